@@ -15,7 +15,7 @@ one index means one direction at both ends. With eq. (1) of the paper, ``y = w* 
 amplitude a that lies on both grids gives ``|y| = sqrt(Nr·Nt)·|a|``. The codebook of an array with several
 subarrays is that of each of them, block by block: a beam has the elements of one panel and one
 polarization. The link's sweep (`link.beam_sweep.sweep`) is a Fourier transform and forms no codebook;
-`tests/unit/test_link_sweep.py` holds the two against each other.
+`tests/unit/test_link_beam_sweep_search.py` holds the two against each other.
 """
 
 from __future__ import annotations

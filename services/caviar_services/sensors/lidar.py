@@ -235,6 +235,7 @@ def _trace(
         rows = [[dr.gather(mi.Float64, mounts[3 * i + j], sensor) for j in range(3)] for i in range(3)]
         return [row[0] * local[0] + row[1] * local[1] + row[2] * local[2] for row in rows]
 
+    # Poses and ranges as columns by sensor, gathered by ray: one kernel for any number of sensors.
     mounts = [mi.Float64(row) for row in aligned_doubles(_mounts(sensors)[:, several(len(sensors))])]
     of_ray = [dr.gather(mi.Float64, row, rays.sensor) for row in mounts[9:]]
     direction = turned(rays.local, rays.sensor)

@@ -150,6 +150,7 @@ class Painter:
     def _directions(self, view: View, x: Any, y: Any) -> Any:
         import drjit as dr
 
+        # Optics and pose are not compiled in: one kernel serves all cameras, wherever they turn.
         mi, optics = self._mi, view.optics
         right = (x - _opaque(mi.Float, optics.cx)) / _opaque(mi.Float, optics.fx)
         down = (y - _opaque(mi.Float, optics.cy)) / _opaque(mi.Float, optics.fy)
@@ -166,6 +167,7 @@ class Painter:
         towards = mi.Vector3f(self._sun.tolist())
         facing = dr.maximum(dr.dot(normal, towards), 0.0)
         lit = hit & (facing > 0)
+        # Rays to the sun are parallel, so Embree may trace them in packets; those to the sky are not.
         shadow = self._traced.occluded(mi.Ray3f(point, towards), lit, coherent=True)
         return dr.select(lit & ~shadow, facing, 0.0)
 

@@ -249,6 +249,7 @@ def _motion(command: VelocityCommand | WaypointCommand, agent: str) -> Motion:
 
 
 def _limits(thing: FlownObject, key: str) -> Limits:
+    # The clearance is that of the centre: with less than half the diagonal a corner might touch a wall.
     half = math.hypot(*thing.dimensions_m) / 2
     if thing.clearance_m < half:
         raise ScenarioError(

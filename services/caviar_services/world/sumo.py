@@ -255,6 +255,7 @@ class SumoWorld(World[SumoSettings]):
         self._angles = {name: api.vehicle.getAngle(name) for name in api.vehicle.getIDList()}
         simulation.step()
         self._steps += 1
+        # Type and size once, when an object departs: SUMO does not change them on the way.
         for name in api.simulation.getDepartedIDList():
             self._vehicles[name] = self._kind(api.vehicle, name)
         for name in api.simulation.getDepartedPersonIDList():

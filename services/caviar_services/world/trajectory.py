@@ -362,6 +362,7 @@ def _from_csv(path: Path, key: str) -> list[Waypoint]:
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
+        # Line by line, not the file at once: an error names the line, comments and empty ones counted.
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:
             header = cells
