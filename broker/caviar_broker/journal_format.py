@@ -113,11 +113,14 @@ class JournalReader:
             if start > self.size:
                 self.problem = f"{self.path}: the entry at byte {self.end} is cut off"
                 return
+            # Compared with what is there before anything is sliced: a damaged length may be any number.
             length, crc = HEAD.unpack_from(self._data, self.end)
             if length > self.size - start:
                 self.problem = f"{self.path}: the entry at byte {self.end} is cut off or damaged"
                 return
             payload = self._data[start : start + length]
+            # Chained: an entry of another journal, or one that was moved, has the wrong CRC though it is
+            # whole.
             if entry_head(self.crc, payload)[1] != crc:
                 self.problem = f"{self.path}: the entry at byte {self.end} is damaged, its CRC-32 differs"
                 return
@@ -137,6 +140,7 @@ def run_of_journal(path: Path) -> str:
 def entry_head(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
     """The head of an entry behind the one with the CRC ``before``, and its CRC; its bytes are ``pieces``."""
     length = sum(map(len, pieces))
+    # The length is covered too: a damaged one must not be taken for that of a longer entry.
     crc = zlib.crc32(length.to_bytes(8, "little"), before)
     for piece in pieces:
         crc = zlib.crc32(piece, crc)
@@ -186,6 +190,7 @@ class EntryIndex:
         """Note entries behind those that are known."""
         for entry in entries:
             kind = entry.service, entry.outcome, entry.topics
+            # One tuple for all entries of a kind; a run has a few kinds and millions of entries.
             self._kinds.append(self._known.setdefault(kind, kind))
             self._numbers.extend((entry.episode, entry.frame, entry.offset, entry.length))
 

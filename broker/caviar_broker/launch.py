@@ -113,6 +113,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     store = AssetStore()
     plan = replace(with_replay(plan, scenario.replay), patterns=pattern_files(scenario, store))
     durability = record.scenario.run.durability
+    # Under every durability but `none` a state is on the disk before an older one is removed.
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
     # A launcher that starts its broker again has not summed the run up yet.
     files = RunDirectory(directory)
@@ -160,6 +161,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
                 server.note("", "; ".join(left.losses), "damage")
             if beside is not None:
                 beside.start(server)
+            # Last: what is there by now lives as long as the run, and is never looked at again.
             tune_garbage_collector()
             outcome = server.run(raise_priority)
     statistics = server.statistics

@@ -54,7 +54,9 @@ def sync_recording(directory: Path) -> None:
     last time. `RunError` naming the directory where that fails.
     """
     try:
+        # The directory too, or a segment that is new could be lost with its name.
         for path in [*RunDirectory(directory).segments()[-2:], directory]:
+            # A recorder that goes on writes its last segment anew, so that the file may be gone for a moment.
             with suppress(FileNotFoundError):
                 sync_file(path)
     except OSError as error:
@@ -84,7 +86,10 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
             refuse_other_kinds(path, PUT_BACK)
         except OSError as error:
             raise RunError(f"cannot go on with {directory}: {path}: {error.strerror}") from error
+    # Each file says by itself which run it is of; copies of a directory keep that.
     runs = {journal.name: run_of_journal(journal)}
+    # What is damaged is mended or reported by the reader of the recording; here it only must not be
+    # another's.
     with suppress(RecordingError):
         manifest = read_manifest(directory)
         runs[files.manifest.name] = manifest.run if manifest else ""

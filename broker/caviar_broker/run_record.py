@@ -46,6 +46,7 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
     found |= {name: _version(name) for name in libraries}
     for package in sorted({use.partition(".")[0].partition(":")[0] for use in used if ":" in use}):
         found[f"code of {package}"] = _hash_of(_sources(package))
+    # A service of another distribution changes with that distribution's version.
     for point in metadata.entry_points(group=ENTRY_POINTS):
         if point.name.partition(":")[2] in used and point.dist is not None:
             found[point.dist.name] = point.dist.version
@@ -94,6 +95,7 @@ def _hash_of(paths: Any) -> str:
     """A short hash of the contents of files."""
     h = hashlib.sha256()
     for path in paths:
+        # Name and length go in, too: code that moves from one file to the next is other code.
         data = path.read_bytes()
         h.update(f"{path.name}\0{len(data)}\0".encode())
         h.update(data)

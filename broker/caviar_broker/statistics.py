@@ -66,6 +66,7 @@ class Statistics:
 
     def __init__(self, budgets_ns: dict[str, int]) -> None:
         self._budgets = budgets_ns
+        # Arrays of machine integers: a list would take 32 B more a figure, in runs of millions of frames.
         self._latencies = {name: array("q") for name in budgets_ns}
         self._misses = dict.fromkeys(budgets_ns, 0)
         self._totals = dict.fromkeys(budgets_ns, 0)
@@ -102,6 +103,7 @@ class Statistics:
         """
         self._finished_at.append(now)
         known, before = self._lag_of_episode
+        # The lag is a sum over the episode, and begins at 0 with each.
         slip = lag_ns - before if episode == known else lag_ns
         self._lag_of_episode = episode, lag_ns
         if slip:
@@ -135,6 +137,7 @@ class Statistics:
         first = self.warm_up_frames
         if self.frames - first < 2:
             return 0.0
+        # Between frames that are finished: neither start-up nor the time until the last BYE counts.
         elapsed = self._finished_at[-1] - self._finished_at[first]
         return (self.frames - 1 - first) / (elapsed / 1e9) if elapsed else 0.0
 

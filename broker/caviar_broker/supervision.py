@@ -20,6 +20,7 @@ class LocalProcess:
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
+        # Not by polling the number: the system may give it to another process at once.
         self.fd = os.pidfd_open(pid)
 
     def verdict(self) -> str:
@@ -222,6 +223,7 @@ class Watchdog:
                 self.lost(service, process.verdict())
         elif process.stopped:
             self.lost(service, describe_stop(process.pid))
+        # A process that dies loses its connection first; only one that lives on without one is reported here.
         elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
             self.lost(service, f"its process {process.pid} lives, but {self.gone_words}")
 

@@ -125,6 +125,7 @@ class Connection:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.linger = LINGER_MS
+        # A wait in the socket itself: a poller would cost two calls more for each message.
         self._socket.rcvtimeo = POLL_MS
         self._socket.sndtimeo = SEND_TIMEOUT_MS
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BODY)
@@ -257,6 +258,7 @@ class Connection:
             return None
         if type(message) is m.Grant:
             return message, parts[1:]
+        # An exception, since it ends whatever the service waits for: a frame, scenery, WELCOME.
         if isinstance(message, m.Shutdown):
             raise RunOver(message.reason)
         if isinstance(message, m.Error | m.Stale):

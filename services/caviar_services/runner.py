@@ -123,6 +123,7 @@ class Runner:
                     self._serve()
                 except Disconnected as loss:
                     self._rejoin(str(loss))
+        # SHUTDOWN instead of WELCOME: the run ended while this service was starting.
         except RunOver as order:
             if not self._session.joined:
                 raise RunError(f"the run ended before {self.name!r} was in it: {order}") from order
@@ -209,6 +210,7 @@ class Runner:
         began = time.monotonic()
         _log.warning("%s; trying to come back for at most %g s (timeouts.rejoin_s)", loss, hold_s)
         # Closed before another one is made at WELCOME: two ray tracers at once may not fit into memory.
+        # A new session, and not the old one: what it knew of the run counts for nothing in the next attempt.
         old, self._session = self._session, self._new_session()
         old.close()
         while True:

@@ -77,7 +77,7 @@ def assert_blamed_in_full(text: str, service: str, frame: int) -> None:
     """Clause 14: service, frame, phase, elapsed and budget, last heartbeat, progress."""
     for word in (f"'{service}'", f"in frame {frame}", f"budget {BUDGET_MS} ms", "since its grant"):
         assert word in text
-    assert re.search(r"last heartbeat [\d.]+ m?s ago: (phase '.+'|no phase told), progress \d+", text), text
+    assert re.search(r"last heartbeat [\d.]+ m?s ago: (phase '.+'|no phase stated), progress \d+", text), text
 
 
 def late_in_recording(finished: Finished) -> set[tuple[str, int]]:

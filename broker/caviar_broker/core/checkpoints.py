@@ -63,10 +63,13 @@ class CheckpointHistory:
 
     def is_due(self, period: int) -> bool:
         """Whether it is time to save the state, at the latest after ``period`` frames."""
+        # The second bound is for large products: what is granted again is kept in memory until then.
         return len(self.grants) >= period or self.size > MAX_HISTORY_BYTES
 
     def save(self, state: Any) -> None:
         """Keep the answer to CHECKPOINT; nothing had been granted meanwhile."""
+        # `handle_checkpoint_done` has sorted out what was not asked for: here it would be a fault of the
+        # core.
         assert self.asked is not None, "a state that was not asked for"
         assert self.asked == self.last, f"state after frame {self.asked}, not {self.last}"
         self.frame, self.state, self.asked = self.asked, state, None
@@ -113,14 +116,18 @@ class Checkpoints:
     def begin_episode(self) -> None:
         """Start with nothing, or with what another broker left of the episode."""
         run, before = self._run, self._run.resumption
+        # State does not outlive an episode: RESET begins anew, and nothing of the one before is granted
+        # again.
         self.histories = {}
         if before is not None and run.graph is not None:
             self.histories = histories_of(before, run.graph, run.plan, self._payload_size)
 
     def reset(self, peer: Peer, *, begins: bool) -> None:
         """Note that a service is reset, as an episode ``begins`` or within one."""
+        # A recorder's state is its recording, which it goes on with by itself.
         able = peer.hello is not None and CAPABILITY in peer.hello.capabilities
         if not (able and peer.role != "recorder" and self._run.plan.remembers):
+            # It may have had one: this incarnation can lack the capability that the one before had.
             self.histories.pop(peer.name, None)
         elif peer.name in self.histories:
             self.histories[peer.name].rewind()
@@ -131,6 +138,8 @@ class Checkpoints:
         """Keep a grant and its answer, for a service that saves its state."""
         history = self.histories.get(peer.name)
         if history is not None:
+            # What was decided from wall time, as the rung of an adaptive channel, is imposed when it is
+            # granted again.
             chosen = answer.decisions if isinstance(answer, Done) else {}
             history.add(AnsweredGrant(order, self._digests(peer, answer), chosen), self._payload_size)
 
@@ -138,6 +147,7 @@ class Checkpoints:
         """Digests by topic of what an answer holds and a service takes; None for FAULT."""
         if isinstance(answer, Fault):
             return None
+        # Only topics in demand: others were dropped when they came, so that a difference has no consequence.
         graph = self._run.graph
         wanted = graph.outputs[peer.name] if graph else ()
         return {header.topic: header.digest for header in answer.products if header.topic in wanted}
@@ -152,6 +162,7 @@ class Checkpoints:
     def request(self, peer: Peer, now: int) -> None:
         """Send CHECKPOINT to a service that owes nothing, once."""
         history = self.histories[peer.name]
+        # Called with each answer while several grants are outstanding; the first call alone asks.
         if history.asked is None:
             history.asked, history.asked_at = history.last, now
             self._run.send(peer, Checkpoint(**self._run.ids(peer), frame=history.last))
@@ -181,6 +192,7 @@ class Checkpoints:
         history = self.histories.get(peer.name)
         if history is None or fault.episode != self._run.episode:
             return False
+        # RESTORE and CHECKPOINT name the frame behind which the state was taken, a grant names the next one.
         restoring = peer.state is ServiceState.RESTORING and not peer.restored
         return fault.frame == (history.frame if restoring else history.asked)
 
@@ -210,6 +222,7 @@ class Checkpoints:
         self._grant_next(peer, history, now)
 
     def _grant_next(self, peer: Peer, history: CheckpointHistory, now: int) -> None:
+        # Each grant that is repeated has the whole time for a reset: a long history is no stall.
         peer.since = now
         pending = history.pending
         if pending is not None:
@@ -231,6 +244,8 @@ class Checkpoints:
             what = f"{kind} for episode {answer.episode} frame {answer.frame}"
             run.stale(peer, kind, what, pending.order.frame if pending else -1)
             return
+        # Under hold and drop the frame did without the answer once, and its decision stands whatever comes
+        # now.
         if (
             isinstance(answer, Fault)
             and pending.digests is not None
@@ -239,6 +254,7 @@ class Checkpoints:
             text = f"failed in frame {answer.frame}, {answer.phase}: {answer.message}"
             run.fail(f"{peer} was restored and {text}", peer.name, now)
             return
+        # The answer itself goes nowhere: consumers have had the first one, and the journal has its decisions.
         self._compare(peer, answer.frame, pending.digests, self._digests(peer, answer))
         history.position += 1
         self._grant_next(peer, history, now)
@@ -264,6 +280,7 @@ def histories_of(
     before: Resumption, graph: Graph, plan: RunPlan, payload_size: PayloadSize
 ) -> dict[str, CheckpointHistory]:
     """The histories of the services of a run that goes on, as they were under the broker before."""
+    # A table of its own, thrown away: it knows how the inputs of a frame are made from decisions.
     table = DecisionTable(graph, plan, before.episode, RunDigest(), Ledger(), [])
     table.resume(before.finished, before.frames, before.tasks, before.newest)
     found = {}

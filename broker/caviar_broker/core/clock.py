@@ -134,6 +134,7 @@ class FrameClock:
     def _late(self, event: ev.Event, now: int) -> None:
         """Take an event of a run that is over: services that come and go matter, work does not."""
         match event:
+            # The run waits for BYE of each service that is present: who comes and goes still counts.
             case ev.Joined() | ev.Lost() | ev.ByeReceived() | ev.Progressed():
                 self._handlers[type(event)](event, now)
             case ev.DoneReceived(service=name, message=message):

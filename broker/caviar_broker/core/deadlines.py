@@ -88,12 +88,14 @@ class Pacer:
 
     def release(self, frame: int, now: int) -> int | None:
         """Ask for a frame: by how much it slips [ns], or None while its time has not come."""
+        # A frame is released by the first service that asks; the others follow without a look at the clock.
         if not self._plan.realtime or frame <= self._released_frame:
             return 0
         due = now if self._released_frame < 0 else self._due()
         if now < due:
             self._awaited = True
             return None
+        # A frame that was asked for in vain is released late by the timer alone, which is no slip of the run.
         slip = 0 if self._awaited else now - due
         self._released_frame, self._reference, self._awaited = frame, due + slip, False
         self.lag_ns += slip
@@ -177,6 +179,7 @@ class Deadlines:
 
     def measure(self, task: Task, now: int) -> None:
         """Report how long a task took that was answered, or never will be."""
+        # No reader gets the latencies of a run in one process that writes no files.
         if self._plan.ephemeral:
             return
         elapsed = now - task.started_at
@@ -187,6 +190,7 @@ class Deadlines:
 
     def next(self) -> int | None:
         """The earliest instant at which a budget is up [ns]; None if none runs."""
+        # A loop, not `min` over a generator: asked once in `LOOK_NS` for every service.
         instant = None
         for participant in self._table.participants.values():
             due = _budget_end(participant)
@@ -215,6 +219,7 @@ class Deadlines:
     def _expire(self, participant: Participant, task: Task, deadline: int, now: int) -> None:
         self._actions.append(Overdue(task.service, self._episode, task.frame, deadline))
         plan, granted = participant.plan, task.state is _GRANTED
+        # Noted before the policy is asked: `measure` counts a miss under each of them.
         task.overran = granted
         if plan.policy == "abort":
             self.aborted = self.aborted or task
@@ -222,6 +227,7 @@ class Deadlines:
         if plan.policy == "wait":
             self.overruns.append((task, "the frame waits"))
             return
+        # The cause travels with the held or absent product to consumers and into the recording (clause 9).
         cause = (
             f"{task.service} missed frame {task.frame} ({plan.policy}, budget {milliseconds(plan.budget_ns)})"
         )

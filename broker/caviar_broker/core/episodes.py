@@ -148,6 +148,7 @@ class Episodes:
 
     def handle_done(self, event: ev.DoneReceived, now: int) -> None:
         """Take DONE: its products are decided, or it is stale."""
+        # An answer of a service that gets its state back was decided before: it is compared, and not used.
         run, peer, message = self._run, self._run.peers[event.service], event.message
         if peer.state is ServiceState.RESTORING:
             self.checkpoints.handle_repeated_answer(peer, message, now)
@@ -163,6 +164,7 @@ class Episodes:
         if len(products) < len(message.products) or not products.keys() <= peer.outputs:
             self._refuse_products(peer, message, now)
             return
+        # It got somewhere since its last loss: `MAX_LOSSES` counts only losses in a row.
         peer.losses = 0
         report: Report | None = None
         if message.decisions or message.counts or message.measured:
@@ -174,9 +176,11 @@ class Episodes:
             )
         if message.seed >= 0:
             self._choose_seed(peer, message, dispatcher, now)
+        # Before the answer is taken: that forgets the order it answers.
         if self.checkpoints.histories:
             self._remember(peer, dispatcher, message)
         dispatcher.handle_done(peer.name, products, now, report, end=message.end_episode)
+        # Behind the decision of its task, so that a broker that resumes reads them in this order.
         if message.end_episode and peer.role == "agent":
             facts = {"frames": dispatcher.table.frames}
             run.enter_journal("end", peer.name, message.frame, now, facts=facts)
@@ -235,6 +239,8 @@ class Episodes:
         if dispatcher is None:
             return
         task = dispatcher.outstanding(peer.name)[0]
+        # A consumer found the product of another wrong: that service has the blame, if it is one of its
+        # inputs.
         if message.culprit and task.order and any(i.source == message.culprit for i in task.order.inputs):
             wrong = run.peers[message.culprit]
             text = f"{wrong} made a wrong product: {message.message} (refused by {peer})"
@@ -250,6 +256,7 @@ class Episodes:
 
     def _owing(self, peer: Peer, answer: Done | Fault, kind: str, now: int) -> Dispatcher | None:
         """The dispatcher, if this answers the oldest outstanding grant (clause 1), in time or late."""
+        # One comparison of tuples is the usual way; which part differs is looked for only where one does.
         run, dispatcher = self._run, self.dispatcher
         participant = dispatcher.table.participants.get(peer.name) if dispatcher else None
         outstanding = -1
@@ -292,6 +299,7 @@ class Episodes:
         run, dispatcher = self._run, self.dispatcher
         if dispatcher is None or run.state is not _RUNNING:
             return
+        # Grants first: services work while notices are written.
         dispatcher.advance(now)
         for order in dispatcher.grants:
             self._grant(order)
@@ -299,6 +307,7 @@ class Episodes:
         deadlines = dispatcher.deadlines
         if deadlines.overruns or deadlines.skips or dispatcher.cut or deadlines.aborted:
             self._blame_overruns(dispatcher, now)
+        # Cheap tests first: this is asked after every event, and holds once an episode.
         table = dispatcher.table
         if table.finished_frames >= table.frames and not run.over and dispatcher.finished:
             self._end(table.frames, now)
@@ -330,6 +339,7 @@ class Episodes:
     def _grant(self, order: GrantOrder, chosen: Mapping[str, str] | None = None) -> None:
         """Send GRANT; with ``chosen`` it was answered before, after these decisions."""
         run, peer = self._run, self._run.peers[order.service]
+        # A replay imposes what was recorded; what a service chose before its restart goes before that.
         decisions = run.plan.imposed.get((order.service, run.episode, order.frame), {})
         grant = Grant(
             epoch=run.plan.epoch,

@@ -144,6 +144,7 @@ class StepRequested(msgspec.Struct, frozen=True):
     frames: int
 
 
+# A union for the type checker; `FrameClock` looks the handler up by the class of the event.
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
     | CheckpointReceived | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested

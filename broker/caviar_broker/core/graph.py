@@ -61,6 +61,7 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
     """
     producers = _producers(hellos)
     edges = {name: _edges(hello, producers) for name, hello in hellos.items()}
+    # Before anything is left out: a cycle is a mistake also among services that would not be run.
     order = _topological_order(hellos, edges)
     wanted = _recorded_parts(record, producers)
     active = _active(hellos, edges, producers, wanted)
@@ -68,11 +69,13 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
     inputs = {
         name: tuple(sorted((e for e in edges[name] if e.source in active), key=_edge_key)) for name in active
     }
+    # A recorder takes what there is, and makes no demand: a run has the same products with and without one.
     consumed = {(e.topic, e.source) for name in active - recorders for e in inputs[name]}
     outputs = {
         name: tuple(sorted(t for t in hellos[name].outputs if (t, name) in consumed or t in wanted))
         for name in active
     }
+    # What no service but the recorder takes is not produced, so there is no edge to the recorder either.
     inputs = {
         name: tuple(edge for edge in found if edge.topic in outputs[edge.source])
         for name, found in inputs.items()
@@ -90,6 +93,7 @@ def build_graph(hellos: Mapping[str, Hello], record: Iterable[str] = ()) -> Grap
         order=tuple(name for name in order if name in active),
         inputs=inputs,
         latest={
+            # Lag 1 was decided a frame ago; of the others the source deepest in the graph comes last.
             name: tuple(sorted(found, key=lambda edge: (edge.lag, -rank[edge.source])))
             for name, found in inputs.items()
         },
@@ -110,6 +114,7 @@ def check_prefixes(prefixes: Mapping[str, Iterable[str]]) -> None:
     claimed = [(prefix, world) for world, found in prefixes.items() for prefix in found]
     for index, (prefix, world) in enumerate(claimed):
         for other_prefix, other in claimed[:index]:
+            # Prefixes of one another clash too: `car` owns `car-1`, and so would `car-`.
             if other != world and (prefix.startswith(other_prefix) or other_prefix.startswith(prefix)):
                 raise DeclarationError(
                     f"worlds {other!r} and {world!r} clash: object names may begin with "
@@ -157,8 +162,11 @@ def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]
                     f"{hello.role} {hello.name!r} needs topic {topic!r}, which no service of the run "
                     f"produces; add one that does (topics there are: {', '.join(sorted(producers))})"
                 )
+            # All sources of a topic: a consumer gets the scenes of all worlds.
             for source in sources:
                 key = (topic, source, entry.lag)
+                # A topic may be declared twice, by name and by the wildcard: what one of them needs is
+                # needed.
                 required = entry.required or (key in found and found[key].required)
                 found[key] = Edge(topic, source, entry.lag, required)
     return list(found.values())
@@ -216,6 +224,7 @@ def _active(
     todo = [
         name for name, h in hellos.items() if h.role == "agent" or (not h.outputs and name not in recorders)
     ]
+    # From what is there for its own sake back to all that it takes, at any lag.
     todo += [name for topic in wanted for name in producers[topic]]
     while todo:
         name = todo.pop()
@@ -243,6 +252,7 @@ def _check_parts(
     """Raise `DeclarationError` where a service is asked for a part that its version does not have."""
     for name, entries in demand.items():
         for topic, part in [(entry.topic, part) for entry in entries for part in entry.parts]:
+            # A part that has no entry came with its topic, in the first version.
             since = PARTS_SINCE.get(f"{topic}.{part}", "1.0")
             if hellos[name].version >= parse_version(since):
                 continue

@@ -44,6 +44,7 @@ class Liveness:
     def handle_loss(self, event: ev.Lost, now: int) -> None:
         """A service died; the run ends, unless it can do without it or wait for its return."""
         run, peer = self._run, self._run.peers[event.service]
+        # Several witnesses report one death: the descriptor of its process, the launcher, the connection.
         if peer.state in (ServiceState.LOST, ServiceState.LEFT):
             return
         dispatcher = self._episodes.dispatcher if run.takes_part(peer) else None
@@ -53,6 +54,7 @@ class Liveness:
             died = f"died ({event.verdict})"
             text = peer.blame_task(owed[0], died, now, dispatcher.table.describe_waiting(peer.name))
         peer.verdict = event.verdict
+        # Counted before it is asked whether the service may come back.
         peer.losses += 1
         peer.move(ServiceEvent.LOST, now)
         if run.over:
@@ -84,6 +86,7 @@ class Liveness:
             return None
         if run.state is RunState.STOPPING:
             return run.since + run.plan.limits.shutdown
+        # A disk that takes nothing stalls the run as a service does.
         waiting = run.ledger.waiting_since
         earliest = None if waiting is None else waiting + run.plan.limits.stall
         for peer in run.peers.values():
@@ -101,6 +104,7 @@ class Liveness:
             return
         if run.over:
             return
+        # The longest silence is the cause; others may be silent because they wait for that service.
         silent = [(due, p) for p in run.peers.values() if (due := self._due(p)) is not None and due <= now]
         if silent:
             _, culprit = min(silent, key=lambda pair: pair[0])

@@ -156,6 +156,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
             ServicePlan(
                 name=name,
                 role=spec.role,
+                # A remote service says by itself what it is.
                 use="" if spec.remote else spec.use,
                 remote=spec.remote,
                 budget_ns=round(spec.budget_ms * 1e6),
@@ -174,6 +175,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
         instants_ns=instants_ns(scenario.run.instants_s),
         episodes=scenario.run.episodes,
         seed=scenario.run.seed,
+        # `fast` is an earlier word for `free`.
         realtime=scenario.run.pace not in ("free", "fast"),
         speed=1.0 if isinstance(scenario.run.pace, str) else scenario.run.pace,
         record=scenario.run.record,
@@ -214,6 +216,7 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
         scenario: A validated one.
         directory: Of the run, where the recorder writes.
     """
+    # As the recording has it: a service and a reader of the recording see the same values.
     plain = resolved(scenario)
     devices = [device | {"world": world_of(scenario, index)} for index, device in enumerate(plain["devices"])]
     common = {
@@ -227,6 +230,7 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
         found[name] = common | {"devices": devices}
         if spec.role == "world":
             found[name]["devices"] = [device for device in devices if device["world"] == name]
+        # The recorder alone writes files, and its metadata hold the whole scenario.
         if spec.role == "recorder":
             found[name] |= {"directory": str(directory), "resolved": plain}
     return found
@@ -247,5 +251,6 @@ def with_ownership(scenario: Scenario) -> Scenario:
 def _agent_settings(spec: ServiceSpec, owned: tuple[str, ...]) -> ServiceSpec:
     if spec.role != "agent" or not owned:
         return spec
+    # A default agent gets what it may not serve in its settings: it cannot know the settings of the others.
     ownership: Mapping[str, Any] = {"users": spec.users} if spec.users else {"except_users": owned}
     return msgspec.structs.replace(spec, settings={**spec.settings, **ownership})

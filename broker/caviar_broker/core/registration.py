@@ -54,6 +54,7 @@ class Registration:
         peer = run.peers[hello.name]
         if peer.state is ServiceState.LOST:
             run.notice("back", peer.name, f"{peer} came back after {(now - peer.since) / 1e9:.3g} s")
+        # Before WELCOME is made, which carries the attempt that this counts.
         peer.join(hello, now)
         run.send(
             peer,
@@ -71,6 +72,7 @@ class Registration:
                 rejoin_ns=self._held_open(peer, event.local),
             ),
         )
+        # The graph needs every declaration; one that comes back later is prepared by the graph that there is.
         if run.state is RunState.JOINING:
             if all(p.state is ServiceState.JOINED for p in run.peers.values()):
                 self._all_joined(now)
@@ -95,6 +97,7 @@ class Registration:
                 code="unknown-name",
                 message=f"the run has no service {hello.name!r}; {hint}it expects: {expected}",
             )
+        # Not fatal: it may have been started while the last frames were run.
         if self._run.over:
             return Refuse(code="late", message="the run is over")
         if peer.state not in (ServiceState.EXPECTED, ServiceState.LOST):
@@ -139,6 +142,7 @@ class Registration:
         """Worlds load first; their scenery is known once they are ready, and all others load with it."""
         run = self._run
         assert run.graph is not None
+        # Worlds first, since all others load the scenery that worlds offer between PREPARE and READY.
         worlds = [p for p in run.peers.values() if p.role == "world" and run.takes_part(p)]
         scenery_is_known = all(p.ready for p in worlds)
         if scenery_is_known and (missing := self._missing_pattern()):
@@ -159,6 +163,7 @@ class Registration:
 
     def _scenery(self) -> tuple[Asset, ...]:
         """The scenery of all worlds, each file once, and pattern files that no world brings."""
+        # A world's own file goes before the broker's, which is that of its name with the same digest.
         found = {pattern.name: pattern.asset for pattern in self._run.plan.patterns if pattern.asset}
         found |= {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
         return tuple(found[name] for name in sorted(found))
@@ -182,6 +187,7 @@ class Registration:
             run.unexpected(peer, "ASSET_OFFER", "only of a world, between PREPARE and READY")
             return
         digests = {asset.name: asset.digest for asset in event.assets}
+        # Others have loaded what it offered first: the run would go on with two geometries.
         if peer.ready and digests != {asset.name: asset.digest for asset in peer.assets}:
             self._refuse(peer, "geometry", f"{peer} came back with other scenery than it had before", now)
             return
@@ -200,6 +206,7 @@ class Registration:
                 )
                 self._refuse(peer, "geometry", located(text, peer.name, run.plan.source), now)
                 return
+        # An offer is progress: a world that reads a large scene sends no READY for a while.
         peer.assets, peer.advanced_at = event.assets, now
 
     def handle_ready(self, event: ev.ReadyReceived, now: int) -> None:
@@ -220,6 +227,7 @@ class Registration:
         if not self._accepted(peer, message, now):
             return
         peer.ready = message
+        # Behind the first episode an agent chooses seeds with DONE; a run that goes on has its seed.
         if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
             run.wish(message.seed, peer, now)
         self._prepare_whoever_can(now)
@@ -231,6 +239,7 @@ class Registration:
 
     def _accepted(self, peer: Peer, message: Ready, now: int) -> bool:
         """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
+        # A service without geometry says none, and an empty digest is no contradiction.
         expected = geometry_digest(self._scenery())
         if peer.role != "world" and message.geometry and message.geometry != expected:
             text = (
@@ -239,6 +248,7 @@ class Registration:
             )
             self._refuse(peer, "geometry", text, now)
             return False
+        # Of all that are ready by now: the one that is last to say so finds each clash.
         claims = {p.name: p.ready for p in self._run.peers.values() if p.ready} | {peer.name: message}
         try:
             worlds = {n: r.prefixes for n, r in claims.items() if self._run.peers[n].role == "world"}
@@ -274,6 +284,7 @@ def _contradiction(peer: Peer, hello: Hello) -> str:
         )
     if unknown := _unknown_part(hello):
         return unknown
+    # The graph was built from the declaration before, and products were granted by it.
     before = peer.hello
     if before is not None and (hello.inputs, hello.outputs) != (before.inputs, before.outputs):
         return f"{hello.name!r} came back with other inputs or outputs than it had before"

@@ -121,7 +121,7 @@ class Peer:
         """What its last heartbeat said."""
         if self.heard_at is None:
             return "no heartbeat ever came"
-        phase = f"phase {self.phase!r}" if self.phase else "no phase told"
+        phase = f"phase {self.phase!r}" if self.phase else "no phase stated"
         return f"last heartbeat {duration(now - self.heard_at)} ago: {phase}, progress {self.progress}"
 
     def blame_task(self, task: Task, problem: str, now: int, waiting: str = "") -> str:
@@ -207,6 +207,7 @@ class Run:
 
     def __init__(self, plan: RunPlan, now: int, resumption: Resumption | None = None) -> None:
         self.plan = plan
+        # Needed until the episode goes on, whose first tasks are made of it.
         self.resumption = resumption
         """What another broker left of the run, until it goes on."""
         self.state = RunState.JOINING
@@ -233,6 +234,7 @@ class Run:
             self._continue(resumption)
         self.error = ""
         self.culprit = ""
+        # One list for the life of the run: the parts of the core keep it and append.
         self.actions: list[Action] = []
 
     def _continue(self, before: Resumption) -> None:
@@ -250,6 +252,7 @@ class Run:
 
     def wish(self, seed: int, peer: Peer, now: int) -> None:
         """An agent chooses the seed of the next episode."""
+        # Two agents may end an episode in one frame; with the same seed there is nothing to decide.
         if self._wished is not None and self._wished[0] != seed and self._wished[1] is not peer:
             other = self._wished[1]
             self.fail(
@@ -287,6 +290,7 @@ class Run:
     def stop(self, reason: str, now: int) -> None:
         """End the run: SHUTDOWN to every service."""
         self.enter(RunEvent.STOP, now)
+        # Also those that are not ready yet: they have joined, and wait for a word.
         for peer in self.peers.values():
             if peer.present:
                 self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.limits.shutdown))

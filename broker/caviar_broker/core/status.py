@@ -98,6 +98,7 @@ def status_of(run: Run, episodes: Episodes, now: int) -> RunStatus:
         episodes: Its episode and what services owe.
         now: The time [ns].
     """
+    # Looked up in one go between two events, so that no figure contradicts another.
     dispatcher = episodes.dispatcher
     waits = [wait for peer in run.peers.values() if (wait := _wait(run, episodes, peer, now)) is not None]
     return RunStatus(
@@ -154,9 +155,11 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
         limit = run.plan.limits.shutdown
         text = f"{peer} has not said BYE for {duration(now - run.since)}; {peer.last_words(now)}"
         return _of(peer, -1, now - run.since, limit, "", text, now)
+    # What an early end cut is not waited for, though its answer is due.
     owed = [task for task in _owed(peer, episodes) if task.state is not TaskState.ABANDONED]
     dispatcher = episodes.dispatcher
     lacking = dispatcher.table.describe_waiting(peer.name) if dispatcher is not None else ""
+    # Before what it owes: a service that is lost owes its grants too, and its return comes first.
     if peer.state in _UNDER_WAY:
         limits = run.plan.limits
         limit = {
@@ -207,4 +210,5 @@ def _age(peer: Peer, now: int) -> float | None:
 
 
 def _s(ns: int) -> float:
+    # Microseconds: more digits would change with every look and say nothing.
     return round(ns / 1e9, 6)

@@ -15,6 +15,7 @@ from typing import TypeVar
 class Enum(enum.Enum):
     """Members are singletons; hashed as such, which is many times faster than by name, in C."""
 
+    # `Enum.__hash__` is a Python function that hashes the name, and tables are asked several times a frame.
     __hash__ = object.__hash__
 
 
@@ -137,12 +138,15 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
     (ServiceState.JOINED, ServiceEvent.PREPARE): ServiceState.PREPARING,
     (ServiceState.PREPARING, ServiceEvent.READY): ServiceState.READY,
     (ServiceState.READY, ServiceEvent.RESET): ServiceState.RESETTING,
+    # Without state, or behind a first reset; else RESTORE comes in between.
     (ServiceState.RESETTING, ServiceEvent.RESET_DONE): ServiceState.ACTIVE,
     (ServiceState.RESETTING, ServiceEvent.RESTORE): ServiceState.RESTORING,
     (ServiceState.RESTORING, ServiceEvent.RESTORED): ServiceState.ACTIVE,
+    # The others may be through with the episode before a service has its state back.
     (ServiceState.RESTORING, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.ACTIVE, ServiceEvent.EPISODE_END): ServiceState.READY,
     (ServiceState.RESETTING, ServiceEvent.EPISODE_END): ServiceState.READY,
+    # A launcher reports the end of a process that never said HELLO.
     (ServiceState.EXPECTED, ServiceEvent.LOST): ServiceState.LOST,
     **{(state, ServiceEvent.LOST): ServiceState.LOST for state in _PRESENT},
     **{(state, ServiceEvent.BYE): ServiceState.LEFT for state in _PRESENT},
@@ -151,11 +155,14 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
 TASK: dict[tuple[TaskState, TaskEvent], TaskState] = {
     (TaskState.PENDING, TaskEvent.GRANT): TaskState.GRANTED,
     (TaskState.PENDING, TaskEvent.SKIP): TaskState.SKIPPED,
+    # It could not be granted in time: its service was still busy, or not there.
     (TaskState.PENDING, TaskEvent.DEADLINE): TaskState.SKIPPED,
     (TaskState.GRANTED, TaskEvent.ANSWER): TaskState.DONE,
     (TaskState.GRANTED, TaskEvent.DEADLINE): TaskState.OVERDUE,
     (TaskState.GRANTED, TaskEvent.FAULT): TaskState.FAILED,
+    # An agent ended the episode before this frame (clause 16); the service is not interrupted.
     (TaskState.GRANTED, TaskEvent.CUT): TaskState.ABANDONED,
+    # Its frame has gone on; what comes may be held by later frames, and is recorded (clause 11).
     (TaskState.OVERDUE, TaskEvent.ANSWER): TaskState.LATE,
     (TaskState.OVERDUE, TaskEvent.FAULT): TaskState.FAILED,
     (TaskState.OVERDUE, TaskEvent.CUT): TaskState.ABANDONED,

@@ -129,6 +129,7 @@ class EmbeddedRun:
         """How it ended; None until then."""
         self._stop_reason = ""
         self._orders: deque[ev.Send] = deque()
+        # Not fed at once: a service answers within `handle`, and the clock must not be entered twice.
         self._events: deque[ev.Event] = deque()
         self._encodes = directory is not None
         check, seats = ContentCheck(), seats or {}
