@@ -180,6 +180,7 @@ class _Stage:
             return 1.0
         if self.play("wait", {name: 0.0}).rate < target:
             return None
+        # By bisection: the frame rate falls with the time of a service, in steps that no formula has.
         low, high = 0.0, 1.0  # share of its time: enough, and too much
         for _ in range(FACTOR_STEPS):
             middle = (low + high) / 2
@@ -191,6 +192,7 @@ class _Stage:
 
 
 def _unexplained(run: RecordedRun, measured: float, predicted: float) -> list[str]:
+    # A run in real time waits for its clock: its rate says nothing of its services.
     if (
         not measured
         or run.scenario.run.pace not in ("free", "fast")
@@ -209,6 +211,7 @@ def _notes(run: RecordedRun, timings: Mapping[str, Timing], frames: int) -> list
     for name, timing in timings.items():
         if not timing.exact:
             notes.append(f"latencies of {name} are not one a frame: they were taken in their order")
+    # The first frame has what every frame has: a service decides in all of them, or in none.
     for report in run.recording.entry(0).reports:
         if report.decisions and report.source in timings:
             notes.append(

@@ -139,7 +139,7 @@ def check_frames() -> Check:
     try:
         with tempfile.TemporaryDirectory(prefix="caviar-doctor-") as folder:
             outcome, abs_y = _two_frames(Path(folder))
-    except Exception as error:  # whatever a dependency that does not fit raises
+    except Exception as error:  # anything: a dependency that does not fit raises what it likes
         text = str(error) if isinstance(error, CaviarError) else f"{type(error).__name__}: {error}"
         return Check("frames", False, text, remedy)
     if outcome.error:
@@ -147,6 +147,7 @@ def check_frames() -> Check:
     rounding = FRAME_DIGESTS.get(outcome.digest)
     if rounding:
         return Check("frames", True, f"two frames of smoke have a known digest ({rounding})")
+    # Another order of sums changes the digest and no result.
     off = abs(abs_y / FRAME_ABS_Y - 1)
     if off <= ABS_Y_TOLERANCE:
         found = f"two frames of smoke are right, rounded in a way of their own: digest {outcome.digest:.12}…"
@@ -213,6 +214,7 @@ def check_zmq() -> Check:
 
 def check_loopback() -> Check:
     """Check that services and broker of one machine can talk over TCP."""
+    # A container without a network may lack the loopback interface.
     try:
         with socket.create_server(("127.0.0.1", 0)) as server:
             address = server.getsockname()
@@ -301,6 +303,7 @@ def _pip_install(requirements: list[Requirement]) -> str:
 def _run(command: list[str], environment: Mapping[str, str]) -> tuple[bool, str]:
     """Whether a command succeeded, and the first line that it printed, or why it failed."""
     try:
+        # Its own process: Dr.Jit with an LLVM that is too old aborts, and takes this one with it.
         done = subprocess.run(  # noqa: S603 - the commands are those above
             command,
             env={**os.environ, **environment},

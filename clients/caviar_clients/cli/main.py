@@ -163,6 +163,7 @@ def broker(
     from caviar_clients.cli.remote import resume_broker, serve_broker
 
     source = _started_anew(resume, scenario, frames, seed, pace)
+    # The options that a new and a resumed run share, as the broker's own command line has them.
     options = ["--bind", bind] + (["--keys", str(keys)] if keys else []) + ["--restarted"] * restarted
     options += (["--http", http] if http else []) + ["--force"] * force
     if resume is not None:
@@ -189,6 +190,7 @@ def service(
     """Run one service and connect it to a broker."""
     from caviar_services.runner import serve
 
+    # At once: a service that waits says nothing else until the broker is there.
     limit = f"for at most {connect_timeout:g} s (--connect-timeout)"
     typer.echo(f"service {name}: waiting for the broker at {broker}, {limit}", err=True)
     raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key, restarted=restarted))

@@ -71,7 +71,7 @@ def measure_broker(
     """
     from caviar_broker.bench.run import measure
 
-    require_writable(json_file)
+    require_writable(json_file)  # before minutes of measuring
     measured = measure(topology, services, payload, frames, curve=curve)
     table = Table(
         "services", "payload B", "µs a frame: mean", "p50", "p99", "MB/s", "broker CPU µs", "misses"
@@ -220,6 +220,7 @@ def trade(
 
     _require_extras_of_ladder(source, options, with_pictures=out is not None)
     files = [file for file in (json_file, out and out / "tradeoff.md") if file is not None]
+    # Files that are still empty after an error are removed: an empty table looks like a result.
     with reserved(*files):
         report = _compared(source, frames, options, console)
     if warning := _other_reference(options, report):
@@ -403,6 +404,7 @@ def conform_client(
     require_writable(json_file, markdown_file)
     options: dict[str, Any] = {"command": command, "names": names, "rules": rules, "tell": tell, "each": each}
     if websocket:
+        # The gateway has the address that clients know; the kit is behind it, at any.
         options["front"] = _gateway(listen, tell)
         listen = "tcp://127.0.0.1:0"
     verdicts = kit.conform(listen, **options)

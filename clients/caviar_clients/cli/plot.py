@@ -121,6 +121,7 @@ def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float
     Returns:
         Amplitudes, Shape ``[N]``.
     """
+    # A codebook of several panels numbers the beams of one panel behind those of the other.
     part, own = subarray_of(array, beam)
     local = directions @ rotation_matrix(part.orientation)
     response = steering_vector(part.array, local) @ dft_codebook(part.array)[own].conj()
@@ -199,6 +200,7 @@ def camera_view(frame: RecordedFrame, camera: str | None) -> CameraView:
     sensor = choose_camera(found, camera, f"frame {frame.number} has")
     if sensor is None:
         raise RecordingError(f"frame {frame.number} has no images; choose another with --frame")
+    # A camera may have any of the three: colours, depth, labels.
     seen, scene = found[sensor], frame.scene()
     _, picture = seen.get("camera", (None, None))
     _, depth = seen.get("depth", (None, None))
@@ -264,6 +266,7 @@ def scenery(recording: Recording) -> Footprints | None:
 def _obstacles(recording: Recording) -> list[Box]:
     """The setting ``obstacles`` of the channels of the recorded scenario."""
     services = recording.metadata.scenario.get("services")
+    # As it was recorded, perhaps by another version: nothing about its form is certain.
     specs = [spec for spec in services.values() if isinstance(spec, dict)] if services else []
     found = [
         settings.get("obstacles", ())
@@ -285,7 +288,7 @@ def _frame(
         candidates = with_topic or candidates
     ranks = [_worth(frame, user) for frame in candidates]
     candidates = [frame for frame, rank in zip(candidates, ranks, strict=True) if rank == max(ranks)]
-    return candidates[len(candidates) // 2]
+    return candidates[len(candidates) // 2]  # not the first, in which users have hardly moved
 
 
 def _has(frame: RecordedFrame, topic: str) -> bool:

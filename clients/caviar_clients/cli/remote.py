@@ -208,6 +208,7 @@ def start_command(name: str, spec: ServiceSpec, endpoint: str) -> str:
         spec: Of the service, from the scenario.
         endpoint: Address of the broker, to connect to.
     """
+    # A checkout has clients to copy from; an installed package does not.
     program, script = EXAMPLES.get(spec.role, ("", ""))
     if script and (MINIMAL / script).exists():
         return f"{program} {_shown(MINIMAL / script)} {endpoint} {shlex.quote(name)}"
@@ -225,6 +226,7 @@ def waiting_text(name: str, spec: ServiceSpec, endpoint: str, seconds: float) ->
     """
     there = reachable(endpoint)
     command = start_command(name, spec, there)
+    # No program is known that fits: the user chooses among the implementations that are here.
     known = sorted(key.partition(":")[2] for key in registered() if key.startswith(f"{spec.role}:"))
     where = f" (IMPLEMENTATION: {', '.join(known)})" if "IMPLEMENTATION" in command else ""
     return (
@@ -244,6 +246,7 @@ def service_commands(services: Mapping[str, ServiceSpec], bind: str, keys: Path 
     Returns:
         A command for each service. With keys, those come first that authorize services which are not yet.
     """
+    # Port 0 or *: which one it is, the broker prints once it listens.
     place = reachable(bind) if bind.rpartition(":")[2].strip("0*!") else ""
     address = ["--broker", place] if place else []
     authorized = {entry.name for entry in read_authorized(keys)} if keys is not None else set()

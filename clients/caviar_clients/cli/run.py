@@ -226,6 +226,7 @@ def run_scenario(
     warnings = implausible_values(scenario)
     for warning in warnings:
         print_line(console, f"warning: {warning}", "yellow")
+    # The child processes get the scenario as it was found: they read the file themselves.
     launcher: Launcher | EmbeddedLauncher
     if embedded:
         launcher = EmbeddedLauncher(scenario, directory)
@@ -299,6 +300,7 @@ def _follow(
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
         return RunOutcome(directory, 130 if interrupted.came else 1, outcome["error"])
+    # Before anything is read of the recording for the summary: figures of another run would mislead.
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None
     noted = [*warnings, *watcher.warnings, *watcher.idle.values()]
@@ -347,7 +349,7 @@ class _Interruption:
 
     def _handle(self, number: int, _: FrameType | None) -> None:
         if self.came:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt  # through the launcher's block, which ends all processes
         self.came = True
         name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         self._launcher.stop(f"stopped by {name}")

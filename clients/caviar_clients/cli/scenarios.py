@@ -57,6 +57,7 @@ def _extras(spec: ServiceSpec) -> set[str]:
     if spec.remote:
         return set()
     found = {load(spec.role, spec.use).extra}
+    # Scenes of Sionna are part of the package that the extra `world` brings.
     scenery = spec.settings.get("scenery", "")
     if isinstance(scenery, str) and scenery.startswith("sionna:"):
         found.add("world")

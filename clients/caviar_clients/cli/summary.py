@@ -222,14 +222,14 @@ class _LinkTotals:
 
     def __init__(self) -> None:
         self.users = self.served = 0
-        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate.
+        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate; sums, so that a run of any length fits.
         self._sums = np.zeros(6)
 
     def add(self, link: Link) -> None:
         with_path = link.has_path
         self.users += len(link.rx)
         self.served += int(with_path.sum())
-        best = link.top_abs_y[:, :1].sum(axis=1)  # no column where there is no user
+        best = link.top_abs_y[:, :1].sum(axis=1)  # the column lacks where there is no user
         figures = (link.abs_y, best, link.baseline_abs_y, link.snr, link.snr_best, link.bit_rate)
         self._sums += [values[with_path].sum() for values in figures]
 
@@ -253,7 +253,7 @@ class _LinkTotals:
 
 
 def _db(ratio: float | None) -> float | None:
-    return 10 * math.log10(ratio) if ratio else None
+    return 10 * math.log10(ratio) if ratio else None  # 0 is no path at all, and no number of decibels
 
 
 def _measure(
@@ -268,6 +268,7 @@ def _measure(
 
 
 def _episodes_planned(scenario: dict[str, Any]) -> int:
+    # As it was recorded, perhaps by another version: nothing about its form is certain.
     run = scenario.get("run")
     episodes = run.get("episodes", 1) if isinstance(run, dict) else 1
     return episodes if isinstance(episodes, int) else 1
@@ -294,6 +295,7 @@ def summarise(recording: Recording) -> RunSummary:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
             setattr(source, entry.status.value, getattr(source, entry.status.value) + 1)
+        # A frame whose payloads are damaged still has its entries, and counts with them.
         try:
             _measure(frame, sources, totals)
         except RecordingError as error:
@@ -483,6 +485,7 @@ def _missed(misses: int, late: Mapping[str, Any]) -> str:
     """Count missed deadlines, and say how promptly the broker decided those without an answer by then."""
     seen = late["decisions"]
     when = f"{late['p99_ms']:.2f} ms (p99) behind, {late['worst_ms']:.2f} ms at worst"
+    # A late answer that arrives before the broker looks at the clock is a miss without a decision.
     if misses <= seen:
         return f"{counted(seen, 'missed deadline')}, decided {when}"
     return (

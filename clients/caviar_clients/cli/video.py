@@ -169,6 +169,7 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
         views.append(view_of(data, beam))
         if len(found.all_gains):
             gains.append(scale(found.all_gains))
+        # What any frame has is in the key of the film, which is drawn once.
         has_ticks |= bool(len(found.tick_gains))
         has_beam |= beam is not None
         carriers = {device.parent for device in data.scene.devices}
@@ -220,6 +221,7 @@ def _pictures(
     recording: Recording, survey: _Survey, moving: MovingMap, user: User | None, steps: Sequence[int]
 ) -> Iterator[UInt8Array]:
     """Pictures of some steps of the survey; a camera that saw nothing in a frame keeps its last picture."""
+    # Cameras may see every n-th frame: between two pictures the earlier one stands.
     last = None
     for step in steps:
         frame = RecordedFrame(recording, survey.indices[step])

@@ -90,7 +90,7 @@ class MapRenderer:
         axes.set_ylabel("y, north [m]")
         axes.set_title(title)
         self._canvas.draw()
-        return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+        return np.array(self._canvas.buffer_rgba())[..., :3].copy()  # the canvas uses its buffer again
 
     def _widen(self, scene: Scene) -> None:
         devices = [device_pose(scene, device).position[:2] for device in scene.devices]
@@ -224,6 +224,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ScenarioError(f"render_mode is {render_mode!r}; write 'rgb_array' or None")
+        # A text is a sequence, too: of names of one letter.
         if isinstance(observe, str):
             raise ScenarioError(
                 f"observe is the text {observe!r}; write a tuple of names: observe=({observe!r},)"
@@ -231,6 +232,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(Path(scenario))
+        # A program may make hundreds of environments: Python shows the same warning once.
         for text in implausible_values(self.scenario):
             warnings.warn(text, stacklevel=2)
         self.agent = agent_of(self.scenario, agent)
@@ -274,6 +276,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if unknown:
             there = f"there are: {', '.join(self.reset_options)}" if self.reset_options else "there are none"
             raise ScenarioError(f"no options of reset are called {unknown}; {there}, set it in the scenario")
+        # With the first reset, and not before: a program that only looks at the spaces starts no run.
         if self._session is None:
             self._session = open_session(
                 self.scenario,
@@ -303,6 +306,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             PayloadError: The action is none of `action_space`.
             RunError: No episode has begun, or the run has ended.
         """
+        # A learner's mistake, which would otherwise wait for a grant that never comes.
         before = self._moment
         if self._session is None or before is None or before.frame.final:
             raise RunError("the episode is over, or none has begun; call reset()")
@@ -315,6 +319,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def close(self) -> None:
         """End the run, or leave it. A later `reset` begins another one."""
+        # Before the session is closed: a second close, of a wrapper, finds nothing to do.
         session, self._session, self._moment = self._session, None, None
         if session is not None:
             session.close()
@@ -355,6 +360,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     # --- from frames to observations ------------------------------------------------------------------
 
     def _inputs(self) -> tuple[Input, ...]:
+        # One input for each topic: two cameras are in one product.
         further = {i.topic: i for p in self._parts.values() for i in p.inputs}
         return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *further.values())
 
@@ -372,6 +378,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         found = {}
         for name, p in self._parts.items():
             value = p.read(moment)
+            # A copy: learners keep observations, and some write into them.
             found[name] = self._blank[name].copy() if value is None else value
         return found
 

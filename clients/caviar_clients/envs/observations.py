@@ -81,6 +81,7 @@ class Users:
         """One for each pair there may be."""
         for tx, rx in self._groups:
             self._first[tx.name, rx.name] = len(self.places)
+            # One object for all of a group: places of a pattern have the same arrays.
             self.places += [Place(_array(tx), _array(rx))] * (tx.count * rx.count)
         self._devices: object = None
         self._found: tuple[tuple[int, Pair], ...] = ()
@@ -375,6 +376,7 @@ def _grid_shape(scenario: Scenario) -> tuple[int, int, int]:
         grid = spec.settings.get("grid") if spec.role == "sensors" else None
         if grid is None:
             continue
+        # A grid has cells, or a box and the size of a cell, which the last cell may exceed.
         if "cells" in grid:
             x, y, z = grid["cells"]
             return int(x), int(y), int(z)

@@ -181,6 +181,7 @@ class UavPathEnv(FlightEnv):
     def _further_reward(self, before: Moment, now: Moment) -> float:
         if self._goal is None:
             return 0.0
+        # Over an episode the differences sum up to the way from start to end, whatever path is flown.
         nearer = np.linalg.norm(self._way(before)) - np.linalg.norm(self._way(now))
         return self._progress_weight * float(nearer)
 

@@ -136,6 +136,7 @@ class UavPathV1Env(FlightEnv):
     ) -> None:
         if "reward" in options:
             raise ScenarioError("the reward has parts of its own; leave reward=… out, or write weights={…}")
+        # Under one name an observation has one shape, and these are scaled.
         own = sorted(set(observe) & set(OWN_PARTS))
         if own:
             raise ScenarioError(f"{', '.join(own)} of observe is always observed; leave it out")
@@ -229,6 +230,7 @@ class UavPathV1Env(FlightEnv):
                 f"no start and goal {low:g} to {high:g} m apart were found between {list(box.low)} and "
                 f"{list(box.high)}; write another box_m or distance_m, or other options"
             )
+        # Given by options: drawn ones are farther apart than the reach.
         if math.dist(start, goal) <= self._reach:
             raise ScenarioError(f"start {list(start)} is within reach_m={self._reach:g} of goal {list(goal)}")
         return start, goal
@@ -236,6 +238,7 @@ class UavPathV1Env(FlightEnv):
     def _space(self, box: tuple[Vector, Vector]) -> Airspace:
         # Made once: scenery is known behind the first reset, and it stays.
         if self._airspace is None and self._session is not None:
+            # The world keeps the object at its clearance, up to rounding: a start exactly there may be inside.
             clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN
             self._airspace = Airspace(self._low, self._high, clearance, self._session.scenery)
         if self._airspace is None:
@@ -276,6 +279,7 @@ class UavPathV1Env(FlightEnv):
         mine = np.array([pair in served for pair in zip(link.tx, link.rx, strict=True)], np.bool_)
         if not mine.any():
             return 0.0, 1.0
+        # Beyond the best that counts nothing is gained: the part stays within −1…0.
         efficiency = np.minimum(link.spectral_efficiency[mine] / self._efficiency, 1.0)
         in_outage = ~link.has_path[mine] | (link.snr[mine] < self._outage_snr)
         return float(efficiency.mean()), float(in_outage.mean())

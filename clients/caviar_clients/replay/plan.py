@@ -110,6 +110,7 @@ def service_named(services: Mapping[str, ServiceSpec], name: str, option: str) -
 
 
 def _halves(text: str, option: str, example: str) -> tuple[str, str]:
+    # The first sign: a value may hold others.
     name, separator, value = text.partition("=")
     if not separator or not name.strip() or not value.strip():
         raise RunError(f"{option} {text}: write it as in {option} {example}")
@@ -127,6 +128,7 @@ def _settings(services: Mapping[str, ServiceSpec], texts: Sequence[str]) -> dict
         table = found.setdefault(service_named(services, name, f"--set {text}"), {})
         for key in keys[:-1]:
             table = table.setdefault(key, {})
+            # As in --set a.b=1 --set a.b.c=2.
             if not isinstance(table, dict):
                 raise RunError(f"--set {text}: {key!r} was given a value of its own before; leave out one")
         table[keys[-1]] = value
@@ -156,6 +158,7 @@ def _typed(given: Any, expected: Any) -> Any:
     if isinstance(given, Mapping):
         return {key: _typed(value, Any) for key, value in given.items()}
     value = _value(given)
+    # `1e3` is a number to TOML, and may be the name of something to the field.
     return given if not _fits(value, expected) and _fits(given, expected) else value
 
 
@@ -192,7 +195,9 @@ class Role:
     name: str
     part: Part
     use: str
+    """The implementation that it has in the replay, or had where it is served as recorded."""
     why: str
+    """For the user: what that follows from, or what is served."""
 
 
 @dataclass(frozen=True)
@@ -237,12 +242,13 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
         run.scenario,
         run=replace(
             run.scenario.run,
-            pace="free",
+            pace="free",  # a recorded product is there at once, and a replay has no real time to keep
             episodes=len(run.lengths),
             seed=run.recording.metadata.seed,
             record=tuple(entry for entry in run.demand if entry.partition(".")[0] in produced),
         ),
         services=services,
+        # By name: a world that is left out must not make another one the default.
         devices=tuple(
             replace(device, world=world_of(run.scenario, index))
             for index, device in enumerate(run.scenario.devices)
@@ -255,6 +261,7 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
         frames=length,
         roles=roles,
         notes=(*cut, *_notes(run, roles, missed)),
+        # Where nothing changed and nothing was late, every product has to come out as it was.
         identical=not request.changed and not missed,
     )
 
@@ -286,6 +293,7 @@ def _spec(role: Role, run: RecordedRun, request: Request) -> ServiceSpec:
     if role.part == "recorded":
         return served_from_recording(spec, run.topics[role.name], run.recording.directory)
     if role.part == "replaced":
+        # Another implementation has other settings: those of the old one would be refused.
         same = role.use == spec.use
         given = request.settings.get(role.name, {})
         changed = merged(spec.settings if same else {}, typed(given, settings_type(spec.role, role.use)))
@@ -304,7 +312,7 @@ def _check_needs(hellos: dict[str, Hello], roles: tuple[Role, ...], run: Recorde
     for name, hello in hellos.items():
         for item in hello.inputs:
             if hello.role == "recorder":
-                continue
+                continue  # it takes all topics, and records those there are
             sources = [other for other, its in hellos.items() if item.topic in its.outputs]
             if not sources and item.required:
                 raise RunError(_not_recorded(name, item, run))
@@ -341,6 +349,7 @@ def _length(run: RecordedRun, roles: tuple[Role, ...], frames: int | None) -> tu
     agents = [r for r in roles if r.part == "recorded" and run.hellos[r.name].role == "agent"]
     shortest, longest = min(run.lengths.values()), max(run.lengths.values())
     found, notes = longest, []
+    # A served product lacks beyond the end of its episode: no episode may be longer than the shortest.
     if not agents and any(role.part == "recorded" for role in roles):
         found = shortest
         if shortest < longest:
@@ -354,6 +363,7 @@ def _length(run: RecordedRun, roles: tuple[Role, ...], frames: int | None) -> tu
 
 def _notes(run: RecordedRun, roles: tuple[Role, ...], missed: list[str]) -> list[str]:
     runs = {role.name for role in roles if role.part in ("replaced", "again")}
+    # A world that is served moves as it did, whatever the agents of this run decide.
     acts = any(run.scenario.services[name].role == "agent" for name in runs)
     notes = []
     for role in roles:

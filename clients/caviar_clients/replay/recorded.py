@@ -102,6 +102,7 @@ class RecordedRun:
             Names of services, without recorders and services of which nothing was recorded.
         """
         found: set[str] = set()
+        # Inputs of a frame before count, too: the graph has circles, as from the link back to the agent.
         todo = list(names)
         while todo:
             name = todo.pop()
@@ -121,6 +122,7 @@ class RecordedRun:
 
     def digest(self, frames: int) -> str:
         """Work out the digest of the run, had its episodes had ``frames`` frames at most."""
+        # As the broker does: of each frame the digests of its fresh products.
         chain = RunDigest()
         for index in range(len(self.recording)):
             entry = self.recording.entry(index)
@@ -167,6 +169,7 @@ def timings_of(run: RecordedRun) -> dict[str, Timing]:
 
 def measured_rate(run: RecordedRun) -> float:
     """Work out the frame rate of a recorded run after its warm-up frames [1/s]; 0 where it is unknown."""
+    # Without the first tenth, at most ten frames, in which services compile kernels and fill caches.
     finished = _archive(run)["finished_ns"]
     first = min(10, len(finished) // 10)
     if len(finished) - first < 2 or finished[-1] == finished[first]:
@@ -205,6 +208,7 @@ def _not_fresh(inputs: Iterable[GrantInput], name: str) -> Iterator[GrantInput]:
 
 def _timing(run: RecordedRun, name: str, values: npt.NDArray[np.int64]) -> Timing:
     outcomes = [(at, outcome) for at, outcome in outcomes_of(run, name) if outcome != "skipped"]
+    # Latencies carry no frame: they are assigned in order, if there are as many as answers.
     exact = len(outcomes) == len(values)
     if exact:
         times = dict(zip(_in_order_of_latencies(outcomes), values.tolist(), strict=True))

@@ -162,6 +162,7 @@ class OutsideAgent(Service[OutsideSettings]):
         if self.settings.except_users:
             # The broker gives it what other agents do not own: which users that is, it knows alone.
             return Prepared(notes=("serves the users whom no other agent owns",), seed=seed)
+        # A bare pattern names users, whose beams are meant.
         owned = tuple(text if ":" in text else BEAM + text for text in self.settings.users)
         return Prepared(actuators=owned, seed=seed)
 

@@ -74,6 +74,7 @@ def _used_by(settings: object) -> Iterator[str]:
         if isinstance(name := settings.get("use"), str):
             yield name
         settings = settings.values()
+    # Rungs stand in a list of tables, a reference in a table.
     if isinstance(settings, Iterable) and not isinstance(settings, str):
         for value in settings:
             yield from _used_by(value)
@@ -116,11 +117,12 @@ def check_implementations(scenario: Scenario) -> Scenario:
     Raises:
         ScenarioError: As of `checked_scenario`.
     """
+    # Before classes are loaded; the processes of services get the same folders on their command lines.
     for folder in module_folders(scenario):
         find_modules_in(folder)
     produced: set[str] = set()
     for name, spec in scenario.services.items():
-        if spec.remote:
+        if spec.remote:  # another program, which says what it produces when it joins
             produced.update(TOPICS_OF[spec.role])
             continue
         try:
@@ -132,7 +134,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
         implementation.check_settings(convert_settings(implementation.Settings, spec.settings, place), place)
         produced.update(implementation.outputs)
     for index, entry in enumerate(scenario.run.record):
-        topic = entry.partition(".")[0]
+        topic = entry.partition(".")[0]  # of a part, as channel.taps
         if topic not in produced:
             raise scenario_error(
                 scenario,

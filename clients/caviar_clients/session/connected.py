@@ -170,6 +170,11 @@ def agent_of(scenario: Scenario, agent: str | None) -> str:
 
     Raises:
         ScenarioError: There is no such agent, or there are several; the text names those there are.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> agent_of(load_scenario("smoke"), None)
+        'agent'
     """
     agents = {name: spec for name, spec in scenario.services.items() if spec.role == "agent"}
     remote = [name for name, spec in agents.items() if spec.remote]
@@ -208,6 +213,10 @@ def open_session(
 
     Raises:
         ScenarioError: A broker and a directory are given; a broker records where it was started.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> open_session(load_scenario("smoke"), "agent", (Input(topic="scene"),)).close()
     """
     if broker is None:
         return EmbeddedSession(scenario, agent, inputs, directory, with_scenery)

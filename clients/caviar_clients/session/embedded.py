@@ -86,6 +86,12 @@ class EmbeddedRun:
             them.
         imposed: Decisions that services take over in place of their own, as
             `caviar_protocol.recording.reader.recorded_decisions` finds them.
+
+    Example:
+        >>> from caviar_clients.session.checks import checked_scenario
+        >>> outcome = EmbeddedRun(checked_scenario("smoke", frames=3), directory=None).run()
+        >>> outcome.error
+        ''
     """
 
     def __init__(
@@ -106,13 +112,15 @@ class EmbeddedRun:
         scenario = with_ownership(scenario)
         folder = (directory or Path()).resolve()
         plan = plan_run(scenario, folder.name, briefings(scenario, folder))
-        # A service that runs ahead gains nothing in one process, and in vain where an agent ends the episode.
         plan = with_replay(plan, scenario.replay)
         imposed = plan.imposed if imposed is None else imposed
         store = AssetStore()
         plan = replace(
             plan,
+            # A service that runs ahead gains nothing in one process, and computes in vain where an agent ends
+            # the episode.
             frames_in_flight=1,
+            # No service can be lost and come back: where this process dies, all of them do.
             checkpoint_frames=0,
             ephemeral=directory is None,
             imposed=imposed,
@@ -131,6 +139,7 @@ class EmbeddedRun:
         self._orders: deque[ev.Send] = deque()
         # Not fed at once: a service answers within `handle`, and the clock must not be entered twice.
         self._events: deque[ev.Event] = deque()
+        # Without a recorder nothing needs bytes: products go to their consumers as the objects that they are.
         self._encodes = directory is not None
         check, seats = ContentCheck(), seats or {}
 
@@ -146,7 +155,12 @@ class EmbeddedRun:
         }
 
     def run(self) -> ev.Finished:
-        """Run to the end."""
+        """Run to the end.
+
+        Returns:
+            How the run ended: its digest, and an error with the service to blame, both empty where there is
+            none.
+        """
         for _ in self.steps():
             pass
         if self.outcome is None:
@@ -156,8 +170,8 @@ class EmbeddedRun:
     def steps(self) -> Generator[None, None, None]:
         """Run to the end, and yield after each step of a service or of the clock.
 
-        Do not go on while a seat has a frame that is not answered. However the loop is left, every service
-        is closed.
+        A frame of a seat has to be answered before the next step. However the loop is left, every service is
+        closed.
         """
         with ExitStack() as stack:
             if self._journal is not None:
@@ -167,6 +181,7 @@ class EmbeddedRun:
             for session in self._sessions.values():
                 self._feed(ev.Joined(session.hello()))
             while self.outcome is None:
+                # Answers before orders: the clock decides what is granted next from all that is known.
                 if self._events:
                     self._feed(self._events.popleft())
                 elif self._stop_reason:
@@ -179,13 +194,15 @@ class EmbeddedRun:
                 yield
 
     def stop(self, reason: str) -> None:
-        """End the run behind what is being done. May be called from a signal handler."""
+        """End the run after the present step, for a reason that its outcome gets. May be called from a signal
+        handler."""
         self._stop_reason = reason
 
     def _obey(self, order: ev.Send) -> None:
         session = self._sessions[order.service]
         payloads = [product.payload for product in order.products]
         parts = [part for payload in payloads for part in payload] if self._encodes else payloads
+        # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
         session.handle(order.message, parts)
         if self._journal is not None and type(order.message) is m.Grant:
@@ -229,6 +246,7 @@ class EmbeddedRun:
         while actions := self._clock.actions():
             entries: list[ev.Journal] = []
             for action in actions:
+                # The two kinds that every frame has, before the others and without a match statement.
                 kind = type(action)
                 if kind is ev.Send:
                     self._orders.append(action)  # type: ignore[arg-type]  # its type was looked at
@@ -236,6 +254,7 @@ class EmbeddedRun:
                     entries.append(action)  # type: ignore[arg-type]
                 elif kind is not ev.Latency:
                     self._tell(action)
+            # One write for all entries of a turn, and one event for the clock: the last number covers all.
             if entries and self._journal is not None:
                 self._journal.write(entries)
                 self._clock.receive(ev.Journaled(entries[-1].number), self._now)
@@ -265,7 +284,7 @@ def _without_recorders(scenario: Scenario) -> Scenario:
 ENDLESS = 2**53
 """Episodes of a run that goes on until it is closed."""
 KEPT_NOTICES = 100
-"""Notices that are kept."""
+"""Notices that a session keeps: the newest."""
 
 
 class EmbeddedSession(Session):
@@ -277,6 +296,9 @@ class EmbeddedSession(Session):
         inputs: What it consumes.
         directory: Where recorder and journal write; None: nothing is written, which is a lot faster.
         with_scenery: Whether `Session.scenery` is looked up.
+
+    Raises:
+        DeclarationError: What services declare does not make a run.
     """
 
     def __init__(

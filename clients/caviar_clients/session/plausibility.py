@@ -143,6 +143,7 @@ def _arrays(scenario: Scenario) -> _Warnings:
         for name in ("vertical_spacing", "horizontal_spacing"):
             if getattr(array, name) > WIDEST:
                 yield f"{key}.{name}", f"is {getattr(array, name):g} wavelengths; write it in wavelengths"
+        # Elements at one place see the same wave: they are no second panel.
         seen: dict[Panel, int] = {}
         for number, panel in enumerate(array.panels):
             if math.hypot(*panel.position_m) > FARTHEST_PANEL_M:
@@ -170,7 +171,7 @@ def _ladders(scenario: Scenario) -> _Warnings:
     for place, _, settings in _configured(scenario, "channel"):
         if not isinstance(settings, AdaptiveSettings) or settings.reference is None:
             continue
-        *rungs, (_, reference) = models(settings, place)
+        *rungs, (_, reference) = models(settings, place)  # the reference stands last
         depth = getattr(reference, "max_depth", 0)
         deeper = [
             rung.label

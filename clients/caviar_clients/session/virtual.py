@@ -81,6 +81,7 @@ class VirtualRun:
         while self._clock.state is not RunState.FINISHED:
             deadline = self._clock.next_deadline()
             event = self._queue[0][0] if self._queue else None
+            # An answer at its deadline is in time.
             if event is not None and (deadline is None or event <= deadline):
                 self._now, _, what = heapq.heappop(self._queue)
                 self._feed(what)
@@ -107,6 +108,7 @@ class VirtualRun:
         match action:
             case ev.Send(service=name, message=message):
                 self._deliver(name, message)
+            # A journal takes no time here; without its answer the clock would hold back what depends on it.
             case ev.Journal(number=number, outcome=outcome, service=name):
                 self._after(0, ev.Journaled(number))
                 if outcome in ("overdue", "skipped"):
@@ -139,6 +141,7 @@ class VirtualRun:
 
     def _granted(self, name: str, grant: m.Grant) -> None:
         """Answer a grant once the service has done all it was granted before: it does one at a time."""
+        # A final grant carries the link to an agent, which answers without a product.
         takes = self._takes(name, grant.episode, grant.frame)
         self._busy[name] = max(self._now, self._busy[name]) + takes
         hello = self._hellos[name]
