@@ -238,7 +238,7 @@ class UavPathV1Env(FlightEnv):
     def _space(self, box: tuple[Vector, Vector]) -> Airspace:
         # Made once: scenery is known behind the first reset, and it stays.
         if self._airspace is None and self._session is not None:
-            # The world keeps the object at its clearance, up to rounding: a start exactly there may be inside.
+            # The world keeps the object at its clearance, up to rounding: a start just there may be inside.
             clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN
             self._airspace = Airspace(self._low, self._high, clearance, self._session.scenery)
         if self._airspace is None:
