@@ -174,8 +174,10 @@ def test_sensors_are_seen_to_the_last_frame_and_what_is_not_known_is_zeros_hande
 ) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
     # As a world whose objects come and go: that of `smoke` refuses a device on an object that cannot come.
+    known = TrajectoryWorld.known_objects
+    monkeypatch.setattr(TrajectoryWorld, "prefixes", lambda world: tuple(known(world.settings) or ()))
+    monkeypatch.setattr(TrajectoryWorld, "mesh_classes", lambda world: ("car", "uav"))
     monkeypatch.setattr(TrajectoryWorld, "known_objects", classmethod(lambda *_: None))
-    monkeypatch.setattr(TrajectoryWorld, "prefixes", lambda _: ("car", "uav"))
     path = tmp_path / "scenario.toml"
     path.write_text((SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + SENSORS)
     observe = ("lidar_grid", "camera:wall", "depth:wall", "camera:bird")
