@@ -16,8 +16,7 @@ from caviar_clients.conform.canonical import (
     product_digest,
     unpack,
 )
-from caviar_clients.conform.case import Failed
-from caviar_clients.conform.client import Received
+from caviar_clients.conform.client import Failed, Received
 
 HEADER, BODY = street.product("scene", "traffic", 3)
 POSITION = pack([0.0, -10.0, 9.0])

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
@@ -20,18 +19,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from caviar_clients.conform import content, frames, lifecycle, wrong
-from caviar_clients.conform.case import Case, Failed, NotApplicable, Outcome, Verdict
+from caviar_clients.conform.case import Case, Kit, Verdict
 from caviar_clients.conform.client import ByHand, Client, Rules, Started, Wire
-from caviar_clients.conform.session import CONNECTING, JOINED, PATIENCE, READY, Seen, Session
-from caviar_protocol.errors import RunError, SetupError, suggestion
+from caviar_protocol.errors import SetupError, suggestion
 from caviar_protocol.keys import ROLES
 
 __all__ = ["Case", "Kit", "Rules", "Verdict", "cases", "conform"]
-
-LONGEST = 600
-"""Characters of what came, in a verdict: a client's texts may have any length."""
-HOPELESS_AFTER = 2
-"""Lives in a row that may fail to get as far as a case needs, before all other cases fail without a try."""
 
 
 def cases() -> tuple[Case, ...]:
@@ -53,117 +46,6 @@ def cases() -> tuple[Case, ...]:
         *frames.AFTERWARDS,
         lifecycle.canonical,
     )
-
-
-class Kit:
-    """What a case works with: the present life of the client, or a new one.
-
-    Args:
-        wire: Socket that the client comes to.
-        client: Starts it.
-        rules: What the user states about it.
-    """
-
-    def __init__(self, wire: Wire, client: Client, rules: Rules) -> None:
-        self.rules = rules
-        self.seen = Seen()
-        self._wire, self._client = wire, client
-        self._session: Session | None = None
-        # Why lives did not get as far as a case needed, since the last one that did.
-        self._unborn: list[str] = []
-        # Whether any life has sent anything: until then a status other than 0 is the command's own fault.
-        self._heard = False
-
-    # --- for the cases -----------------------------------------------------------------------------
-
-    def at(self, stage: int) -> Session:
-        """Return a session in this stage: the present one where it has not passed it, else a new life.
-
-        Args:
-            stage: `CONNECTING`, `JOINED`, `READY` or `ACTIVE`.
-
-        Raises:
-            Failed: The client does not get there.
-        """
-        # A life goes on from case to case as long as it can: starting the client takes most of the time.
-        session = self._session
-        if session is None or session.stage > stage or session.client.ended() is not None:
-            session = self.fresh()
-        try:
-            if session.stage == CONNECTING and stage > CONNECTING:
-                session.welcome()
-            if session.stage == JOINED and stage > JOINED:
-                session.prepare()
-            if session.stage == READY and stage > READY:
-                session.reset(0)
-        except Failed as failed:
-            # Once more from the start for the next case: this failure may be that case's own business.
-            self._unborn.append(str(failed))
-            raise
-        self._unborn.clear()
-        return session
-
-    def fresh(self) -> Session:
-        """End the present life and return a new one, which has said HELLO."""
-        self.discard()
-        if len(self._unborn) >= HOPELESS_AFTER:
-            raise Failed("a client that gets as far as this case", f"none: {self._unborn[-1]}")
-        self._session = Session(self._wire, self._client, self.rules, self.seen)
-        try:
-            self._session.begin()
-        except Failed as failed:
-            self._check_command(self._session)
-            # No HELLO is hopeless at once: each further try would wait `START_S` for it.
-            self._unborn += [str(failed)] * HOPELESS_AFTER
-            raise
-        self._heard = True
-        return self._session
-
-    def _check_command(self, session: Session) -> None:
-        """Raise `RunError` where the command fails by itself: no life of the client has sent anything."""
-        self._heard = self._heard or session.heard
-        end = self._client.ended()
-        if not self._heard and end is not None and end.status:
-            raise RunError(f"the client did not connect: {end}; see --command")
-
-    def discard(self) -> None:
-        """End the present life."""
-        if self._session is not None:
-            session, self._session = self._session, None
-            session.close()
-
-    # --- the run -----------------------------------------------------------------------------------
-
-    def judge(self, case: Case) -> Verdict:
-        """Play one case; a client that goes wrong fails it, and only the kit's own errors are raised."""
-        started = time.monotonic()
-        self.seen.allow(PATIENCE * self.rules.timeout_s)
-        expected = case.expected
-        outcome: Outcome = "pass"
-        try:
-            got = case.run(self)
-        except NotApplicable as reason:
-            outcome, got = "not applicable", str(reason)
-        except Failed as failed:
-            outcome, expected, got = "fail", failed.expected, failed.got
-            # What is wrong with this life must not be blamed on the next case.
-            self._drop()
-        return Verdict(
-            case=case.name,
-            title=case.title,
-            clauses=case.clauses,
-            outcome=outcome,
-            expected=expected,
-            got=got[:LONGEST],
-            seconds=round(time.monotonic() - started, 3),
-        )
-
-    def _drop(self) -> None:
-        """End a life that went wrong, whatever that takes."""
-        try:
-            self.discard()
-        except RunError as error:
-            self._unborn += [str(error)] * HOPELESS_AFTER
 
 
 def chosen(names: Sequence[str]) -> list[Case]:

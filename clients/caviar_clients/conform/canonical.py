@@ -13,8 +13,7 @@ from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 
-from caviar_clients.conform.case import Failed
-from caviar_clients.conform.client import BROKEN, Fields, Received, pack, unpack
+from caviar_clients.conform.client import BROKEN, Failed, Fields, Received, pack, unpack
 from caviar_protocol.codec import (
     check_parts,
     decode_message,
@@ -148,6 +147,28 @@ def _form(kind: str, raw: bytes) -> str:
     """«a float as `ca` (5 bytes)»."""
     article = f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} as " if kind else ""
     return f"{article}`{raw[0]:02x}` ({len(raw)} byte{'s' if len(raw) > 1 else ''})"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A message on the ordered connection that was read and judged."""
+
+    kind: str
+    fields: Fields
+    parts: list[bytes]
+
+    def product(self, topic: str) -> tuple[bytes, bytes] | None:
+        """Header and body of the product of a topic; None where the message has none."""
+        topics = [entry["topic"] for entry in self.fields.get("products", [])]
+        if topic not in topics:
+            return None
+        place = 1 + 2 * topics.index(topic)
+        return self.parts[place], self.parts[place + 1]
+
+    def __str__(self) -> str:
+        shown = ("code", "message", "frame")
+        words = {key: str(value)[:300] for key, value in self.fields.items() if key in shown}
+        return f"{self.kind} {words}" if words else self.kind
 
 
 def product_digest(header: bytes, body: bytes) -> str:

@@ -22,7 +22,6 @@ import msgpack  # type: ignore[import-untyped]
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from caviar_clients.conform.case import Failed
 from caviar_protocol.errors import RunError
 
 BROKEN = (ValueError, TypeError, RecursionError, msgpack.exceptions.UnpackException)
@@ -68,6 +67,23 @@ MAX_PART = 1 << 30
 """[B] of a part; a client that sends more is disconnected."""
 
 Fields = dict[str, Any]
+
+
+class Failed(Exception):  # noqa: N818 - a verdict, not an error of this program
+    """The client did something else than it should.
+
+    Args:
+        expected: What should have come, as a phrase.
+        got: What came, as a phrase.
+    """
+
+    def __init__(self, expected: str, got: str) -> None:
+        super().__init__(f"expected {expected}; got {got}")
+        self.expected, self.got = expected, got
+
+
+class NotApplicable(Exception):  # noqa: N818 - a verdict, not an error of this program
+    """The case does not concern this client; the text says why."""
 
 
 @dataclass(frozen=True)

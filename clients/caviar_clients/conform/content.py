@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
 from caviar_clients.conform import street
-from caviar_clients.conform.case import Case, Failed, NotApplicable, case
+from caviar_clients.conform.case import Case, Kit, case
+from caviar_clients.conform.client import Failed, NotApplicable
 from caviar_clients.conform.session import ACTIVE, Session
 from caviar_protocol import scene_validation as scenes
 from caviar_protocol.arrays import Float64Array
@@ -21,9 +22,6 @@ from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.validation import PartCheck
-
-if TYPE_CHECKING:
-    from caviar_clients.conform import Kit
 
 FRAMES = 4
 # Between two frames [rad]: behind half a turn (π) the other way round is the shorter one, and the rotation

@@ -5,18 +5,13 @@ With that capability a life's state is saved, and the next life takes it over (c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from caviar_clients.conform import canonical, street
-from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.client import End
+from caviar_clients.conform.canonical import Answer
+from caviar_clients.conform.case import Kit, case
+from caviar_clients.conform.client import End, Failed, NotApplicable
 from caviar_clients.conform.lifecycle import BEATS, check_beats
-from caviar_clients.conform.session import ACTIVE, Answer, Session
+from caviar_clients.conform.session import ACTIVE, Session
 from caviar_clients.conform.street import HELD_FOR, Inputs
-
-if TYPE_CHECKING:
-    from caviar_clients.conform import Kit
-
 
 FRAMES = 4
 

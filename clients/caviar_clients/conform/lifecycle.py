@@ -7,16 +7,13 @@ is the title that ``caviar conform --list`` prints.
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.client import End, Fields
-from caviar_clients.conform.session import ACTIVE, ATTEMPT, CONNECTING, EPOCH, JOINED, READY, Answer, Session
+from caviar_clients.conform.canonical import Answer
+from caviar_clients.conform.case import Kit, case
+from caviar_clients.conform.client import End, Failed, Fields, NotApplicable
+from caviar_clients.conform.session import ACTIVE, ATTEMPT, CONNECTING, EPOCH, JOINED, READY, Session
 from caviar_protocol.topics import PAYLOADS
-
-if TYPE_CHECKING:
-    from caviar_clients.conform import Kit
-
 
 BEATS = 10
 """Heartbeats that are due while they are counted."""

@@ -16,8 +16,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from caviar_clients.conform import canonical, street
-from caviar_clients.conform.case import Failed
-from caviar_clients.conform.client import BY_HAND_S, Client, End, Fields, Received, Rules, Wire, in_order
+from caviar_clients.conform.canonical import Answer
+from caviar_clients.conform.client import (
+    BY_HAND_S,
+    Client,
+    End,
+    Failed,
+    Fields,
+    Received,
+    Rules,
+    Wire,
+    in_order,
+)
 from caviar_clients.conform.street import Inputs
 
 CHUNK = 700
@@ -66,28 +76,6 @@ class Pulse:
     """Each HEARTBEAT."""
     wrong: list[str] = field(default_factory=list)
     """What came beside ATTACH and HEARTBEAT."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A message on the ordered connection that was read and judged."""
-
-    kind: str
-    fields: Fields
-    parts: list[bytes]
-
-    def product(self, topic: str) -> tuple[bytes, bytes] | None:
-        """Header and body of the product of a topic; None where the message has none."""
-        topics = [entry["topic"] for entry in self.fields.get("products", [])]
-        if topic not in topics:
-            return None
-        place = 1 + 2 * topics.index(topic)
-        return self.parts[place], self.parts[place + 1]
-
-    def __str__(self) -> str:
-        shown = ("code", "message", "frame")
-        words = {key: str(value)[:300] for key, value in self.fields.items() if key in shown}
-        return f"{self.kind} {words}" if words else self.kind
 
 
 class Session:

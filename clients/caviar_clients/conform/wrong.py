@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
 
-from caviar_clients.conform.case import Failed, NotApplicable, case
-from caviar_clients.conform.client import End, Fields, pack
+from caviar_clients.conform.canonical import Answer
+from caviar_clients.conform.case import Kit, case
+from caviar_clients.conform.client import End, Failed, Fields, NotApplicable, pack
 from caviar_clients.conform.lifecycle import BEATS, FEWEST_BEATS, attached_heart
-from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Answer, Session
+from caviar_clients.conform.session import ACTIVE, ATTEMPT, EPOCH, Session
 from caviar_clients.conform.street import Inputs
-
-if TYPE_CHECKING:
-    from caviar_clients.conform import Kit
 
 # Written out rather than imported: the kit is a second reading of SPEC.md, section Limits.
 MAX_HEADER = 1 << 20
