@@ -115,6 +115,7 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
         envelope = msgspec.msgpack.decode(state, type=_Envelope)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise RunError(f"{who}: these {len(state)} bytes are none ({error}); start the run again") from error
+    # Before anything is made of the body, so that a damaged one is called so, and not «no state of …».
     if _digest(envelope.body) != envelope.digest:
         raise RunError(f"{who}: its bytes are not those that were saved; start the run again")
     name = type(service).__qualname__

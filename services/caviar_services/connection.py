@@ -128,6 +128,7 @@ class Connection:
         # A wait in the socket itself: a poller would cost two calls more for each message.
         self._socket.rcvtimeo = POLL_MS
         self._socket.sndtimeo = SEND_TIMEOUT_MS
+        # libzmq drops a connection on which more comes, before it is in memory.
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BODY)
         self._heartbeat: HeartbeatThread | None = None
         self._rejoin_s = 0.0
@@ -328,7 +329,7 @@ class Handshake:
         socket.monitor(address, _WATCHED)
         self._watched = socket
         self._monitor = context.socket(zmq.PAIR)
-        self._monitor.rcvhwm = 0
+        self._monitor.rcvhwm = 0  # no limit: a success that is dropped would leave failures counted
         self._monitor.connect(address)
         self._endpoint, self._with_keys = endpoint, with_keys
         self._failures = 0
@@ -409,6 +410,7 @@ class HeartbeatThread(threading.Thread):
         self._lock = threading.Lock()
         self._progress, self._phase, self._grace_ns = 0, "", 0
         self._sign = SignOfLife()
+        # A descriptor, so that one poller waits for the socket and for the end at once.
         self._halt = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self.broker_silence: float | None = None
         """For how long the broker has been silent [s], once that is too long; None while it lives."""

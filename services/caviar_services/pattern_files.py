@@ -229,7 +229,7 @@ def _planet(file: Path, lines: list[str]) -> PatternTable:
     cuts: dict[str, _CutLines] = {}
     cut: _CutLines | None = None
     for number, text in enumerate(lines, 1):
-        parts = text.replace(",", ".").split()
+        parts = text.replace(",", ".").split()  # decimal commas, as some makers' tools write them
         key = parts[0].upper() if parts else ""
         if key in _CUTS:
             if key in cuts:
@@ -276,6 +276,7 @@ def _count(file: Path, line: int, parts: list[str]) -> int:
 
 
 def _gain(file: Path, line: int, parts: list[str]) -> float:
+    # «15.5dBi» in one word, and no unit at all, are both found in files of makers.
     if len(parts) == 1 and (joined := re.fullmatch(r"(.*\d\.?)(db[di])", parts[0], re.IGNORECASE)):
         parts = [*joined.groups()]
     unit = parts[1].lower() if len(parts) > 1 else "dbd"
@@ -307,6 +308,7 @@ class _CutLines:
                 f"{self.file}:{line}: the loss is {loss:g} dB; write the attenuation against GAIN, which is "
                 "positive"
             )
+        # 0° and 360° are one direction, which a cut that ends where it began has twice.
         if self.losses.setdefault(angle % 360.0, loss) != loss:
             raise AssetError(f"{self.file}:{line}: a second loss at {angle:g}°; remove one")
         self.read.append(line)

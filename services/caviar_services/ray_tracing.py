@@ -169,6 +169,7 @@ def cuda_devices(library: str = "libcuda.so.1") -> int:
         driver = ctypes.CDLL(library)
     except OSError:
         return 0
+    # A driver without a device, as in a container, is there and answers with an error.
     count = ctypes.c_int(0)
     if driver.cuInit(0) != 0 or driver.cuDeviceGetCount(ctypes.byref(count)) != 0:
         return 0

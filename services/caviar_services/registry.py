@@ -59,6 +59,7 @@ def registered() -> dict[str, str]:
     """
     found = dict(BUILT_IN)
     for point in entry_points(group=ENTRY_POINT_GROUP):
+        # The same value twice is one distribution that is installed twice, in editable mode for instance.
         if point.name in found and found[point.name] != point.value:
             raise DeclarationError(
                 f"{point.name} is registered twice, as {found[point.name]} and as {point.value}; "

@@ -86,6 +86,7 @@ class Replayer(Service[ReplaySettings]):
             )
         if self.role == "world":
             self._check_scenery()
+        # An agent that chose the first seed has to wish for it again; the run's own needs no wish.
         seed = self._episodes[0][1] if 0 in self._episodes else -1
         wished = seed if self.role == "agent" and seed != recording.metadata.seed else -1
         return Prepared(notes=(f"as recorded in {recording.path}",), seed=wished)

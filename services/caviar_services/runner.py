@@ -150,6 +150,7 @@ class Runner:
                 continue
             if isinstance(message, m.Refuse):
                 raise self._refused(message)
+            # Buffers, not copies: a frame of a channel or a LIDAR has megabytes.
             session.receive(message, [part.buffer for part in parts], time.monotonic())
 
     # --- joining -----------------------------------------------------------------------------------
@@ -234,6 +235,7 @@ class Runner:
                 return
 
     def _close(self) -> None:
+        # The connection last, and in any case: BYE may still be on its way.
         try:
             self._session.close()
         finally:

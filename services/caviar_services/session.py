@@ -214,6 +214,7 @@ class ServiceSession:
         fetch = self._fetch
         if fetch is None or now < fetch.deadline:
             return
+        # First, so that an answer that comes after all is «not asked for» instead of half of a file.
         self._fetch = None
         with self._reporting("prepare"):
             raise AssetError(
@@ -227,6 +228,7 @@ class ServiceSession:
 
     def close(self) -> None:
         """Let the service release what it holds. Further calls do nothing."""
+        # Forgotten first: a `close` that fails is not tried again.
         service, self._service = self._service, None
         if service is not None:
             service.close()
@@ -234,6 +236,7 @@ class ServiceSession:
     # --- joining and preparing ---------------------------------------------------------------------
 
     def _welcome(self, welcome: m.Welcome, _: Sequence[Any], __: float) -> None:
+        # Before the service is made: what goes wrong there is reported with epoch and attempt.
         self._identity = {"epoch": welcome.epoch, "attempt": welcome.attempt}
         # A FAULT, not an exception: the broker ends the run and names the key, whatever machine this is.
         with self._reporting("settings"):
