@@ -19,7 +19,7 @@ def pair(name: str) -> Path:
     """The public key of a pair, which is made if need be."""
     folder = ROOT / name
     public = folder / f"{name}.pub"
-    if not public.exists():  # it is written behind the secret key
+    if not public.exists():  # it is written after the secret key
         (folder / f"{name}.key").unlink(missing_ok=True)
         new(name, directory=folder)
     return public

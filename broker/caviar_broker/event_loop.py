@@ -13,7 +13,7 @@ import zmq
 from zmq.backend import zmq_poll
 
 PRIORITY = 1
-"""The least of the real-time class: before whatever computes, behind every other real-time task."""
+"""The least of the real-time class: ahead of whatever computes, after every other real-time task."""
 NICE = -10
 """Niceness that is asked for where the real-time class is not permitted."""
 
@@ -184,7 +184,7 @@ class Standby:
     several times what the write takes; here a write that is quick costs a lock.
 
     Args:
-        turn: One turn of the loop. It returns soon once ``fd`` is readable. Behind a `call` it takes nothing
+        turn: One turn of the loop. It returns soon once ``fd`` is readable. After a `call` it takes nothing
             for granted that it looked up before, since other turns may have been run meanwhile.
         over: Whether the loop is over.
     """

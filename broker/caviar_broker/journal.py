@@ -37,7 +37,7 @@ class CheckpointFiles:
     """``checkpoints/NAME-EPISODE-FRAME.bin`` in the directory of a run.
 
     A file is there as a whole or not at all. Kept of each service are the newest one of a frame that
-    is finished, since a broker that resumes goes on behind the last finished frame, and all later ones.
+    is finished, since a broker that resumes continues after the last finished frame, and all later ones.
 
     Args:
         directory: Of the run.
@@ -62,7 +62,7 @@ class CheckpointFiles:
         Args:
             service: Whose state it is.
             episode: Of the checkpoint.
-            frame: Behind which the state was taken.
+            frame: After which the state was taken.
             state: Its bytes.
         """
         path, data = self._folder / f"{service}-{episode}-{frame}.bin", memoryview(state)
@@ -147,10 +147,10 @@ class JournalFile:
     disk. Both and `compact` may be called from different threads, `write` and `compact` from one.
 
     Args:
-        path: The file; one that exists is gone on with behind its last whole entry.
+        path: The file; one that exists is continued after its last whole entry.
         epoch: Of the broker that writes.
         checkpoints: Where the states of services go; by default beside the journal.
-        end: Where to go on [B]; what is behind it is kept in a file of its own. By default the end of the
+        end: Where to go on [B]; what is past it is kept in a file of its own. By default the end of the
             log.
         run: Id of the run, by which a journal in the directory of another run is noticed.
         durable: Whether what is compacted has to be on the disk before it takes the place of what was there.
@@ -347,7 +347,7 @@ class JournalFile:
     # --- opening and closing ---------------------------------------------------------------------------
 
     def _continue_log(self, end: int | None) -> None:
-        """Go on with what another broker wrote; what is cut off is kept beside it."""
+        """Continue what another broker wrote; what is cut off is kept beside it."""
         reader = JournalReader(self.path)
         self.size = reader.end
         for entry in reader:

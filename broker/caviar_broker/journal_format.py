@@ -32,7 +32,7 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """One entry of the journal: what became of one service's part of one frame, or a turn of the run;
     see `caviar_broker.core.events.Journal`.
 
-    ``snapshot`` opens a compacted journal: the run up to ``frame``. Entries of earlier frames behind it are
+    ``snapshot`` opens a compacted journal: the run up to ``frame``. Entries of earlier frames after it are
     those that a grant may still need.
     """
 
@@ -79,20 +79,20 @@ class JournalReader:
         self.size = len(self._data)
         """Of the file [B]."""
         self.end, self.crc = 0, MAGIC_CRC
-        """Behind the last whole entry [B], and its CRC."""
+        """End of the last whole entry [B], and its CRC."""
         if self._data[: len(MAGIC)] == MAGIC:
             self.end = len(MAGIC)
         elif self.size and (self._data[0] & 0xF0 == 0x80 or self._data[0] == 0xDE):
             raise RecordingError(
                 f"{path} is a journal without checksums, of a version before this one: "
-                "go on with that run with the version that began it"
+                "resume that run with the version that began it"
             )
         elif self.size:
             self.problem = f"{path}: it does not begin as a journal"
 
     @property
     def lost(self) -> int:
-        """Bytes behind the end of the log."""
+        """Bytes past the end of the log."""
         return self.size - self.end
 
     def __iter__(self) -> Iterator[JournalEntry]:
@@ -107,7 +107,7 @@ class JournalReader:
             yield entry
 
     def payloads(self) -> Iterator[memoryview]:
-        """The bytes of the entries, each with `end` behind it."""
+        """The bytes of the entries, each with `end` after it."""
         while self.end >= len(MAGIC) and self.end < self.size:
             start = self.end + HEAD.size
             if start > self.size:
@@ -138,7 +138,7 @@ def run_of_journal(path: Path) -> str:
 
 
 def entry_head(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
-    """The head of an entry behind the one with the CRC ``before``, and its CRC; its bytes are ``pieces``."""
+    """The head of an entry after the one with the CRC ``before``, and its CRC; its bytes are ``pieces``."""
     length = sum(map(len, pieces))
     # The length is covered too: a damaged one must not be taken for that of a longer entry.
     crc = zlib.crc32(length.to_bytes(8, "little"), before)
@@ -187,7 +187,7 @@ class EntryIndex:
         self._known: dict[tuple[str, str, tuple[str, ...]], tuple[str, str, tuple[str, ...]]] = {}
 
     def extend(self, entries: Iterable[EntryLocation]) -> None:
-        """Note entries behind those that are known."""
+        """Note entries after those that are known."""
         for entry in entries:
             kind = entry.service, entry.outcome, entry.topics
             # One tuple for all entries of a kind; a run has a few kinds and millions of entries.

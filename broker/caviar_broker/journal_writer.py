@@ -29,7 +29,7 @@ class JournalWriter:
     """Writes a journal, and puts it on the disk as ``durability`` says. `write` may wait for the disk.
 
     Args:
-        file: The journal; its owner closes it behind `close`.
+        file: The journal; its owner closes it after `close`.
         durability: When entries have to be on the disk.
         sync_recording: Puts the recording on the disk, as far as it is handed over; under ``frame`` the
             recorder did so before it answered.
@@ -131,7 +131,7 @@ class JournalWriter:
                 if self._dirty_since is None:
                     self._dirty_since = now
                 self.doing = "fsync"
-                # Behind an error of the thread that synchronises, no sync will come.
+                # After an error of the thread that synchronises, no sync will come.
                 self._clean.wait_for(lambda: self._over or self.error is not None or not self._is_overdue())
 
     def _is_overdue(self) -> bool:

@@ -1,6 +1,6 @@
 """The broker as a process: ``python -m caviar_broker SCENARIO --bind URL --directory DIR``.
 
-``python -m caviar_broker --resume DIR`` goes on with a run that another broker left, at the address
+``python -m caviar_broker --resume DIR`` resumes a run that another broker left, at the address
 where that one listened unless ``--bind`` says another.
 
 With ``--control`` a launcher talks to it in JSON lines. On standard output come ``listening``,
@@ -121,7 +121,7 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     left = _left(directory, record, checkpoints, last) if arguments.resume else _NOTHING
     if left.is_cut and not has_recording(directory) and not arguments.force:
         raise RunError(
-            f"cannot go on with {directory}: its recording is gone; put it back, or begin again with --force"
+            f"cannot resume {directory}: its recording is gone; put it back, or begin again with --force"
         )
     resumption = left.resumption
     scheduling = raise_priority()  # before the threads of the port are started, which inherit it
@@ -229,14 +229,14 @@ def _resumed(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str,
     different = changes(before.versions, versions)
     if different and not arguments.force:
         raise RunError(
-            f"cannot go on with {directory}: it was begun with other versions, and its results may differ: "
-            f"{different}. Go on with the versions that began it, or with these by --force"
+            f"cannot resume {directory}: it was begun with other versions, and its results may differ: "
+            f"{different}. Resume it with the versions that began it, or with these by --force"
         )
     # The directory of a private socket goes with the launcher that made it.
     listened = DEFAULT_BIND if before.endpoint.startswith("ipc://") else before.endpoint
     endpoint = arguments.bind or listened
     record = msgspec.structs.replace(before, epoch=before.epoch + 1, endpoint=endpoint, versions=versions)
-    return record, directory, (f"the run goes on with other versions: {different}",) if different else ()
+    return record, directory, (f"the run continues with other versions: {different}",) if different else ()
 
 
 _NOTHING = ResumeState(None, None, ())
@@ -260,7 +260,7 @@ def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last
     over = found is not None and found.finished >= found.frames and found.episode + 1 >= scenario.run.episodes
     if over and last.exists() and last.stat().st_size:
         raise RunError(
-            f"cannot go on with {directory}: all its frames are finished, and so is it; "
+            f"cannot resume {directory}: all its frames are finished, and so is it; "
             "to run its scenario again leave out --resume"
         )
     return replace(left, losses=(*damage, *left.losses)) if left.is_cut else left
@@ -285,7 +285,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--local-key", default="", help="public key of the services that a launcher starts")
     found.add_argument("--http", default="", help="HOST:PORT: serve HTTP and WebSocket there")
     found.add_argument("--directory", type=Path, help="where the run is written")
-    found.add_argument("--resume", type=Path, help="go on with the run in this directory, and nothing else")
+    found.add_argument("--resume", type=Path, help="resume the run in this directory, and nothing else")
     found.add_argument("--force", action="store_true", help="with --resume: though versions have changed")
     found.add_argument("--run", default="", help="id of the run; by default the directory's name")
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")

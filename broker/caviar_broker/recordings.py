@@ -85,7 +85,7 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
         try:
             refuse_other_kinds(path, PUT_BACK)
         except OSError as error:
-            raise RunError(f"cannot go on with {directory}: {path}: {error.strerror}") from error
+            raise RunError(f"cannot resume {directory}: {path}: {error.strerror}") from error
     # Each file says by itself which run it is of; copies of a directory keep that.
     runs = {journal.name: run_of_journal(journal)}
     # What is damaged is mended or reported by the reader of the recording; here it only must not be
@@ -98,7 +98,7 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
     strange = [f"{name} is of run {other!r}" for name, other in runs.items() if other not in ("", run)]
     if strange:
         raise RunError(
-            f"cannot go on with {directory}: run.json is of run {run!r}, but {' and '.join(strange)}; "
+            f"cannot resume {directory}: run.json is of run {run!r}, but {' and '.join(strange)}; "
             "put the files of one run together"
         )
 

@@ -1,4 +1,4 @@
-"""What the journal of a run says that a broker needs to go on with it (contract, clause 18)."""
+"""What the journal of a run says that a broker needs to resume it (contract, clause 18)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def read_resumption(
     losses = []
     at = f"episode {resumption.episode}, frame {resumption.finished}" if resumption else "the first frame"
     if reader.problem:
-        losses.append(f"{reader.problem}; {reader.lost} B behind it are lost, and the run goes on with {at}")
+        losses.append(f"{reader.problem}; {reader.lost} B after it are lost, and the run continues with {at}")
     if found.is_cut:
         losses.append(f"the recording ends before {at}: what the journal has from there on is run again")
     return ResumeState(resumption, end, tuple(losses), found.is_cut)
@@ -122,7 +122,7 @@ class _Reader:
         if self._recorded is not None and self._recorded < (entry.episode, entry.frame):
             raise RecordingError(
                 f"the recording has {self._recorded[1]} frames of episode {self._recorded[0]}, and the "
-                f"journal begins behind frame {entry.frame - 1} of episode {entry.episode}: what is "
+                f"journal begins after frame {entry.frame - 1} of episode {entry.episode}: what is "
                 "between is lost, and the run cannot go on"
             )
         self._begin, self._digest = entry, RunDigest(entry.digest)
@@ -131,7 +131,7 @@ class _Reader:
         self._complete_from = entry.facts["base"]
 
     def _forget(self, frame: int) -> None:
-        """The run went on with this frame: what had been decided from there on does not count."""
+        """The run was resumed with this frame: what had been decided from there on does not count."""
         tables: list[dict[int, Any]] = [
             *self._tasks.values(),
             *self._products.values(),
@@ -226,7 +226,7 @@ class _Reader:
             state = self._content(states[frame])
             if state is not None:
                 return frame, state
-            del states[frame]  # it was removed behind a newer one, or is damaged
+            del states[frame]  # it was removed after a newer one, or is damaged
         return -1, None
 
     def _content(self, saved: JournalEntry) -> bytes | None:

@@ -1,4 +1,4 @@
-"""What a run directory says about its run, so that another broker can go on with it."""
+"""What a run directory says about its run, so that another broker can resume it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
 
     Libraries for ray tracing and traffic count where a service that `caviar run` starts may use them.
     """
-    read = msgspec.structs.replace(scenario, source=Source())  # a run goes on with what was read
+    read = msgspec.structs.replace(scenario, source=Source())  # a run is resumed with what was read
     used = {spec.use for spec in scenario.services.values()}
     libraries = [*LIBRARIES]
     libraries += TRAFFIC if "sumo" in used else ()
@@ -158,21 +158,21 @@ def read_record(directory: Path) -> RunRecord:
     except OSError as error:
         if isinstance(error, FileNotFoundError) and RunDirectory(directory).journal.exists():
             raise RecordingError(
-                f"cannot go on with {directory}: it has no {path.name}, and an embedded run cannot be "
-                "gone on with; run its scenario again"
+                f"cannot resume {directory}: it has no {path.name}, and an embedded run cannot be "
+                "resumed; run its scenario again"
             ) from error
         remedy = "; give the directory of a run" if isinstance(error, FileNotFoundError) else ""
-        raise RecordingError(f"cannot go on with {directory}: {path}: {error.strerror}{remedy}") from error
+        raise RecordingError(f"cannot resume {directory}: {path}: {error.strerror}{remedy}") from error
     found = _CHECK.search(data)
     if found is None or hashlib.sha256(_blanked(data, found)).hexdigest() != found[1].decode():
         why = "it is empty" if not data.strip(b"\0") else "its content is not that of its SHA-256"
         if found is None and b'"scenario"' in data and b'"check"' not in data:
-            why = "it has no check value; a run that another version began is gone on with by that version"
-        raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {why}")
+            why = "it has no check value; a run that another version began is resumed by that version"
+        raise RecordingError(f"cannot resume {directory}: {path} is damaged: {why}")
     try:
         return msgspec.json.decode(data, type=RunRecord)
     except msgspec.MsgspecError as error:
-        raise RecordingError(f"cannot go on with {directory}: {path} is damaged: {error}") from error
+        raise RecordingError(f"cannot resume {directory}: {path} is damaged: {error}") from error
 
 
 def _blanked(data: bytes, found: re.Match[bytes]) -> bytes:

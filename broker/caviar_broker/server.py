@@ -340,7 +340,7 @@ class BrokerServer:
     def _write_journal(self) -> None:
         """Clause 18: nothing that relies on an entry is granted before the system has it.
 
-        Written once a grant waits for it, behind the last answer of a frame, and whenever deadlines are
+        Written once a grant waits for it, after the last answer of a frame, and whenever deadlines are
         looked at; so services that answer one after the other cost one write.
         """
         while self._entries and not self._standby.calling:

@@ -79,7 +79,7 @@ def describe_exit(code: int) -> str:
 
 
 def _stat(pid: int) -> list[str] | None:
-    """Fields of /proc/PID/stat behind the command name, state first; None where it is gone."""
+    """Fields of /proc/PID/stat after the command name, state first; None where it is gone."""
     try:
         with open(f"/proc/{pid}/stat", "rb", buffering=0) as file:  # noqa: PTH123 - read 100 times a second
             text = file.read()

@@ -45,7 +45,7 @@ def run(runs: Path, tmp_path: Path) -> Path:
 
 
 def refusal(run: Path) -> str:
-    """With which a broker that is to go on with a run ends."""
+    """With which a broker that is to resume a run ends."""
     with pytest.raises(CaviarError) as refused:
         serve(parser().parse_args(["--resume", str(run)]))
     return str(refused.value)

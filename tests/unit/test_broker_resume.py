@@ -1,4 +1,4 @@
-"""Clause 18: a broker goes on with a run from its journal, in virtual time."""
+"""Clause 18: a broker resumes a run from its journal, in virtual time."""
 
 from __future__ import annotations
 

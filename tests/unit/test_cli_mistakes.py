@@ -109,7 +109,7 @@ def test_an_embedded_run_is_not_gone_on_with_and_says_why(
     assert caviar(monkeypatch, "run", SMOKE, "--frames", "2", "--embedded", "--out", tmp_path) == 0
     (run,) = tmp_path.iterdir()
     assert caviar(monkeypatch, "run", "--resume", run) == 1
-    assert "an embedded run cannot be gone on with" in capsys.readouterr().err
+    assert "an embedded run cannot be resumed" in capsys.readouterr().err
 
 
 def test_a_finished_run_is_not_gone_on_with_and_stays_as_it_is(

@@ -57,7 +57,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
     curve: bool
     """Whether with keys, encrypted."""
     frames: int
-    """That were measured, behind the warm-up."""
+    """That were measured, after the warm-up."""
     us_per_frame: MicrosecondsPerFrame
     bytes_per_second: float
     """Delivered to consumers [B/s]."""
@@ -88,7 +88,7 @@ def measure(
         topology: Which client takes what from which.
         services: Number of clients.
         payload: Of each product [B].
-        frames: That are measured, behind the warm-up.
+        frames: That are measured, after the warm-up.
         curve: Whether with keys.
         ipc: Whether at a socket file, as the services of `caviar run`; else over TCP.
 

@@ -22,7 +22,7 @@ from caviar_protocol.files import open_to_append
 from caviar_protocol.messages import STOPPED_BY
 
 MAX_PENDING = 1 << 18
-"""[B] of lines kept in memory; what comes behind them is read back from the log."""
+"""[B] of lines kept in memory; what comes after them is read back from the log."""
 LOG_S = 0.1
 """[s] that is waited for the disk to take lines of the log."""
 CHUNK = select.PIPE_BUF
@@ -288,7 +288,7 @@ class Reporter:
         self._see_to_the_rest()
 
     def finished(self, **values: Any) -> None:
-        """Report the outcome, behind everything else."""
+        """Report the outcome, after everything else."""
         if self._outbox.log_error:
             text = f"the log of notices is incomplete: {self._outbox.log_error}"
             self._outbox.event({"event": "notice", "kind": "note", "service": "", "frame": -1, "text": text})

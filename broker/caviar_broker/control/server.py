@@ -26,7 +26,7 @@ from caviar_broker.statistics import Statistics
 MAX_REQUEST = 1 << 12
 """[B] of a request."""
 MAX_WAITING = 1 << 18
-"""[B] that may wait for a client that does not read; behind that the connection is cut."""
+"""[B] that may wait for a client that does not read; beyond that the connection is cut."""
 MAX_CONNECTIONS = 32
 """Clients at once; another one is hung up on, and reads that too many ask."""
 FRAME_EVENT_NS = 50_000_000
@@ -277,7 +277,7 @@ class _Caller:
     def _watch(self) -> None:
         """Wait for what is due: room for what waits, the turn of the next request, or a request."""
         # A socket is nearly always writable: waiting for that gives a request that is here already its turn,
-        # behind what else the loop has to do.
+        # after what else the loop has to do.
         events = zmq.POLLOUT if self._waiting or b"\n" in self._received else zmq.POLLIN
         if events != self._watched:
             loop, self._watched = self._control.server.loop, events

@@ -117,7 +117,7 @@ def refuse_second_broker(directory: Path) -> None:
 def locked(directory: Path) -> Iterator[None]:
     """Lock a run's directory within the block, or until this process ends.
 
-    Two brokers that go on with a run at the same instant both find that no other answers, and the second
+    Two brokers that resume a run at the same instant both find that no other answers, and the second
     would cut the journal of the first. A file system without locks (some network ones) locks nothing.
 
     Raises:

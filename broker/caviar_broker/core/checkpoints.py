@@ -21,7 +21,7 @@ from caviar_protocol.messages import Checkpoint, Done, Fault, Restore
 
 CAPABILITY = "checkpoint"
 MAX_HISTORY_BYTES = 64 * 2**20
-"""[B] of products kept for a service, behind which its state is saved before its turn."""
+"""[B] of products kept for a service, beyond which its state is saved before its turn."""
 
 PayloadSize = Callable[[Any], int]
 """Size of a product's payload [B], which only the shell can tell."""
@@ -271,7 +271,7 @@ class Checkpoints:
             what = f"another {', '.join(topics)}"
         text = (
             f"{peer} answered frame {frame} again after its restart, with {what}: it is not "
-            "reproducible; the run goes on with what was decided"
+            "reproducible; the run continues with what was decided"
         )
         self._run.notice("differs", peer.name, text, frame)
 

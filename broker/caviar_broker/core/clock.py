@@ -90,7 +90,7 @@ class FrameClock:
 
         What services answer together is dispatched once, which is what keeps a frame of many services cheap.
         """
-        # What still arrives behind the end of a run is work for nothing, and changes no result.
+        # What still arrives after the end of a run is work for nothing, and changes no result.
         handler = self._late if self._run.over else self._handlers[type(event)]
         handler(event, now)
 

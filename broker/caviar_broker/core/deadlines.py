@@ -32,7 +32,7 @@ class PauseGate:
         self._held_since: int | None = None
 
     def pause(self, begun: int) -> None:
-        """Let no frame behind ``begun`` begin."""
+        """Let no frame after ``begun`` begin."""
         if not self.closed:
             self.closed, self.steps, self.begun, self._held_since = True, 0, begun, None
 
@@ -70,7 +70,7 @@ class Pacer:
 
     Frame 0 is released when a service first asks for it. A later one is due as long after the one
     before as simulated time says, divided by the run's speed; when no service is ready for it by then, all
-    frames behind it slip by as much. A timer that fires late delays its own frame, not those behind it. As
+    frames after it slip by as much. A timer that fires late delays its own frame, not those after it. As
     fast as possible, every frame is released at once.
 
     Args:

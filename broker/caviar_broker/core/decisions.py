@@ -154,7 +154,7 @@ class Participant:
     inputs: tuple[tuple[Edge, Participant], ...] = ()
     """Its edges with their sources, sorted by (topic, source)."""
     lagged: tuple[tuple[Edge, Participant], ...] = ()
-    """Those of lag 1, which alone count behind the last frame (clause 16)."""
+    """Those of lag 1, which alone count after the last frame (clause 16)."""
     latest: tuple[tuple[Edge, Participant], ...] = ()
     """All of them, those first that are decided last in a frame."""
     waiting: set[Participant] = field(default_factory=set)
@@ -243,7 +243,7 @@ class DecisionTable:
         tasks: Mapping[str, Mapping[int, Task]],
         newest: Mapping[tuple[str, str], tuple[Product, int]],
     ) -> None:
-        """Go on behind the last finished frame, with what `Resumption` has; the table must be new."""
+        """Continue after the last finished frame, with what `Resumption` has; the table must be new."""
         assert not self.finished_frames, "only a new table can go on"
         self.finished_frames, self.frames = finished, frames
         for name, participant in self.participants.items():
@@ -264,7 +264,7 @@ class DecisionTable:
 
     def undecided_source(self, participant: Participant, frame: int) -> Participant | None:
         """A source that has not decided what a service gets of it in a frame; None: all have (clause 7)."""
-        # From behind: once the last one is decided, so are mostly the others, and few looks are in vain.
+        # From the last on: once the last one is decided, so are mostly the others, and few looks are in vain.
         for edge, source in participant.latest if frame < self.frames else participant.lagged:
             if frame - edge.lag >= source.next_frame and frame >= edge.lag:
                 return source
@@ -375,7 +375,7 @@ class DecisionTable:
             self._renew(products.values(), number)
 
     def end_after(self, frame: int) -> list[Task]:
-        """End the episode with ``frame`` (clause 16); the tasks behind it, forgotten unless outstanding."""
+        """End the episode with ``frame`` (clause 16); the tasks after it, forgotten unless outstanding."""
         if frame + 1 >= self.frames:
             return []
         self.frames = frame + 1

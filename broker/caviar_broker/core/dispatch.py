@@ -84,7 +84,7 @@ class Dispatcher:
         everyone = self._participants.values()
         self._agents = tuple(p for p in everyone if p.plan.role == "agent")
         self._recorders = tuple(p for p in everyone if p.plan.role == "recorder")
-        # All but the recorders, those behind others in the graph first.
+        # All but the recorders, those after others in the graph first.
         self._others = tuple(p for p in reversed(everyone) if p.plan.role != "recorder")
         # Late products that no recorder has been granted (clause 11).
         self._late: list[Product] = []
@@ -97,7 +97,7 @@ class Dispatcher:
         self._seen_finished = 0
 
     def resume(self, before: Resumption, completed: Mapping[str, int]) -> None:
-        """Go on behind the last finished frame; ``completed`` says how far services got that have state."""
+        """Continue after the last finished frame; ``completed`` says how far services got that have state."""
         self.table.resume(before.finished, before.frames, before.tasks, before.newest)
         for participant in self._participants.values():  # lag 1 needs the last frame, nothing an earlier one
             tasks = participant.tasks
@@ -132,7 +132,7 @@ class Dispatcher:
         task.move(_ANSWER)
         if state is _ABANDONED:
             self.table.release(task)
-            self._notice("discarded", task, "answered behind the end of the episode; not used")
+            self._notice("discarded", task, "answered after the end of the episode; not used")
             return
         participant.completed = max(participant.completed, task.frame)
         self.deadlines.measure(task, now)
@@ -185,7 +185,7 @@ class Dispatcher:
         self.table.release(task)
 
     def _end_after(self, frame: int) -> None:
-        """Cut what lies behind ``frame``, with which an agent ends the episode (clause 16).
+        """Cut what comes after ``frame``, with which an agent ends the episode (clause 16).
 
         An agent that is late cannot undo what others did meanwhile: the episode then ends with the
         last frame that any agent was granted.
@@ -332,7 +332,7 @@ class Dispatcher:
                 inputs = table.gather_inputs(participant, frame)
             if written < inputs.entry or written < self._first_entry:
                 self._waiting_for_journal.add(participant)
-                # Behind another frame of the service, which is not decided yet, it will rely on more.
+                # After another frame of the service, which is not decided yet, it will rely on more.
                 task.inputs = None if in_flight else inputs
                 return
             if (self.plan.realtime or self._gate.closed) and not self._release(participant, task, now):
@@ -435,7 +435,7 @@ class Dispatcher:
     def _must_answer(self, participant: Participant) -> bool:
         """Whether the end of the episode waits for what a service still owes.
 
-        Behind the last episode there is no RESET that it had to be ready for, so a service that the run can
+        After the last episode there is no RESET that it had to be ready for, so a service that the run can
         do without is not waited for.
         """
         last = self.episode + 1 >= self.plan.episodes

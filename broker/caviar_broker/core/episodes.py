@@ -92,7 +92,7 @@ class Episodes:
             run.gate,
             histories,
         )
-        # Behind the dispatcher, so that frame 0 need not wait for these entries.
+        # After the dispatcher, so that frame 0 need not wait for these entries.
         facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": dispatcher.table.frames}
         before, run.resumption = run.resumption, None
         if before is not None:
@@ -128,7 +128,7 @@ class Episodes:
             self._ended, self.dispatcher = self.dispatcher, None
 
     def handle_last_recording(self, event: ev.DoneReceived, now: int) -> bool:
-        """Take a recorder's DONE behind the end of the run: whether it was such a one.
+        """Take a recorder's DONE after the end of the run: whether it was such a one.
 
         What the recorder wrote counts, so that the digest of the run is that of the recording.
         """

@@ -182,7 +182,7 @@ class Journal(msgspec.Struct, frozen=True):
     service: str
     outcome: str
     """``done``, ``fault``, ``overdue``, ``skipped``, or, for what came later, ``late``. Of the run:
-    ``episode`` (one begins), ``resumed`` (one goes on with this frame), ``end`` (an agent ends it with
+    ``episode`` (one begins), ``resumed`` (one continues with this frame), ``end`` (an agent ends it with
     this frame), ``seed`` (an agent chooses the next one's), ``checkpoint`` (a service saved its state)."""
     decisions: tuple[GrantInput, ...] = ()
     products: tuple[Product, ...] = ()
@@ -210,7 +210,7 @@ class Notice(msgspec.Struct, frozen=True):
 
 
 class Latency(msgspec.Struct, frozen=True):
-    """The figure behind p50 and p99: one for each grant once it is answered, late or not, or will never
+    """What p50 and p99 are computed from: one for each grant once it is answered, late or not, or will never
     be; and one for each frame that a service could not be granted before its deadline."""
 
     service: str

@@ -43,7 +43,7 @@ class Graph:
     producers: Mapping[str, tuple[str, ...]]
     """Sources of each topic, sorted."""
     retained: frozenset[str]
-    """Active services whose products someone takes with lag 1."""
+    """Active services whose products are taken with lag 1."""
     idle: tuple[str, ...]
     """Services whose outputs no service takes: not run."""
 
@@ -173,7 +173,7 @@ def _edges(hello: Hello, producers: Mapping[str, tuple[str, ...]]) -> list[Edge]
 
 
 def _topological_order(hellos: Mapping[str, Hello], edges: Mapping[str, list[Edge]]) -> list[str]:
-    # Depth first, by name, so that a consumer stands right behind its sources; graphlib orders by levels.
+    # Depth first, by name, so that a consumer stands right after its sources; graphlib orders by levels.
     order: list[str] = []
     trail: list[Edge] = []
 

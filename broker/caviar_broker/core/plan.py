@@ -133,10 +133,10 @@ class RunPlan:
         return self.checkpoint_frames > 0 and not self.ephemeral
 
     def t_ns(self, frame: int) -> int:
-        """Simulated time of a frame of any episode [ns]; one behind the last comes a period later."""
+        """Simulated time of a frame of any episode [ns]; one past the last comes a period later."""
         if not self.instants_ns:
             return frame * self.sampling_period_ns
-        # An agent's final grant stands behind the last frame, where the scenario lists no instant.
+        # An agent's final grant comes after the last frame, where the scenario lists no instant.
         last = len(self.instants_ns) - 1
         return self.instants_ns[min(frame, last)] + max(0, frame - last) * self.sampling_period_ns
 

@@ -165,7 +165,7 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class Resumption:
-    """What the core needs to go on with a run that another broker left, read from its journal."""
+    """What the core needs to resume a run that another broker left, read from its journal."""
 
     episode: int
     seed: int

@@ -23,7 +23,7 @@ class GrantStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     frame: int
     state: str
-    """``granted``; ``overdue`` where its frame has gone on without it, ``abandoned`` behind the end."""
+    """``granted``; ``overdue`` where its frame has gone on without it, ``abandoned`` after the end."""
     elapsed_s: float
     budget_s: float
 

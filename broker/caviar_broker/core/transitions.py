@@ -97,7 +97,7 @@ class TaskState(Enum):
     ABANDONED = auto()
     """Granted, but the episode ended before this frame; the answer is still due and not used."""
     DISCARDED = auto()
-    """Answered behind the end of the episode."""
+    """Answered after the end of the episode."""
 
 
 class TaskEvent(Enum):

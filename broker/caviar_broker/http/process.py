@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from caviar_broker.server import BrokerServer
 
 END_S = 3.0
-"""[s] that the process gets to end behind the broker's last frame, which it sees by itself."""
+"""[s] that the process gets to end after the broker's last frame, which it sees by itself."""
 
 
 class HttpProcess:

@@ -376,7 +376,7 @@ def _examine_record(
     except RecordingError as error:
         rebuilt = _rebuilt(recording, journal)
         part.state = "damaged" if rebuilt is not None else "lost"
-        part.lines = [str(error).removeprefix(f"cannot go on with {run}: ")]
+        part.lines = [str(error).removeprefix(f"cannot resume {run}: ")]
         if rebuilt is not None:
             part.lines.append("made anew from the recording's metadata and the journal")
         return rebuilt, part
