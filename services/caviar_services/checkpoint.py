@@ -138,7 +138,7 @@ def restored(service: Service[Any], version: int, cls: type[T], state: bytes) ->
 
 
 # What a state may depend on. The directory and the scenario as a whole are left out: a run that is moved, or
-# gone on with under other timeouts, has the same states.
+# resumed under other timeouts, has the same states.
 def _circumstances(service: Service[Any]) -> bytes:
     run = service.run
     known = (run.name, run.seed, run.sampling_period_ns, run.carriers, run.devices)

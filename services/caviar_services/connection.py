@@ -171,7 +171,7 @@ class Connection:
 
         Args:
             message: The message.
-            parts: What travels behind it.
+            parts: What follows it.
 
         Raises:
             Disconnected: The broker takes no messages any more.
@@ -225,7 +225,7 @@ class Connection:
         """Close both connections, which are lost, at once."""
         self._socket.linger = 0
         self.close()
-        if self._end is not None:  # asked behind the end of the heartbeat thread, which sets it
+        if self._end is not None:  # asked after the end of the heartbeat thread, which sets it
             self._end.set()
 
     def close(self) -> None:
@@ -312,7 +312,7 @@ ending may cause once."""
 def dress(socket: zmq.Socket[Any], endpoint: str, credentials: Credentials | None) -> None:
     """Give a socket what it needs before it connects. Raises `zmq.ZMQError` for impossible keys."""
     socket.setsockopt(zmq.IPV6, int("[" in endpoint))
-    # The system sends the packet that opens a connection again after 1, 3, 7 and 15 s: behind an outage of
+    # The system sends the packet that opens a connection again after 1, 3, 7 and 15 s: after an outage of
     # 8 s it would be silent for 7 s more.
     socket.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_TIMEOUT_MS)
     if credentials is not None:

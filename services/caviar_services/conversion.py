@@ -204,7 +204,7 @@ def decoded(payload: Payload) -> Payload:
 def encoded_done(
     identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
 ) -> tuple[m.Done, list[Any]]:
-    """Make DONE, and header and body of each product behind it.
+    """Make DONE, and header and body of each product after it.
 
     Args:
         identity: Epoch and attempt of the service.
@@ -274,7 +274,7 @@ def plain_done(
 
 
 def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
-    # Sorted, so that DONE and what is behind it are the same bytes whatever order a service makes them in.
+    # Sorted, so that DONE and what follows it are the same bytes whatever order a service makes them in.
     products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
     for topic, payload in products:
         if type(payload) is not PAYLOADS.get(topic) and not isinstance(payload, Encoded):
@@ -337,13 +337,13 @@ class Answers:
         """Forget all answers.
 
         Args:
-            newest: Frame behind which the service is; −1: before the first.
+            newest: Frame after which the service is; −1: before the first.
         """
         self._answers.clear()
         self._bytes, self._newest = 0, newest
 
     def is_new(self, frame: int) -> bool:
-        """Whether a frame lies behind all that were answered.
+        """Whether a frame comes after all that were answered.
 
         Args:
             frame: Number of the frame.

@@ -12,7 +12,7 @@ field is bilinear in both angles.
 
 An MSI/Planet file, ``.msi`` or ``.pln``, has a horizontal and a vertical cut as attenuation [dB] against
 ``GAIN`` (dBd unless it says dBi). Horizontal angles count clockwise from boresight, vertical ones downwards
-from the horizon; the number behind ``HORIZONTAL`` and ``VERTICAL`` is that of the lines that follow. The
+from the horizon; the number after ``HORIZONTAL`` and ``VERTICAL`` is that of the lines that follow. The
 directions between follow by summing: the attenuation is that of the horizontal cut at the azimuth plus that
 of the front half of the vertical cut at the elevation (T. G. Vasiliadis, A. G. Dimitriou and G. D. Sergiadis,
 "A novel technique for the approximation of 3-D antenna radiation patterns", IEEE Trans. Antennas Propag.
@@ -74,7 +74,7 @@ class PatternTable:
     theta: Float64Array
     """Zenith angles [rad], ascending from 0 to π, Shape ``[T]``."""
     phi: Float64Array
-    """Azimuths [rad], ascending, the last a whole turn behind the first, Shape ``[F]``."""
+    """Azimuths [rad], ascending, the last a whole turn after the first, Shape ``[F]``."""
     values: Float64Array | Complex128Array
     """Gains [dBi], Shape ``[T, F]``, or E_θ and E_φ, Shape ``[T, F, 2]``."""
 

@@ -5,7 +5,7 @@ the first that it finds; with versions before 16 the process aborts at its first
 AVX-512. So the library is chosen here, before Dr.Jit is imported.
 
 Left alone, Dr.Jit computes with as many threads as the machine has cores, and each of them looks for work
-for a while behind every kernel. Services that trace rays side by side then take the cores from one another:
+for a while after every kernel. Services that trace rays side by side then take the cores from one another:
 on two cores, in `street-canyon`, the channel's frame took 65 ms of processor time with two threads and 39
 ms with one, the LIDAR's 19 ms and 11 ms. So `caviar run` shares the cores out among them.
 """
@@ -306,7 +306,7 @@ def all_threads() -> Iterator[None]:
 
 
 def aligned_columns(rows: Float64Array) -> Float32Array:
-    """Copy rows as float32, each at a multiple of 64 bytes, with room behind it.
+    """Copy rows as float32, each at a multiple of 64 bytes, with room after it.
 
     Dr.Jit computes in NumPy's memory where it can, whole vectors of up to 64 bytes at a time, and
     compiles a kernel anew for each combination of arrays that happen to be aligned or not.

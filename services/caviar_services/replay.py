@@ -93,7 +93,7 @@ class Replayer(Service[ReplaySettings]):
 
     def step(self, frame: Frame) -> StepResult:
         """What the service made of this frame. `RecordingError` where the frame was not recorded."""
-        # The recording ends with the last frame; the agent's extra grant behind it was not recorded.
+        # The recording ends with the last frame; the agent's extra grant after it was not recorded.
         if frame.final:
             return StepResult(seed=self._next_seed(frame.episode))
         recorded = self._recording.frame(frame.episode, frame.number)

@@ -226,7 +226,7 @@ class Runner:
                         f"{loss}; {self.name!r} gives up, it could not come back within {hold_s:g} s: "
                         f"{failure}; timeouts.rejoin_s of the scenario says for how long the run waits"
                     ) from failure
-                # Longer each time: all services of a run come back at once behind an outage.
+                # Longer each time: all services of a run come back at once after an outage.
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, MAX_RETRY_S)
             else:

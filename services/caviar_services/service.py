@@ -7,8 +7,8 @@ the embedded run uses the same objects without sockets.
 
 Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per episode ``reset``,
 ``step`` for each frame, ``end_episode`` → ``close``. What a service with state knows after a frame
-it saves with ``checkpoint``; another process takes it over with ``restore``, behind ``reset`` of the
-same episode, and goes on with the same bytes (`checkpoint` makes bytes of a struct, and checks them).
+it saves with ``checkpoint``; another process takes it over with ``restore``, after ``reset`` of the
+same episode, and continues with the same bytes (`checkpoint` makes bytes of a struct, and checks them).
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     previous: int = -1
     """The frame this service last completed; −1: none. A world steps the whole gap."""
     final: bool = False
-    """The agent's extra grant behind the last frame (clause 16)."""
+    """The agent's extra grant after the last frame (clause 16)."""
     budget_ns: int = 0
     """Wall time that this service has for the frame [ns]; 0: no limit."""
     inputs: tuple[FrameInput, ...] = ()
@@ -466,7 +466,7 @@ class Service(ABC, Generic[S]):
         """
 
     def checkpoint(self) -> bytes:
-        """The state after the last frame, from which `restore` goes on with the same bytes.
+        """The state after the last frame, from which `restore` continues with the same bytes.
 
         Returns:
             Bytes, as `checkpoint.saved` makes them.

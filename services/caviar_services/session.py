@@ -56,12 +56,12 @@ TRIM_EVERY = 10
 TRIM_S = 1.0
 """[s] from one return of free memory to the system to the next. Megabytes come and go in each frame in ever
 other sizes, and what they leave behind would creep up for hours. A return costs 0.1 ms, and 0.5 ms of page
-faults behind it: after every tenth frame that would be a twentieth of a small service's work."""
+faults after it: after every tenth frame that would be a twentieth of a small service's work."""
 FETCH_TIMEOUT_S = 30.0
 """[s] until the broker has to answer a request for scenery."""
 
 Send: TypeAlias = Callable[[m.Message, Sequence[Any]], None]
-"""``send(message, parts)``: hand a message, and the parts behind it, to the broker."""
+"""``send(message, parts)``: hand a message, and the parts after it, to the broker."""
 
 
 class ServiceSession:
@@ -181,7 +181,7 @@ class ServiceSession:
 
         Args:
             message: From the broker.
-            parts: What came behind it.
+            parts: What came after it.
             now: Time on any monotonic clock [s]; see `deadline`.
         """
         mine = self._identity
@@ -406,7 +406,7 @@ class ServiceSession:
             return
         with self._reporting("restore", order.episode, order.frame):
             self._progress(f"restoring the state after frame {order.frame}", 0.0)
-            self._running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed behind this
+            self._running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed after this
             if self._answers is not None:
                 self._answers.clear(order.frame)
             self._send(m.Ready(**self._identity), ())

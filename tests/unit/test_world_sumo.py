@@ -400,7 +400,7 @@ def test_traffic_that_sumo_would_leave_out_is_named_with_its_line(tmp_path: Path
     routes = tmp_path / "traffic.rou.xml"
     first = '<flow id="first" begin="1" end="9" period="2" from="a" to="b"/>'
     routes.write_text(f'<routes>\n{first}\n{later} from="a" to="b"/>\n</routes>\n')
-    with pytest.raises(ScenarioError, match=r"'later' departs at 0.* behind flow 'first' at 1 s") as caught:
+    with pytest.raises(ScenarioError, match=r"'later' departs at 0.* after flow 'first' at 1 s") as caught:
         check_file("routes", str(routes))
     assert (caught.value.line, caught.value.key) == (3, "settings.routes")
     routes.write_text(f'<routes>\n{later} from="a" to="b"/>\n{first}\n</routes>\n')
@@ -493,7 +493,7 @@ def test_a_configuration_file_is_run_and_settings_go_before_it(
 
 
 def test_a_process_that_is_killed_is_gone_on_for_by_another(repository: Path, tmp_path: Path) -> None:
-    """60 frames in one process, and with a kill behind frame 16: the same bytes."""
+    """60 frames in one process, and with a kill after frame 16: the same bytes."""
     folder = repository / "deploy" / "caviar_scenarios" / "street-canyon"
 
     def run(scratch: Path, first: int, last: int, *, kill: bool) -> int:
@@ -531,5 +531,5 @@ def test_other_traffic_than_that_which_was_saved_is_an_error(make: Make) -> None
     scenes(world, 7, 30)
     state = world.checkpoint()
     world.reset(0, 8, 0)
-    with pytest.raises(RunError, match="has other traffic 29 steps behind frame 0 than it had before"):
+    with pytest.raises(RunError, match="has other traffic 29 steps after frame 0 than it had before"):
         world.restore(state)

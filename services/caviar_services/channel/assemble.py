@@ -173,7 +173,7 @@ def _located(
 
 
 def _canonical_names(table: PathTable) -> PathTable:
-    """Names that occur, sorted; points and objects behind the last interaction set to their filler."""
+    """Names that occur, sorted; points and objects past the last interaction set to their filler."""
     if not table.types.shape[1]:
         return replace(table, object_names=(), object_velocity=np.zeros((0, 3)), object_turning=None)
     used = table.types != 0

@@ -157,9 +157,9 @@ class PathTable(Rows):
     """Dyad from the field sent to the field received, with spreading λ/(4πd) and without
     exp(−j2πfτ), in world axes; Shape ``[C, P, 3, 3]``, rows at RX, columns at TX."""
     types: UInt8Array
-    """`Interaction` at each point, Shape ``[P, D]``; 0 behind the last."""
+    """`Interaction` at each point, Shape ``[P, D]``; 0 past the last."""
     objects: Int32Array
-    """Index into ``object_names``, Shape ``[P, D]``; −1 behind the last."""
+    """Index into ``object_names``, Shape ``[P, D]``; −1 past the last."""
     points: Float64Array
     """Interaction points [m], Shape ``[P, D, 3]``."""
     object_names: tuple[str, ...]

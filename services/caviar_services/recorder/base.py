@@ -153,9 +153,9 @@ class StoredProducts:
 
 # Whatever else the system says, another directory may help.
 _REMEDIES = {
-    errno.ENOSPC: "free space on its file system, then go on with caviar run --resume {folder}, "
+    errno.ENOSPC: "free space on its file system, then resume with caviar run --resume {folder}, "
     "or choose another directory with --out",
-    errno.EDQUOT: "free space within your quota, then go on with caviar run --resume {folder}, "
+    errno.EDQUOT: "free space within your quota, then resume with caviar run --resume {folder}, "
     "or choose another directory with --out",
     errno.EFBIG: "raise the limit of file sizes (ulimit -f), or set segment_mib of the recorder below it",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",

@@ -13,7 +13,7 @@ A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mc
 * ``log_time`` is run time in nanoseconds: ``t_ns`` of the frame in the first episode; a later
   episode begins one sampling period after the end of the one before. ``publish_time`` is the
   same for the instant the product was computed for.
-* One chunk a frame, and behind it a seal with the CRC-32 of all bytes before it
+* One chunk a frame, and after it a seal with the CRC-32 of all bytes before it
   (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the
   run's ``durability`` says (`segment_writer.Persistence`). MCAP's index and statistics are written when a
   segment is full or the run ends; then the manifest ``recording.json`` lists it as finished.
@@ -243,7 +243,7 @@ class McapRecorder(Recorder[McapSettings]):
         return Persistence(self.run.directory, self._durability, self.run.run, self.run.seed, earlier)
 
     def _take_over(self, until: tuple[int, int] | None) -> None:
-        """Go on behind what another process recorded, before the frame ``until``."""
+        """Continue after what another process recorded, before the frame ``until``."""
         self._goes_on = False
         folder = self.run.directory
         sync = self._durability != "none"
@@ -376,7 +376,7 @@ class _Continuation:
         self, last: tuple[int, int] | None, until: tuple[int, int] | None, damage: list[str]
     ) -> RunError:
         ends = f"ends with {frame_name(last)}" if last else "has no frame"
-        goes_on = f", and the run goes on with {frame_name(until)}" if until else ""
+        goes_on = f", and the run continues with {frame_name(until)}" if until else ""
         why = f" ({damage[0]})" if damage else ""
         return RunError(
             f"the recording in {self.folder} {ends}{goes_on}: what is between is lost{why}; nothing was "

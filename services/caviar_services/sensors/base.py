@@ -246,7 +246,7 @@ def sensor_poses(traced: TracedScene, scene: Scene, kind: type[D]) -> list[tuple
 
 @contextmanager
 def active_variant(variant: str) -> Iterator[Any]:
-    """Mitsuba with a variant set, and the one before set again behind it.
+    """Mitsuba with a variant set, and the one before set again after it.
 
     The variant is one for the whole process, and an embedded run has a channel service in it too.
 
@@ -323,7 +323,7 @@ class _Part:
 class TracedScene:
     """Scenery and the bodies of moving objects, for rays. Build and use it under `active_variant`.
 
-    What a ray hits has an *owner*: the number of a scenery shape, or of an object behind all shapes.
+    What a ray hits has an *owner*: the number of a scenery shape, or of an object, counted after all shapes.
 
     Args:
         mi: Mitsuba, with the variant that is active.

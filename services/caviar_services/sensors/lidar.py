@@ -48,7 +48,7 @@ class _Rays:
     patterns: tuple[tuple[int, int, float, float], ...]
     """Beams, azimuth steps, lowest and highest elevation [rad] of each sensor."""
     first: Int64Array
-    """Number of the first ray of each sensor, and behind them that of all rays."""
+    """Number of the first ray of each sensor, and after them that of all rays."""
     local: list[Any]
     """Unit vectors in the sensors' axes, x, y and z as `mitsuba.Float64`."""
     sensor: Any

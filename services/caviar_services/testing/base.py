@@ -33,7 +33,7 @@ HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib"
 
 FRAMES = 4
 INTERRUPTED = 3
-"""Frames behind which a service is replaced by another; as many follow."""
+"""Frames after which a service is replaced by another; as many follow."""
 
 EPISODE_SEED = 11
 
@@ -349,7 +349,7 @@ class ServiceConformance:
             assert played.encoded(1) == played.encoded(0)
 
     def test_another_process_goes_on_with_the_same_bytes(self, tmp_path: Path) -> None:
-        """Clause 18: behind what `checkpoint` saved; a service without state, from its frames alone."""
+        """Clause 18: after what `checkpoint` saved; a service without state, from its frames alone."""
         declared = self.service_class.checkpoints
         with self.at_start(tmp_path / "first") as first:
             frames = self.frames_of(first, self.episodes[0], 2 * INTERRUPTED)

@@ -334,7 +334,7 @@ class Mounts:
         return tuple(self._arrived)
 
     def clear(self, arrived: Sequence[str] = ()) -> None:
-        """Forget which objects came first: a new episode begins, or goes on behind a frame.
+        """Forget which objects came first: a new episode begins, or continues after a frame.
 
         Args:
             arrived: Objects of that frame, those that came first in front.

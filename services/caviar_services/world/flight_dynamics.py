@@ -3,7 +3,7 @@
 Time is cut into sub-steps of one length, counted from the instant at which the command last
 changed, so that it makes no difference how a flight is cut into frames. In a sub-step the velocity
 goes straight to a set-point with the greatest acceleration, and stays there. A sub-step is taken
-where the way through it and to a stop behind it is free. Otherwise the part of the set-point that
+where the way through it and to a stop after it is free. Otherwise the part of the set-point that
 leads into what is in the way is taken off; at last the object brakes, the way for which was found
 free before. So speed, acceleration and clearance hold at once, at any speed.
 """
@@ -145,7 +145,7 @@ class FlyerState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     into_ns: Annotated[int, msgspec.Meta(ge=0, lt=SUB_STEP_NS)] = 0
     """How far into it."""
     pieces: list[_Piece] = []
-    """It and those looked at behind it."""
+    """It and those looked at after it."""
     at_once: Annotated[int, msgspec.Meta(ge=1, le=_AT_ONCE)] = _AT_ONCE
     """How many sub-steps are looked at together next."""
     yaw_rate: float = 0.0
@@ -248,7 +248,7 @@ class Flyer:
                 break
             pieces.append(self._towards(*at, wish))
             at = pieces[-1].at(_H)
-            # To the end of each, and to a stop behind it: braking there was free, so it can be done any time.
+            # To the end of each, and to a stop after it: braking there was free, so it can be done any time.
             places += [at[0], self._stop(*at)]
         return [] if self._in_the_way(places)[1] else pieces
 
@@ -302,7 +302,7 @@ class Flyer:
         """Velocity [m/s] to strive for in a sub-step.
 
         On the way to a target it is the greatest w from which, braking as hard as it can, the object
-        comes to rest there behind this sub-step of length h. With the speed v towards the target, the
+        comes to rest there after this sub-step of length h. With the speed v towards the target, the
         ramp from v to w and the stop from w are as long as the way d:
         w·h ± (w − v)²/2a + w²/2a = d, with the sign of v − w.
         """

@@ -82,7 +82,7 @@ class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """
 
     steps: Annotated[int, msgspec.Meta(ge=0)]
-    """Behind frame 0."""
+    """After frame 0."""
     arrived: tuple[str, ...]
     """Objects of the last frame, those that came first in front."""
     traffic: str
@@ -212,7 +212,7 @@ class SumoWorld(World[SumoSettings]):
                 self.run.progress(f"the same traffic again: step {self._steps} of {was.steps}", 0.0)
         if self._traffic() != was.traffic:
             raise RunError(
-                f"world {self.run.name!r} has other traffic {was.steps} steps behind frame 0 than it had "
+                f"world {self.run.name!r} has other traffic {was.steps} steps after frame 0 than it had "
                 "before it was started again: its files, or SUMO, have changed; start the run again"
             )
         # Which objects came first follows from all frames before, which are not computed again.

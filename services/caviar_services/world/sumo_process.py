@@ -96,7 +96,7 @@ def check_file(key: str, file: str) -> None:
 
 class _Departures:
     """Whether a file of routes has its traffic in the order of departure: SUMO leaves out whatever stands
-    behind something later, with a warning among many."""
+    after something later, with a warning among many."""
 
     def __init__(self, file: str, key: str) -> None:
         self._file, self._key = file, key
@@ -112,7 +112,7 @@ class _Departures:
         name = f"{tag} {attributes.get('id', '')!r}"
         if departs < self._latest:
             text = (
-                f"{name} departs at {departs:g} s, behind {self._of} at {self._latest:g} s: SUMO would leave "
+                f"{name} departs at {departs:g} s, after {self._of} at {self._latest:g} s: SUMO would leave "
                 "it out; sort flows, vehicles and trips by departure"
             )
             raise ScenarioError(text, self._file, self._key, line)

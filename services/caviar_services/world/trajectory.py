@@ -319,7 +319,7 @@ class Track:
 def read_waypoints(source: str | Sequence[Sequence[float]], key: str = "") -> list[Waypoint]:
     """Read waypoints from a CSV file or from rows.
 
-    The file has one header line, ``t_s,x_m,y_m,z_m`` or with ``yaw_deg`` behind; lines that
+    The file has one header line, ``t_s,x_m,y_m,z_m`` or with ``yaw_deg`` last; lines that
     begin with ``#`` and empty lines are skipped.
 
     Args:
@@ -339,7 +339,7 @@ def read_waypoints(source: str | Sequence[Sequence[float]], key: str = "") -> li
     widths = {len(row) for *_, row in rows}
     if widths not in ({len(COLUMNS)}, {len(COLUMNS) + 1}):
         raise ScenarioError(
-            f"needs rows of one length, [{', '.join(COLUMNS)}] or with {YAW_COLUMN} behind", key=key
+            f"needs rows of one length, [{', '.join(COLUMNS)}] or with {YAW_COLUMN} last", key=key
         )
     return _checked(rows)
 

@@ -309,7 +309,7 @@ class Calibration:
     """Bounds on the errors of all rungs.
 
     Args:
-        rungs: The ladder, and behind it a reference that is no rung.
+        rungs: The ladder, and after it a reference that is no rung.
         every: Frames from one check to the next; 0: there are none, and only errors that rungs declare are
             stated.
     """

@@ -48,7 +48,7 @@ DECISION = "rung"
 """Key of the decision in DONE."""
 
 TIMINGS = 5
-"""Timings of each rung before the first frame, behind one that is not counted."""
+"""Timings of each rung before the first frame, after one that is not counted."""
 
 _TIMING_GRACE_S = 120.0
 

@@ -89,7 +89,7 @@ def naming(label: str) -> Iterator[None]:
 
 
 def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
-    """The ladder of a scenario, and behind it the reference where that is no rung. Raises `ScenarioError`
+    """The ladder of a scenario, and after it the reference where that is no rung. Raises `ScenarioError`
     naming the key for whatever cannot be."""
     place = run.settings_place
     every = zip(_every(settings), _places(settings, place), models(settings, place), strict=True)

@@ -63,7 +63,7 @@ class Lengths:
     """[m], Shape ``[P, M, N]``."""
     spreading: Float64Array
     """What the amplitude of the wave is proportional to [1/m], Shape ``[P, M, N]``: one over the length;
-    over the root of s·s'·(s + s') behind an edge; over both legs behind scattering. Such legs count as
+    over the root of s·s'·(s + s') after an edge; over both legs after scattering. Such legs count as
     `CLEARANCE` at least, which antennas are traced with. Elements at one place send each other nothing."""
 
 

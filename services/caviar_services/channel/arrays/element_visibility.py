@@ -32,7 +32,7 @@ class Look:
     """Of segments ``[Q, 3]`` → ``[Q, 3]``: how much farther than its end the first surface along each is
     [m], infinite where there is none, and the plane that it lies in, anything where there is none."""
     reflected: Callable[[Int64Array, Float64Array, Float64Array], BoolArray]
-    """Whether there are paths by way of planes ``[Q, D]``, −1 behind the last, between ends ``[Q, 3]``."""
+    """Whether there are paths by way of planes ``[Q, D]``, −1 past the last, between ends ``[Q, 3]``."""
 
 
 # [m]; rays from face to face start this far from the first face, whose points are known to some 1e-5 m.

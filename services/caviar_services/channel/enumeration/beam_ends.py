@@ -132,7 +132,7 @@ def ends_by_scenery(
     of_body = last >= targets.first_body
     place_of = np.searchsorted(scenery.faces, last)
     group_of = np.where(of_body, targets.body_of(last), targets.bodies + place_of)
-    # Beams group by group of what reflected them last: a body, or a face of scenery behind the bodies.
+    # Beams group by group of what reflected them last: a body, or a face of scenery, after the bodies.
     order = np.argsort(group_of, kind="stable")
     sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery.faces))
     begin = np.cumsum(sizes) - sizes
@@ -230,7 +230,7 @@ class ChainPairs:
     """N pairs of a chain and a receiver."""
 
     chain: Int64Array
-    """Faces, −1 behind the last, Shape ``[N, D]``."""
+    """Faces, −1 past the last, Shape ``[N, D]``."""
     receiver: Int64Array
     """Shape ``[N]``."""
 
@@ -257,7 +257,7 @@ def chain_pairs(
 
     Args:
         targets: Faces of scenery, then those of bodies, body after body.
-        scenery: Chains of scenery alone that waves from the transmitter go along, as faces, −1 behind the
+        scenery: Chains of scenery alone that waves from the transmitter go along, as faces, −1 past the
             last, Shape ``[K, D]``; the beginnings of each chain are among them.
         views: Faces of these chains that may reflect last, and who sees them.
         transmitter: Position [m], Shape ``[3]``.

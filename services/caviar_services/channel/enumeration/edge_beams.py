@@ -3,7 +3,7 @@
 A path over an edge is a chain of reflections from the transmitter to the edge and one from the receiver to
 it. Beams say which edges each side lights (`image_beams`). Unfolded around the edge, the path is a straight
 line between the images of both ends, which meets the edge at the point that J. B. Keller's law gives
-("Geometrical Theory of Diffraction", 1962). Pairs of a chain before and a chain behind are left out where
+("Geometrical Theory of Diffraction", 1962). Pairs of a chain before and a chain after are left out where
 this point is beyond the ends of the edge or outside of a beam.
 
 Enumerated are paths over one edge in which a body has the edge or a face. Each side has up to two reflections
@@ -158,7 +158,7 @@ def _spheres(ends: Float64Array, begin: Int64Array) -> tuple[Any, Any]:
 
 @dataclass(frozen=True, eq=False)
 class EdgeChains:
-    """N candidates for paths over an edge, all with I reflections before it and J behind it."""
+    """N candidates for paths over an edge, all with I reflections before it and J after it."""
 
     before: Int64Array
     """Faces from the transmitter to the edge, Shape ``[N, I]``."""

@@ -23,7 +23,7 @@ class EdgePaths(Rows):
     """P paths of at most D interactions, one of which is a diffraction."""
 
     chain: Int64Array
-    """Face at each reflection, −1 at the edge and behind the last, Shape ``[P, D]``."""
+    """Face at each reflection, −1 at the edge and past the last, Shape ``[P, D]``."""
     bend: Int64Array
     """Which interaction is at the edge, Shape ``[P]``."""
     count: Int64Array
@@ -33,7 +33,7 @@ class EdgePaths(Rows):
     receiver: Int64Array
     """Shape ``[P]``."""
     points: Float64Array
-    """The receiver behind the last [m], Shape ``[P, D, 3]``."""
+    """The receiver past the last [m], Shape ``[P, D, 3]``."""
 
 
 def edge_paths(
@@ -107,7 +107,7 @@ def _with_points(
     rows, before = rows[one], before[one]
     behind, other = reflection_points(faces, chains.behind[rows], ends[rows], place[rows])
     rows, before, behind = rows[other], before[other], behind[other]
-    # In the order of the path: reflections before, the edge, reflections behind, which count from the
+    # In the order of the path: reflections before, the edge, reflections after, which count from the
     # receiver.
     i, j = before.shape[1], behind.shape[1]
     chain = np.full((len(rows), depth), -1)

@@ -40,11 +40,11 @@ class ImagePaths(Rows):
     """P paths of at most D reflections."""
 
     chain: Int64Array
-    """Faces that reflect, −1 behind the last, Shape ``[P, D]``."""
+    """Faces that reflect, −1 past the last, Shape ``[P, D]``."""
     receiver: Int64Array
     """Index of the receiver, Shape ``[P]``."""
     points: Float64Array
-    """Points of the reflections, the receiver's position behind the last [m], Shape ``[P, D, 3]``."""
+    """Points of the reflections, the receiver's position past the last [m], Shape ``[P, D, 3]``."""
 
 
 def image_paths(
@@ -78,12 +78,12 @@ def reflection_points(
 
     Args:
         faces: Faces of the chains.
-        chain: Faces in turn, −1 behind the last, Shape ``[N, D]``.
+        chain: Faces in turn, −1 past the last, Shape ``[N, D]``.
         start: Position [m], Shape ``[N, 3]``; ``end`` likewise.
         end: See ``start``.
 
     Returns:
-        Points, the end behind the last [m], Shape ``[N, D, 3]``, and which rows have every point in a
+        Points, the end past the last [m], Shape ``[N, D, 3]``, and which rows have every point in a
         triangle of its face, on the side that reflects, Shape ``[N]``. Points of other rows are undefined.
     """
     depth, count = chain.shape[1], (chain >= 0).sum(1)

@@ -203,7 +203,7 @@ class EnumeratedTracer:
     def _mirrors(
         self, faces: FaceRectangles, chain: Int64Array, points: Float64Array
     ) -> tuple[Int64Array, Float64Array]:
-        """Triangles that reflect at points of chains, −1 behind the last, and unit normals there."""
+        """Triangles that reflect at points of chains, −1 past the last, and unit normals there."""
         used, table = chain >= 0, self._scene.plane_table
         triangles, normals = np.full(chain.shape, -1), np.zeros((*chain.shape, 3))
         if used.any():
@@ -315,7 +315,7 @@ class EnumeratedTracer:
         bent, mirrors = (traced.types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
         used = traced.types != 0
         of_scenery = surfaces < self._scene.first_moving_plane
-        # Edges of bodies stand behind those of scenery.
+        # Edges of bodies stand after those of scenery.
         of_body = traced.edge >= len(edges) - len(edges.of_bodies[0])
         if enumerated_scenery(edges):
             of_body |= (traced.edge >= 0) & (mirrors & ~of_scenery).any(1)
@@ -333,6 +333,6 @@ def _only_reflected(traced: Traced) -> BoolArray:
 
 
 def _surfaces(traced: Traced, scene: SionnaScene) -> Int64Array:
-    """Surface of each interaction of paths, −1 behind the last."""
+    """Surface of each interaction of paths, −1 past the last."""
     surfaces = scene.surface_of[scene.triangle_numbers(traced.shapes, traced.primitives)]
     return np.where(traced.types != 0, surfaces, -1)

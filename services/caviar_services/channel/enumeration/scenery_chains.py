@@ -66,7 +66,7 @@ class _Level:
     face: Int64Array
     """Its last face, Shape ``[K]``."""
     planes: Int32Array
-    """Its planes, −1 behind the last, Shape ``[K, D]``."""
+    """Its planes, −1 past the last, Shape ``[K, D]``."""
 
 
 class ChainTree:
@@ -123,7 +123,7 @@ class ChainTree:
             seen: Faces that the source may see, Shape ``[U]``.
 
         Returns:
-            Planes of each, −1 behind the last, Shape ``[K, D]``: shorter sequences first, with the beginnings
+            Planes of each, −1 past the last, Shape ``[K, D]``: shorter sequences first, with the beginnings
             of each one among them.
         """
         faces, level = self._faces, self._levels[0]
@@ -202,7 +202,7 @@ class KnownScenery:
     """Scenery as it is known from the place of a transmitter."""
 
     chains: Int32Array
-    """Planes that reflect waves from there in turn, −1 behind the last, Shape ``[K, D]``."""
+    """Planes that reflect waves from there in turn, −1 past the last, Shape ``[K, D]``."""
     sights: Int32Array
     """Pairs of these planes that see one another, in both orders, Shape ``[M, 2]``."""
 
@@ -343,7 +343,7 @@ def launched_chains(
         progress: Called before each part with its number and the count of parts.
 
     Returns:
-        Planes of all chains, −1 behind the last, Shape ``[K, D]``: shorter ones first, with the beginnings of
+        Planes of all chains, −1 past the last, Shape ``[K, D]``: shorter ones first, with the beginnings of
         each one among them.
     """
     reflected = only_reflected(options, launch.samples)

@@ -161,7 +161,7 @@ def _of(scene: Scene, joined: Joined, field: str) -> Places:
 
 
 def corners(places: Places, points: Float64Array, joined: Joined) -> Float64Array:
-    """TX, points, RX of each path; points behind the last lie on RX: Shape ``[K, D + 2, 3]``."""
+    """TX, points, RX of each path; points past the last lie on RX: Shape ``[K, D + 2, 3]``."""
     inside = np.where((joined.types != 0)[..., None], points, places.end[:, None])
     return np.concatenate([places.start[:, None], inside, places.end[:, None]], axis=1)
 
@@ -249,7 +249,7 @@ class Courses:
             _angle(joined.ends[0].departure, joined.ends[1].departure),
             _angle(joined.ends[0].arrival, joined.ends[1].arrival),
         )
-        # Slopes of the remainder: what is left of the rates behind the straight line between both images.
+        # Slopes of the remainder: what is left of the rates beyond the straight line between both images.
         moved = self._to_end[1] - self._to_end[0]
         chord = [(_unit(vector) * moved).sum(-1) / seconds for vector in self._to_end]
         self._slopes = [rate - along for rate, along in zip(self._rates(), chord, strict=True)]

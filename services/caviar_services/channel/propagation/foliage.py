@@ -176,7 +176,7 @@ def lengths_inside(
     if not found:
         return np.zeros((len(start), kinds))
     line, kind, along, step = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    # Along each line and kind, the running sum of +1 and −1 is the winding number behind each crossing.
+    # Along each line and kind, the running sum of +1 and −1 is the winding number after each crossing.
     pair, along = line * kinds + kind, np.clip(along, 0.0, 1.0)
     order = np.lexsort((step, along, pair))
     pair, along, around = pair[order], along[order], np.cumsum(step[order])

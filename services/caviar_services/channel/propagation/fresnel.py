@@ -132,7 +132,7 @@ def reflection_fields(
     """Fields of reflected and transmitted paths.
 
     Args:
-        corners: TX, points of interactions, and RX in all places behind the last one [m], ``[P, D + 2, 3]``.
+        corners: TX, points of interactions, and RX in all places past the last one [m], ``[P, D + 2, 3]``.
         count: Interactions of each path, Shape ``[P]``.
         normals: Unit normal of the plane at each point, Shape ``[P, D, 3]``.
         through: Which of them let the wave through, Shape ``[P, D]``; the others reflect it.

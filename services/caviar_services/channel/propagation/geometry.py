@@ -138,7 +138,7 @@ def path_geometry(
         >>> made.departure.tolist(), round(float(made.doppler_ratio[0]) * 28e9)  # [Hz] at 28 GHz
         ([[1.0, 0.0, 0.0]], 2802)
 
-    Doppler shift to first order in v/c, with unit vector k_i of the segment behind corner i:
+    Doppler shift to first order in v/c, with unit vector k_i of the segment after corner i:
     f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
     """
     paths = len(points)

@@ -96,12 +96,12 @@ def image_points(
     Args:
         start: Position of TX [m], Shape ``[P, 3]``; ``end`` that of RX.
         end: See ``start``.
-        types: `Interaction` at each point, 0 behind the last, Shape ``[P, D]``.
+        types: `Interaction` at each point, 0 past the last, Shape ``[P, D]``.
         origin: A point of each plane [m], Shape ``[P, D, 3]``.
         normal: Of each plane, of any length, Shape ``[P, D, 3]``.
 
     Returns:
-        Points [m], Shape ``[P, D, 3]``: 0 behind the last one, not finite at a plane seen edge-on.
+        Points [m], Shape ``[P, D, 3]``: 0 past the last one, not finite at a plane seen edge-on.
 
     Example:
         >>> ends = np.array([[0.0, 0.0, 1.0]]), np.array([[4.0, 0.0, 3.0]])
@@ -154,7 +154,7 @@ def _found(
 def _images(
     start: Float64Array, fixed: Float64Array, types: UInt8Array, origin: Float64Array, normal: Float64Array
 ) -> Float64Array:
-    """Image of the source before each interaction and behind the last, Shape ``[D + 1, P, 3]``."""
+    """Image of the source before each interaction and past the last, Shape ``[D + 1, P, 3]``."""
     images = [start]
     for d in range(types.shape[1]):
         last, kind = images[-1], types[:, d, None]

@@ -125,7 +125,7 @@ class Bends:
     out: Float64Array
     """Unit vectors along outgoing waves, Shape ``[P, 3]``."""
     legs: tuple[Float64Array, Float64Array]
-    """Lengths before and behind the edge [m], each of Shape ``[P]``."""
+    """Lengths before and after the edge [m], each of Shape ``[P]``."""
     faces: Wedges
     """First the face that waves meet more steeply."""
     swapped: BoolArray
@@ -194,7 +194,7 @@ def edge_fields(
     """Fields of paths that are diffracted once.
 
     Args:
-        corners: TX, interaction points, and RX in all places behind the last one [m], ``[P, D + 2, 3]``.
+        corners: TX, interaction points, and RX in all places past the last one [m], ``[P, D + 2, 3]``.
         types: `Interaction` at each point, Shape ``[P, D]``: reflections, transmissions, one diffraction.
         normals: Of the triangle at each point, of any length, Shape ``[P, D, 3]``.
         faces: Of the wedges.
@@ -217,7 +217,7 @@ def edge_fields(
         field = np.eye(3) - k[:, :, None] * k[:, None] + 0j
         other = Wall.of(second, carrier, 0, wavelength)
         for d in range(types.shape[1]):
-            # Behind the last interaction nothing changes any more.
+            # After the last interaction nothing changes any more.
             going = types[:, d] != 0
             out = np.where(going[:, None], unit(steps[:, d + 1]), k)
             wall = Wall.of(media, carrier, d, wavelength)
@@ -228,7 +228,7 @@ def edge_fields(
                 flat[rows] = _diffracted(bends.take(rows), walls, lit[rows])
             field = np.where(going[:, None, None], flat @ field, field)
             k = out
-        # Of a spherical wave at an edge: 1/s' before it, sqrt(s' / (s·(s' + s))) behind it.
+        # Of a spherical wave at an edge: 1/s' before it, sqrt(s' / (s·(s' + s))) after it.
         spreading = 1 / np.sqrt(s_in * s_out * (s_in + s_out))
         fields.append(field * (wavelength / (4 * np.pi) * spreading)[:, None, None])
     return np.stack(fields)

@@ -310,7 +310,7 @@ def reached(
     """Whether chains of reflections are paths, Shape ``[P, L, K]``.
 
     Args:
-        chains: Plane at each interaction, −1 behind the last, Shape ``[P, D]``.
+        chains: Plane at each interaction, −1 past the last, Shape ``[P, D]``.
         receiver: Of each chain, Shape ``[P]``.
         sources: Corners of the transmitter's array [m], Shape ``[K, 3]``.
         targets: Corners of the receivers' arrays [m], Shape ``[R, L, 3]``.
@@ -346,7 +346,7 @@ def reflected(
 
     Args:
         faces, planes: Of the scene.
-        chains: Plane at each interaction, −1 behind the last, Shape ``[Q, D]``.
+        chains: Plane at each interaction, −1 past the last, Shape ``[Q, D]``.
         start, end: [m], Shape ``[Q, 3]``.
     """
     import mitsuba as mi

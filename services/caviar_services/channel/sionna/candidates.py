@@ -37,7 +37,7 @@ MANY_RAYS = 1000
 
 @dataclass(frozen=True, eq=False)
 class Chains(Rows):
-    """C specular chains, or specular ends behind a scattering point."""
+    """C specular chains, or specular ends after a scattering point."""
 
     ray: Int64Array
     """The first ray that went along each, Shape ``[C]``."""
@@ -227,7 +227,7 @@ def _tokens(
 
 
 def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array:
-    """What tells each interaction of chains apart, −1 behind the last, Shape ``[C, D]``."""
+    """What tells each interaction of chains apart, −1 past the last, Shape ``[C, D]``."""
     signature = np.full(chains.planes.shape, -1, np.int64)
     for d in range(len(launch.bounces)):
         used = chains.depth > d
@@ -253,7 +253,7 @@ def _met_at(
 
 
 def _first_edge(scene: SionnaScene) -> int:
-    """The first number of an edge: behind those of planes and kinds."""
+    """The first number of an edge: after those of planes and kinds."""
     # The flags of kinds are at most 8.
     return len(scene.plane_table.triangle) + 16
 

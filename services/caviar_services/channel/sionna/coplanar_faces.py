@@ -45,7 +45,7 @@ class CoplanarFaces:
     """Finds the faces of bodies that are one surface with others.
 
     Args:
-        table: Planes of scenery, and behind them those of bodies, body after body.
+        table: Planes of scenery, and after them those of bodies, body after body.
         first: Number of the first plane of a body.
         sizes: How many planes each body has, Shape ``[V]``.
         two_sided: Of each plane of a body, whether both of its sides reflect, Shape ``[P − first]``; of

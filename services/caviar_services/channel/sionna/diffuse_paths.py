@@ -1,7 +1,7 @@
 """Few diffuse paths for each receiver, chosen among every point that rays met.
 
 Most points at which rays meet something rough bring a receiver next to nothing: they are far away, or were
-met behind other reflections. So each point is kept with a probability that goes by what it is expected to
+met after other reflections. So each point is kept with a probability that goes by what it is expected to
 bring, and its power is divided by that probability: the mean over all choices is the power of all points
 (Russian roulette; J. Arvo and D. Kirk, "Particle transport and image synthesis", SIGGRAPH 1990). What was
 not chosen is not tested for occlusion, and has no field.

@@ -292,7 +292,7 @@ def _first_largest(values: Float64Array, begins: Int64Array) -> Int64Array:
 
 
 def _runs(pieces: _Pieces, at: Float64Array, face_of_side: Int64Array) -> Int64Array:
-    """Number of the edge that each piece is a part of: pieces of the same faces, one behind the other."""
+    """Number of the edge that each piece is a part of: pieces of the same faces, one after the other."""
     count = len(pieces.ends)
     _, pair = np.unique(np.sort(face_of_side[pieces.faces], axis=1), axis=0, return_inverse=True)
     piece, place = np.tile(np.arange(count), 2), pieces.ends.T.reshape(-1)

@@ -120,7 +120,7 @@ class Tracer:
         )
 
     def offer_again(self, offers: Sequence[tuple[bytes, TableState]]) -> None:
-        """Go on with what was on offer, the scene being as it was then.
+        """Continue with what was on offer, the scene being as it was then.
 
         Args:
             offers: Of `offers`.

@@ -306,7 +306,7 @@ def _diffract_anew(
     points = refined_points(start, met.points[rows] - scene.centre, end, types, corners, of_edges)
     kept = np.ones(len(met.edge), np.bool_)
     kept[rows] = ~beyond_edges(points[np.arange(len(rows)), bent], of_edges)
-    # Behind the last interaction all points are the receiver, so that segments there have no length.
+    # After the last interaction all points are the receiver, so that segments there have no length.
     points = np.where((types != 0)[..., None], points, end[:, None])
     path = np.concatenate([start[:, None], points, end[:, None]], axis=1)
     a, b, c = np.moveaxis(corners, -2, 0)

@@ -170,7 +170,7 @@ class Launch:
 
 
 def _concatenated(parts: Sequence[Any]) -> Any:
-    """Arrays of Dr.Jit, or structures of them, one behind the other."""
+    """Arrays of Dr.Jit, or structures of them, one after the other."""
     import drjit as dr
     import mitsuba as mi
 
@@ -245,7 +245,7 @@ class Launcher:
     Args:
         mi_scene: Where they go, a `mitsuba.Scene`.
         options: What is traced.
-        part: Numbers of the first ray and of the one behind the last; absent: all rays.
+        part: Numbers of the first ray and of the one past the last; absent: all rays.
         generator: What says how rays go on, a `SBCandidateGenerator` of Sionna RT; absent: that itself.
     """
 

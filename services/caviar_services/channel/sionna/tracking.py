@@ -57,7 +57,7 @@ class _Table(Rows):
     depth: Int64Array
     """Shape ``[K]``."""
     kind: Int64Array
-    """Flag of each interaction, 0 behind the last, Shape ``[K, D]``."""
+    """Flag of each interaction, 0 past the last, Shape ``[K, D]``."""
     triangle: Int64Array
     """Number of the triangle, through all shapes, Shape ``[K, D]``."""
     probability: Float64Array

@@ -121,7 +121,7 @@ def mirrored(point: Float64Array, origin: Float64Array, normal: Float64Array) ->
 
 
 def reflected(field: Field, k_in: Float64Array, normal: Float64Array, eta: complex) -> Complex128Array:
-    """Field of a wave along a unit vector behind its reflection at a half-space, Shape ``[3]``."""
+    """Field of a wave along a unit vector after its reflection at a half-space, Shape ``[3]``."""
     k_out = k_in - 2 * np.dot(k_in, normal) * normal
     across, along = fresnel(abs(float(np.dot(k_in, normal))), eta)
     s = unit(np.cross(k_in, normal))

@@ -10,7 +10,7 @@ With a free line of sight, component 0 is the straight path, of power K/(K + 1),
 the rest; without one, all L are reflected. A reflected component l has
 
 * a gain that is complex Gaussian (Rayleigh), all of equal mean power;
-* an excess delay that is exponential with mean ``delay_spread_ns``, behind the straight line's d/c;
+* an excess delay that is exponential with mean ``delay_spread_ns``, after the straight line's d/c;
 * directions that deviate from the straight line by Laplacian angles, of the spreads in the settings, in
   zenith and azimuth at both ends (3GPP TR 38.901, section 7.5, has the same two distributions).
 
@@ -113,7 +113,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         count, k = settings.components, 10 ** (settings.k_factor_db / 10)
         self._frequencies = [carrier.frequency_hz for carrier in run.carriers]
         self._frequency = np.array(self._frequencies)[:, None]
-        # Amplitudes: all components of a blocked pair share the power, of a free one those behind the
+        # Amplitudes: all components of a blocked pair share the power, of a free one those after the
         # straight path.
         self._reflected = math.sqrt(1 / count)
         self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0

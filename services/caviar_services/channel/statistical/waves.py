@@ -188,7 +188,7 @@ class Draws:
     excess: list[list[float]]
     """[s], by frame and component."""
     excess_free: list[list[float]]
-    """The same, sorted behind component 0: dropping the shortest of all would make the others longer."""
+    """The same, sorted after component 0: dropping the shortest of all would make the others longer."""
     deviation: list[list[list[float]]]
     """[rad] of departure zenith and azimuth, arrival zenith and azimuth, by frame and component."""
 
@@ -207,7 +207,7 @@ class Draws:
         gain = random.normal(0.0, math.sqrt(0.5), (*shape, 2)).view(np.complex128)[..., 0]
         excess = random.exponential(settings.delay_spread_ns * 1e-9, shape)
         # Of a free pair component 0 is the straight path, whose delay is not drawn: the others are sorted
-        # behind it.
+        # after it.
         excess_free = excess.copy()
         excess_free[:, 1:].sort(axis=-1)
         excess.sort(axis=-1)
