@@ -290,8 +290,9 @@ def set_materials(
     materials = scene.radio_materials
     unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
     if unknown:
+        known = sorted(name for name in materials if not name.startswith("caviar-"))
         raise ScenarioError(
-            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(sorted(materials))}",
+            f"the scenery has no material {unknown[0]!r}; it has: {', '.join(known)}",
             key=f"{policy.key}.materials.{unknown[0]}",
         )
     for name, material in materials.items():
