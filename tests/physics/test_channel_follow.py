@@ -132,7 +132,7 @@ def test_an_episode_begins_with_a_launch_also_where_nothing_moves(
     """All rays of the first launch: else it would begin with what the episode before had found in time."""
     channel = channels(5)
     launched: list[Any] = []
-    launcher = channel._tracer._launcher  # type: ignore[attr-defined]
+    launcher = channel._finder.tracer._launcher  # type: ignore[attr-defined]
     each = launcher.each  # counted on its way
     monkeypatch.setattr(
         launcher,
@@ -167,7 +167,7 @@ def test_where_nothing_moves_but_receivers_the_rays_are_launched_once(
     """Bit by bit what a new channel computes, and receivers that stand still are not traced again."""
     channel = channels(None)
     launched: list[int] = []
-    launcher = channel._tracer._launcher  # type: ignore[attr-defined]
+    launcher = channel._finder.tracer._launcher  # type: ignore[attr-defined]
     each = launcher.each  # counted on its way
     monkeypatch.setattr(launcher, "each", lambda *a: launched.append(1) or each(*a))
     still = street(0)

@@ -84,4 +84,4 @@ def test_a_launch_into_the_scene_as_it_was_is_forgotten() -> None:
     channel: Any = model(CANYON, samples=SAMPLES, candidates="launched")
     for frame in range(3):
         stepped(channel, frame, street(2.0 * frame))
-        assert len(channel._tracer._last) == 1
+        assert len(channel._finder.tracer._last) == 1

@@ -31,7 +31,7 @@ def test_power_of_the_chosen_is_in_the_mean_that_of_all_points() -> None:
     channel = model(CANYON, **settings, scattering_paths=60)
     found = []
     for offset in np.random.default_rng(1).integers(2**32, size=40, dtype=np.uint64):
-        channel._diffuse._thinning._offset = offset  # type: ignore[attr-defined]
+        channel._finder._diffuse._thinning._offset = offset  # type: ignore[attr-defined]
         found.append(powers(asked(channel, CANYON, where, TEN)))
     reached = all_points > 0
     assert reached.sum() > 4  # the others stand within houses
