@@ -41,7 +41,7 @@ def done(grant, parts):
     return [msgpack.packb(report)] if grant.get("final") else [msgpack.packb(report | product), payload, b""]
 
 threading.excepthook = lambda end: os._exit(os.write(2, f"{NAME}: {end.exc_value!r}\n".encode()) and 1)
-leaving = set()  # by SIGTERM, which may come amid the parts of a message: BYE goes behind them, from the loop
+leaving = set()  # by SIGTERM, which may come amid the parts of a message: BYE goes after them, from the loop
 with zmq.Context() as context, dealer(context) as broker:
     broker.linger = 1000  # [ms] at the end, so that a broker that is gone does not hold it up
     broker.send(msgpack.packb({"type": "HELLO", **message}))

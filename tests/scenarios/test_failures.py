@@ -276,8 +276,8 @@ def test_an_agent_that_served_nobody_is_warned_of_when_the_run_is_over(tmp_path:
     finished = run(scenario, tmp_path / "out", "--embedded", "--frames", "3")
     assert finished.status == 0, finished.output
     (warning,) = json.loads((finished.directory / "summary.json").read_text())["warnings"]
-    assert warning.startswith("agent had nobody to serve in any frame")
-    assert "warning: agent had nobody" in finished.output
+    assert warning.startswith("agent had no user to serve in any frame")
+    assert "warning: agent had no user" in finished.output
 
 
 def test_two_worlds_with_the_same_names_are_refused(tmp_path: Path) -> None:

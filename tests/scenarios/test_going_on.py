@@ -99,7 +99,7 @@ def test_a_broker_that_is_killed_is_followed_by_another_and_the_digest_is_the_sa
         output, _ = process.communicate(timeout=40)
         assert marked(mark) == []
     assert_same(tmp_path, output, process.returncode, digest)
-    assert output.count("another one goes on with the run") == 2
+    assert output.count("another one resumes the run") == 2
 
 
 def test_a_run_whose_machine_went_down_is_gone_on_with(scenario: Path, digest: str, tmp_path: Path) -> None:

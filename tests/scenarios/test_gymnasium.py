@@ -253,7 +253,7 @@ def test_an_environment_outlives_its_broker_and_decides_nothing_twice(tmp_path: 
             disturbed = steps(env, disturb=20)
         status, output = run.ended()
         assert status == 0, output
-        assert "another one goes on with the run" in output
+        assert "another one resumes the run" in output
         with closing(BeamSelectionEnv(run.scenario, observe=PARTS)) as env:
             assert steps(env) == disturbed
 

@@ -83,7 +83,7 @@ def test_an_agent_that_leaves_users_to_others_declares_none_by_name() -> None:
     """`beam:*` would clash with what the others own."""
     prepared = agent(("*",), ("car.*",)).prepare(Preparation(demand={}))
     assert prepared.actuators == ()
-    assert prepared.notes == ("serves the users whom no other agent owns",)
+    assert prepared.notes == ("serves the users that no other agent owns",)
 
 
 @pytest.mark.parametrize("actuator", ["motion:uav", "schedule:bs1"])

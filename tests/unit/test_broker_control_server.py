@@ -87,7 +87,7 @@ def test_why_names_who_is_late_in_which_frame_and_who_lacks_what(tmp_path: Path)
         assert re.search(r"\d+ ms since its grant, budget 50 ms; no heartbeat ever came", told)
         assert "sensors waits for scene of frame 0" in told
         assert "last blame: miss: world in frame 0: world 'world' overran its budget" in told
-        assert "nobody is late" not in told
+        assert "no service is late" not in told
 
 
 def test_why_tells_phase_and_progress_of_the_last_heartbeat(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_why_names_whoever_has_not_connected(tmp_path: Path) -> None:
     with desk_of(tmp_path) as broker, Client(broker.endpoint, "world") as world:
         world.join()
         told = why(tmp_path)
-        assert "nobody is late" in told
+        assert "no service is late" in told
         assert "waited for: sensors 'sensors' has not connected" in told
         assert "world 'world'" not in told
 
@@ -137,7 +137,7 @@ def test_a_paused_run_grants_nothing_until_it_may_step_or_go_on(tmp_path: Path) 
         world.send(m.Done(**world.ids, episode=0, frame=0))
         sensors.quiet(50)  # its only input is absent, so that it is not granted
         assert world.quiet(200)
-        assert "nobody is late: the run is paused" in why(tmp_path)
+        assert "no service is late: the run is paused" in why(tmp_path)
         ask(tmp_path, do="step")
         assert world.answer().frame == 1
         assert sensors.answer().frame == 1

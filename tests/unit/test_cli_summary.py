@@ -64,7 +64,7 @@ def test_misses_that_were_answered_before_the_broker_looked_are_told_apart(tmp_p
     late = {"decisions": 76, "p99_ms": 1.0, "worst_ms": 2.0}
     ended = outcome(4) | {"deadlines": late, "services": services}
     told = str(summary_table(summary_of(ended, None, "smoke", tmp_path, 1)).caption)
-    assert "80 missed deadlines: 76 decided 1.00 ms (p99) behind, 2.00 ms at worst; 4 answered before" in told
+    assert "80 missed deadlines: 76 decided 1.00 ms late (p99), 2.00 ms at worst; 4 answered before" in told
 
 
 def test_a_service_that_is_not_run_stands_on_the_screen_and_in_the_summary(

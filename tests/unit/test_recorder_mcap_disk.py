@@ -48,7 +48,7 @@ def test_a_full_disk_is_named_with_its_remedy_and_what_was_written_is_read(small
     number, text = fill(made)
     assert "the recorder cannot write" in text
     assert str(small_disk / "run") in text
-    assert "No space left on device (errno 28); free space on its file system, then go on with" in text
+    assert "No space left on device (errno 28); free space on its file system, then resume with" in text
     assert f"caviar run --resume {small_disk / 'run'}" in text
     with pytest.raises(RunError, match="No space left"):
         made.step(frame(number))

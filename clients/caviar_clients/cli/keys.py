@@ -75,7 +75,7 @@ def list_keys(directory: Directory = DEFAULT) -> None:
         typer.echo("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)))
     if not rows:
         missing = "" if directory.is_dir() else ", which does not exist"
-        typer.echo(f"nobody is authorized in {directory}{missing}")
+        typer.echo(f"no key or token is authorized in {directory}{missing}")
 
 
 @app.command()
@@ -83,12 +83,12 @@ def revoke(
     name: Annotated[str, typer.Argument(help="as `caviar keys list` shows it", show_default=False)],
     directory: Directory = DEFAULT,
 ) -> None:
-    """Withdraw a key or a token; whoever takes part with it is cut off within a second."""
+    """Withdraw a key or a token; a client that takes part with it is cut off within a second."""
     entries, tokens = k.read_authorized(directory), k.read_tokens(directory)
     kept = [entry for entry in entries if entry.name != name]
     kept_tokens = [token for token in tokens if token.name != name]
     if len(kept) == len(entries) and len(kept_tokens) == len(tokens):
-        names = ", ".join([e.name for e in entries] + [t.name for t in tokens]) or "nobody"
+        names = ", ".join([e.name for e in entries] + [t.name for t in tokens]) or "none"
         raise SetupError(f"{name!r} is not authorized in {directory}, but: {names}")
     if len(kept) < len(entries):
         k.write_authorized(directory, kept)

@@ -31,7 +31,7 @@ BROKER_S = 30.0
 MAX_RESTARTS = 5
 """Processes that are started for a service that died, before it comes back."""
 LISTEN_S = 120.0
-"""[s] from its start until the broker listens: one that goes on with a run reads its journal before."""
+"""[s] from its start until the broker listens: one that resumes a run reads its journal before."""
 ANY_PORT = "tcp://127.0.0.1:0"
 # Of services that trace rays, or may.
 _TRACING_ROLES = ("channel", "sensors")
@@ -61,7 +61,7 @@ class Child:
         Args:
             name: Of the service.
             command: Program and arguments.
-            log: Gets what the process prints, behind what a process before it printed.
+            log: Gets what the process prints, after what a process before it printed.
             environment: All of its environment.
         """
         with open_to_append(log) as file:
@@ -407,7 +407,7 @@ class Launcher:
         self._restarts.clear()
         self._start_broker()
         self._start_services()
-        text = f"the broker died ({verdict}); another one goes on with the run, number {self._brokers}"
+        text = f"the broker died ({verdict}); another one resumes the run, number {self._brokers}"
         self._order({"restarted": "", "text": text})
 
     def _end_services(self) -> None:

@@ -202,7 +202,7 @@ def why(
         Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
     ] = None,
 ) -> None:
-    """Ask a running broker whom it waits for now, and why."""
+    """Ask a running broker which services it waits for now, and why."""
     from caviar_clients.cli.remote import why_command
 
     why_command(run, _console)

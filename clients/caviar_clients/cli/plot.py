@@ -121,7 +121,7 @@ def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float
     Returns:
         Amplitudes, Shape ``[N]``.
     """
-    # A codebook of several panels numbers the beams of one panel behind those of the other.
+    # A codebook of several panels numbers the beams of one panel after those of the other.
     part, own = subarray_of(array, beam)
     local = directions @ rotation_matrix(part.orientation)
     response = steering_vector(part.array, local) @ dft_codebook(part.array)[own].conj()

@@ -92,7 +92,7 @@ def _print_digest(recording: Recording) -> int:
     typer.echo(report.digest)
     if not recording.complete:
         last = recording.entry(len(recording) - 1) if len(recording) else None
-        behind = f" behind frame {last.frame} of episode {last.episode}" if last is not None else ""
+        behind = f" after frame {last.frame} of episode {last.episode}" if last is not None else ""
         note = f"note: the recording breaks off{behind}; the digest is that of {report.frames} frames"
         typer.echo(note, err=True)
     return _print_damage(report.damage)
@@ -328,7 +328,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
-            # Segments behind one that is missing, too: other readers stop there.
+            # Segments after one that is missing, too: other readers stop there.
             recording = Recording(run, past_gaps=True)
         damage = list(recording.run_digest().damage)
     except RecordingError as error:

@@ -64,7 +64,7 @@ def serve_broker(
     current = RunInProgress(out, scenario.run.name) if "--restarted" in options else None
     left = current.directory() if current else None
     if current is not None and left is not None:
-        typer.echo(f"run {left}: its broker died, another one goes on with it")
+        typer.echo(f"run {left}: its broker died, another one resumes it")
         return current.serve(left, lambda: resume_broker(left, options))
     directory = new_run_directory(out, scenario.run.name)
     for warning in implausible_values(scenario):
@@ -173,7 +173,7 @@ def why_lines(why: Mapping[str, Any]) -> Iterator[str]:
     if not late:
         idle = why["paused"] and not waits
         rest = ": the run is paused, and every frame that has begun is finished" if idle else ""
-        yield f"nobody is late{rest}"
+        yield f"no service is late{rest}"
     for wait in waits:
         yield f"{'late' if wait['late'] else 'waited for'}: {wait['text']}"
     if last is not None:

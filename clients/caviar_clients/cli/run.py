@@ -34,7 +34,7 @@ from caviar_protocol.files import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 
-# What a run needs in one process, or behind its end, is imported there: what stands above is imported before
+# What a run needs in one process, or after its end, is imported there: what stands above is imported before
 # the broker starts.
 if TYPE_CHECKING:
     from caviar_broker.core import events as ev

@@ -81,7 +81,7 @@ Keys = Annotated[
     Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
 ]
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
-Resume = Annotated[Path | None, typer.Option(help="go on with the run in this directory, whose broker died")]
+Resume = Annotated[Path | None, typer.Option(help="resume the run in this directory, whose broker died")]
 Force = Annotated[
     bool, typer.Option("--force", help="with --resume: though code, libraries or files have changed")
 ]
@@ -133,7 +133,7 @@ def require_writable(*files: Path | None) -> None:
 
 
 def new_run_directory(root: Path, name: str) -> Path:
-    """Make the directory of a run, ``NAME-DATE-TIME``, with a number behind it where that is taken.
+    """Make the directory of a run, ``NAME-DATE-TIME``, with a number after it where that is taken.
 
     Args:
         root: Folder in which it is made, and which is made where it lacks.
@@ -165,11 +165,11 @@ def print_line(console: Console, text: object, style: str = "") -> None:
 
 
 def progress_bar(console: Console, *columns: str | ProgressColumn, transient: bool = False) -> Progress:
-    """Make a bar behind the description of its task.
+    """Make a bar after the description of its task.
 
     Args:
         console: Where it is drawn.
-        columns: What stands behind the bar; texts are formats of a task, as ``{task.fields[left]}``.
+        columns: What stands after the bar; texts are formats of a task, as ``{task.fields[left]}``.
         transient: Whether it vanishes when it is done.
     """
     from rich.progress import BarColumn, Progress, TextColumn

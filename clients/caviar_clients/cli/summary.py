@@ -36,7 +36,7 @@ _CAUSES = {cause.count_name: cause for cause in Cause}
 _DROPPED = "dropped"
 # What a count means that every frame of a run has, by the count's name or what that begins with.
 _NEVER: Mapping[str, str] = {
-    "frames-without-users": "{source} had nobody to serve in any frame; see its `users`, and `on` of the "
+    "frames-without-users": "{source} had no user to serve in any frame; see its `users`, and `on` of the "
     "receivers",
     WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
 }
@@ -109,7 +109,7 @@ class RunSummary(msgspec.Struct, kw_only=True):
     episodes: int
     frames: int
     frames_planned: int
-    simulated_s: Annotated[float, quantity("s", "up to a sampling period behind the last frames")]
+    simulated_s: Annotated[float, quantity("s", "up to a sampling period after the last frames")]
     bytes: Annotated[int, quantity("B", "size of the segments")]
     sources: list[SourceSummary]
     link: LinkSummary | None
@@ -484,7 +484,7 @@ def _caption(summary: Mapping[str, Any]) -> str:
 def _missed(misses: int, late: Mapping[str, Any]) -> str:
     """Count missed deadlines, and say how promptly the broker decided those without an answer by then."""
     seen = late["decisions"]
-    when = f"{late['p99_ms']:.2f} ms (p99) behind, {late['worst_ms']:.2f} ms at worst"
+    when = f"{late['p99_ms']:.2f} ms late (p99), {late['worst_ms']:.2f} ms at worst"
     # A late answer that arrives before the broker looks at the clock is a miss without a decision.
     if misses <= seen:
         return f"{counted(seen, 'missed deadline')}, decided {when}"

@@ -383,7 +383,7 @@ class ByHand:
             else:
                 return
             if not request:
-                raise RunError("the client was not ended; the kit cannot go on with the next case")
+                raise RunError("the client was not ended; the kit cannot continue with the next case")
             self._tell(request)
 
     def memory(self) -> int | None:

@@ -24,7 +24,7 @@ from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.validation import PartCheck
 
 FRAMES = 4
-# Between two frames [rad]: behind half a turn (π) the other way round is the shorter one, and the rotation
+# Between two frames [rad]: beyond half a turn (π) the other way round is the shorter one, and the rotation
 # between two orientations does not say which of them the object took.
 AMBIGUOUS_RAD = 2.5
 # Of an angular velocity, relative and [rad]: a world takes it between two frames, at one of them, or from its

@@ -125,7 +125,7 @@ def gap(kit: Kit) -> str:
     "ERROR unexpected or that frame's answer; then the next frame",
 )
 def reordered_grants(kit: Kit) -> str:
-    """A GRANT of a frame behind those that were answered does no harm."""
+    """A GRANT of a frame after those that were answered does no harm."""
     session = kit.at(ACTIVE)
     session.step()
     skipped = session.frame
@@ -239,7 +239,7 @@ def episodes(kit: Kit) -> str:
     if "episodes" not in session.hello.get("capabilities", []):
         raise NotApplicable("it did not name the capability `episodes`")
     played = []
-    # In a life of its own there was no frame yet: RESET comes behind EPISODE_END, and that behind a frame.
+    # In a life of its own there was no frame yet: RESET comes after EPISODE_END, and that after a frame.
     if session.completed < 0:
         session.step()
     for _ in range(2):
@@ -273,7 +273,7 @@ AFTERWARDS = (final_grant, several_sources)
 
 
 BEFORE, AFTER = 3, 3
-"""Frames before the state is saved, and frames that are answered again behind it."""
+"""Frames before the state is saved, and frames that are answered again after it."""
 # Begins with the one byte that MessagePack never uses, so that no client reads it as a state.
 NO_STATE = b"\xc1no state of any service"
 
@@ -313,7 +313,7 @@ def restore(kit: Kit) -> str:
         if _products(session, session.step()) != products:
             raise Failed("the products of before, byte by byte", f"others in frame {number}")
     session.step()
-    return f"the same products in {AFTER} frames behind the state of frame {saved}"
+    return f"the same products in {AFTER} frames after the state of frame {saved}"
 
 
 @case("wrong-state", "clause 18; Wrong things", "FAULT, or an end with a status other than 0")

@@ -402,7 +402,7 @@ class Session:
         return number
 
     def granting(self, frame: int, inputs: Inputs, **more: Any) -> tuple[Fields, list[bytes]]:
-        """Return the fields of a GRANT without its type, and the parts behind it."""
+        """Return the fields of a GRANT without its type, and the parts after it."""
         entries, parts = inputs.of(self.hello.get("inputs", []), frame)
         fields: Fields = {**self.who, "episode": self.episode, "frame": frame}
         if self.completed >= 0:

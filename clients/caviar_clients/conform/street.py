@@ -430,7 +430,7 @@ class Inputs:
     stranger: bool = False
 
     def of(self, declared: Sequence[Fields], frame: int) -> tuple[list[Fields], list[bytes]]:
-        """Make the entries of ``inputs`` and the parts behind the header.
+        """Make the entries of ``inputs`` and the parts after the header.
 
         Args:
             declared: Inputs that the client declared in HELLO; topic ``*`` stands for all.
@@ -491,7 +491,7 @@ class Inputs:
 
 
 def _with_stranger(header: bytes, body: bytes) -> Product:
-    """Add a field to a product, whose array lies behind all others."""
+    """Add a field to a product, whose array comes after all others."""
     fields = unpack(header)
     # Arrays begin at multiples of 8 bytes (SPEC.md, Arrays).
     padded = body + bytes(-len(body) % 8)

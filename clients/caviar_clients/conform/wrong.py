@@ -42,7 +42,7 @@ def survive(kit: Kit, variants: Iterable[Variant], codes: tuple[str, ...], *, pa
 
 
 def _survived(session: Session, name: str, codes: tuple[str, ...], pardoned: bool) -> str:
-    # The GRANT behind it shows that the client is still of use, and how far its answers are: without one, a
+    # The GRANT after it shows that the client is still of use, and how far its answers are: without one, a
     # client that ignores a variant and one that is about to refuse it look alike.
     probe, expected, way = session.grant(), f"for {name}: {GOES_ON}", ""
     got = session.reaction(expected)

@@ -167,7 +167,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     """A run of CAVIAR as a gymnasium environment (contract, clause 16).
 
     ``step(a_k)`` reports the decision of frame k, waits for the grant of frame k + 1, or the final one,
-    and returns its observation with the reward of link(k). An episode ends by truncation behind its
+    and returns its observation with the reward of link(k). An episode ends by truncation after its
     last frame; the last observation has the scene of the last frame and its link.
 
     Args:

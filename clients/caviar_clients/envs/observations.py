@@ -153,7 +153,7 @@ class Part(ABC):
     Args:
         scenario: Has the devices and their settings.
         users: The places.
-        sensor: What stands behind the colon of the part's name; empty: nothing.
+        sensor: What stands after the colon of the part's name; empty: nothing.
     """
 
     inputs: ClassVar[tuple[Input, ...]] = ()
@@ -333,7 +333,7 @@ PARTS: Mapping[str, Callable[[Scenario, Users, str], Part]] = {
     "depth": DepthImage,
     "camera": CameraImage,
 }
-"""Parts by name. One of a sensor may name it behind a colon: ``camera:dash``."""
+"""Parts by name. One of a sensor may name it after a colon: ``camera:dash``."""
 
 
 def part(scenario: Scenario, users: Users, name: str) -> Part:
@@ -342,7 +342,7 @@ def part(scenario: Scenario, users: Users, name: str) -> Part:
     Args:
         scenario: Has the devices.
         users: The places.
-        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand behind a colon.
+        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand after a colon.
 
     Raises:
         ScenarioError: The part does not exist, or its sensor does not; the text has those there are.

@@ -72,7 +72,7 @@ class UavPathV1Env(FlightEnv):
     **Episode.** Start and goal are drawn by the seed, free of scenery, within the object's bounds; the
     ``options`` of `reset` set them: ``{"start": (x, y, z), "goal": (x, y, z)}`` [m], either or both. Frame 0
     puts the object at the start, so that an episode of S frames has S − 1 steps. It terminates where the goal
-    is reached and is truncated behind the last frame.
+    is reached and is truncated after the last frame.
 
     **Observation**, float32:
 
@@ -236,7 +236,7 @@ class UavPathV1Env(FlightEnv):
         return start, goal
 
     def _space(self, box: tuple[Vector, Vector]) -> Airspace:
-        # Made once: scenery is known behind the first reset, and it stays.
+        # Made once: scenery is known after the first reset, and it stays.
         if self._airspace is None and self._session is not None:
             # The world keeps the object at its clearance, up to rounding: a start just there may be inside.
             clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN

@@ -133,7 +133,7 @@ class RecordedRun:
 
 
 At: TypeAlias = tuple[int, int]
-"""(episode, frame); an agent's final grant stands behind the last frame."""
+"""(episode, frame); an agent's final grant stands after the last frame."""
 Outcome: TypeAlias = Literal["answered", "late", "busy", "skipped"]
 """What became of a service's part of a frame. ``busy``: it never got the grant, for it still had an
 earlier one; ``skipped``: something that it needs was absent (clause 10)."""

@@ -90,7 +90,7 @@ class Session(ABC):
             products: By topic, what the agent decided: ``{"action": Action(…)}``.
 
         Returns:
-            The next frame, with the link of the answered one; behind the last frame of an episode one that
+            The next frame, with the link of the answered one; after the last frame of an episode one that
             is ``final`` and needs no answer.
 
         Raises:
@@ -161,7 +161,7 @@ class OutsideAgent(Service[OutsideSettings]):
         seed = type(self).first_seed()
         if self.settings.except_users:
             # The broker gives it what other agents do not own: which users that is, it knows alone.
-            return Prepared(notes=("serves the users whom no other agent owns",), seed=seed)
+            return Prepared(notes=("serves the users that no other agent owns",), seed=seed)
         # A bare pattern names users, whose beams are meant.
         owned = tuple(text if ":" in text else BEAM + text for text in self.settings.users)
         return Prepared(actuators=owned, seed=seed)

@@ -51,7 +51,7 @@ def shares(costs_s: Sequence[float], most: Sequence[int], seconds: float) -> lis
         >>> shares([1.0, 10.0], [9, 9], 40.0)
         [9, 3]
     """
-    # From the cheapest on: each that needs less than its share leaves the rest to those behind it.
+    # From the cheapest on: each that needs less than its share leaves the rest to those after it.
     counts, left = [0] * len(costs_s), seconds
     order = sorted(range(len(costs_s)), key=lambda i: costs_s[i] * most[i])
     for rank, i in enumerate(order):
@@ -372,7 +372,7 @@ class Campaign:
             measured.notes.append("timed on the scene that warmed it up: another would take too long")
             entry.count = 0
             return
-        # Behind the last scene it begins again with the first: a second measurement of each, then a third.
+        # After the last scene it begins again with the first: a second measurement of each, then a third.
         index = self._order[turn % self._scenes_of(measured.setting)]
         try:
             share = min(self._left_s, PATIENCE * (until - time.monotonic()))

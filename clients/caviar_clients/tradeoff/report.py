@@ -131,7 +131,7 @@ _WEIGHTS: Mapping[Block, float] = {
     "convergence": 10,
     "diffuse convergence": 14,
 }
-# Shares of the time; a block that needs less leaves the rest to those behind it.
+# Shares of the time; a block that needs less leaves the rest to those after it.
 
 
 def compare(
@@ -168,7 +168,7 @@ def compare(
         plan = _plan(options, list(dict.fromkeys([*needed, campaign.baseline])))
         measured, interpolated = list[Measured](), list[Row]()
         for number, (block, settings) in enumerate(plan):
-            # Of the time that is left: what one block does not need, those behind it share.
+            # Of the time that is left: what one block does not need, those after it share.
             share = _WEIGHTS[block] / sum(_WEIGHTS[name] for name, _ in plan[number:])
             if block == "keyframes":
                 interpolated += campaign.keyframes(share)

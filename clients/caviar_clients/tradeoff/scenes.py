@@ -139,7 +139,7 @@ def scene_at(path: Path, frame: int = 0) -> Scenes:
     if not 0 <= frame < scenario.run.frames:
         last = scenario.run.frames - 1
         raise RunError(f"--frame {frame}: scenario {scenario.run.name!r} has the frames 0 to {last}")
-    # A world's scene may depend on every frame before: the run is cut behind the frame, not begun at it.
+    # A world's scene may depend on every frame before: the run is cut after the frame, not begun at it.
     scenario = checked_scenario(path, frames=frame + 1)
     instants, assets = _simulated(scenario)
     return _planned(path, scenario, instants[-1:], assets)
