@@ -376,3 +376,17 @@ def test_threads_share_the_codec_without_seeing_each_other() -> None:
     for thread in threads:
         thread.join()
     assert wrong == []
+
+
+def test_what_stands_in_a_field_is_encoded_anew_where_it_is_another() -> None:
+    """A tuple of immutable values is encoded once for each object; a list in its place may change."""
+    first, second = (BeamChoice(tx="a", rx="b", tx_beam=beam) for beam in (1, 2))
+    alike = Action(commands=(first,))
+    assert encode_payload(alike) == encode_payload(Action(commands=(first,)))
+    assert encode_payload(Action(commands=(second,))) != encode_payload(alike)
+    commands = [first]
+    changing = Action(commands=commands)  # type: ignore[arg-type]  # as a careless producer does
+    before = encode_payload(changing)
+    commands[0] = second
+    assert before == encode_payload(alike)
+    assert encode_payload(changing) == encode_payload(Action(commands=(second,)))

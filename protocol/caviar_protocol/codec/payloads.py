@@ -250,7 +250,12 @@ def _struct(cls: type[msgspec.Struct]) -> Convert:
     fields = []
     for field in msgspec.structs.fields(cls):
         empty = field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
-        fields.append((field.name, empty, _converter(hints[field.name])))
+        converter = _converter(hints[field.name])
+        # Not of texts, which are converted as quickly as they are found.
+        hint = hints[field.name]
+        if get_origin(hint) is tuple and get_args(hint)[0] is not str and _is_immutable(hint):
+            converter = _encoded_once(converter)
+        fields.append((field.name, empty, converter))
 
     def convert(value: Any, writer: BodyWriter) -> dict[str, Any]:
         found: dict[str, Any] = {config.tag_field: config.tag} if config.tag_field else {}
@@ -270,6 +275,47 @@ def _struct(cls: type[msgspec.Struct]) -> Convert:
         return found
 
     return convert
+
+
+def _encoded_once(convert: Convert) -> Convert:
+    """Encode a tuple of immutable values when it comes, and not again while the same object does.
+
+    Devices, carriers and names of users stay the same objects from frame to frame; to convert them takes
+    longer than everything else in the header of a scene.
+    """
+    # One tuple, replaced as a whole: threads that encode at the same time see a value and its own bytes.
+    last: tuple[Any, Any] = (None, None)
+
+    def encoded(value: Any, writer: BodyWriter) -> Any:
+        nonlocal last
+        known, raw = last
+        if value is not known:
+            raw = msgspec.Raw(_payload_encoder.encode(convert(value, writer)))
+            # Fields are declared as tuples, and a list may stand in one all the same: it has no hash, and may
+            # be another one in the next frame.
+            try:
+                hash(value)
+            except TypeError:
+                return raw
+            last = value, raw
+        return raw
+
+    return encoded
+
+
+def _is_immutable(hint: Any) -> bool:
+    """Whether values of a type cannot change, and hold no array, which would have a place in the body."""
+    hint = _without_alias(hint)
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _is_immutable(arguments[0])
+    if origin in (Union, UnionType, tuple):
+        return all(_is_immutable(argument) for argument in arguments if argument is not ...)
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        hints = get_type_hints(hint, include_extras=True)
+        names = hint.__struct_fields__
+        return bool(hint.__struct_config__.frozen) and all(_is_immutable(hints[name]) for name in names)
+    return origin is Literal or hint in _SCALARS or hint is NoneType
 
 
 def _converter(hint: Any) -> Convert:
