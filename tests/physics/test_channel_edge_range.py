@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import CaviarError
-from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import Channel, Interaction
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.lab import Plate, Thing, antenna, scene, sionna, write_scenery
-from caviar_services.service import Frame, FrameInput
+from caviar_services.channel.stability.lab import (
+    Plate,
+    Thing,
+    antenna,
+    channel_of,
+    frame_of,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 pytestmark = pytest.mark.channel
 
@@ -33,12 +40,8 @@ def assets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def traced(model: ChannelModel[Any], things: Sequence[Thing]) -> tuple[Channel, Mapping[str, int]]:
     devices = [antenna(f"r{i}", "rx", place) for i, place in enumerate(RECEIVERS)]
     at = scene([antenna("t", "tx", SENDER), *devices], things)
-    source = FrameInput(GrantInput(topic="scene", source="world", status=Status.FRESH), payload=at)
-    frame = Frame(episode=0, number=0, t_ns=0, inputs=(source,), service="channel", seed=1)
-    result = model.step(frame)
-    channel = result.products["channel"]
-    assert isinstance(channel, Channel)
-    return channel, result.counts
+    result = model.step(frame_of(at, service="channel", seed=1))
+    return channel_of(result), result.counts
 
 
 def model(assets: dict[str, Path], **settings: Any) -> ChannelModel[Any]:

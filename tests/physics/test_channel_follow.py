@@ -11,12 +11,10 @@ import pytest
 from same_paths import model
 
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.lab import Thing, antenna, scene
-from caviar_services.service import Frame, FrameInput
+from caviar_services.channel.stability.lab import Thing, antenna, channel_of, frame_of, scene
 
 CANYON = "simple_street_canyon_with_cars"
 SAMPLES = 40_000
@@ -39,13 +37,8 @@ def street(frame: int, cars: int = 6, leaving: int = 0) -> Scene:
 
 def stepped(channel: ChannelModel[Any], number: int, what: Scene, previous: int | None = None) -> Channel:
     """The product of a frame."""
-    provenance = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=number)
     before = number - 1 if previous is None else previous
-    inputs = (FrameInput(provenance, payload=what),)
-    result = channel.step(Frame(episode=0, number=number, t_ns=0, previous=before, inputs=inputs))
-    product = result.products["channel"]
-    assert isinstance(product, Channel)
-    return product
+    return channel_of(channel.step(frame_of(what, number, previous=before)))
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 from same_paths import SCENES, model
 
-from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.multipath import changes
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.stability.formulas import C
-from caviar_services.channel.stability.lab import Plate, Thing, antenna, measure, scene, sionna, write_scenery
-from caviar_services.service import Frame, FrameInput
+from caviar_services.channel.stability.lab import (
+    Plate,
+    Thing,
+    antenna,
+    frame_of,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 
 pytestmark = pytest.mark.channel
 
@@ -104,10 +111,7 @@ def test_the_service_counts_births_and_deaths(tmp_path: Path) -> None:
     wall = Thing("wall", (10, 5, 3.5), (40, 0.5, 6.0))
 
     def counts(number: int, things: list[Thing]) -> dict[str, int]:
-        source = FrameInput(
-            GrantInput(topic="scene", source="w", status=Status.FRESH), payload=scene(ends, things)
-        )
-        result = channel.step(Frame(episode=0, number=number, t_ns=0, inputs=(source,)))
+        result = channel.step(frame_of(scene(ends, things), number))
         return {name: value for name, value in result.counts.items() if name in ("births", "deaths")}
 
     assert counts(0, [wall]) == {}

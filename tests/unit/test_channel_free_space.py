@@ -7,11 +7,11 @@ import pytest
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier
+from caviar_services.channel.stability.lab import channel_of, frame_of, scene
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.registry import load
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
+from caviar_services.service import Preparation, RunInfo, StepResult
 
 CARRIERS = (Carrier(name="a", frequency_hz=28e9), Carrier(name="b", frequency_hz=60e9))
 
@@ -19,24 +19,7 @@ CARRIERS = (Carrier(name="a", frequency_hz=28e9), Carrier(name="b", frequency_hz
 def step(*devices: AntennaDevice, parts: frozenset[str] = frozenset()) -> StepResult:
     model = FreeSpaceChannel(FreeSpaceSettings(), RunInfo(name="channel", carriers=CARRIERS))
     model.prepare(Preparation(demand={"channel": parts}))
-    scene = Scene(
-        names=(),
-        classes=(),
-        assets=(),
-        position=np.zeros((0, 3)),
-        orientation=np.zeros((0, 4)),
-        velocity=np.zeros((0, 3)),
-        dimensions=np.zeros((0, 3)),
-        devices=tuple(sorted(devices, key=lambda device: device.name)),
-    )
-    source = FrameInput(GrantInput(topic="scene", source="w", status=Status.FRESH), payload=scene)
-    return model.step(Frame(episode=0, number=0, t_ns=0, inputs=(source,)))
-
-
-def product(result: StepResult) -> Channel:
-    channel = result.products["channel"]
-    assert isinstance(channel, Channel)
-    return channel
+    return model.step(frame_of(scene(devices)))
 
 
 def device(name: str, role: str, x: float) -> AntennaDevice:
@@ -49,7 +32,7 @@ def test_it_is_registered_under_its_rung() -> None:
 
 def test_every_pair_has_its_line_of_sight() -> None:
     result = step(device("t", "tx", 0), device("u", "tx", -7), device("r", "rx", 30), device("s", "rx", 9))
-    channel = product(result)
+    channel = channel_of(result)
     assert channel.tx == ("t", "u")
     assert channel.rx == ("r", "s")
     assert channel.offsets.tolist() == [0, 1, 2, 3, 4]
@@ -62,12 +45,12 @@ def test_every_pair_has_its_line_of_sight() -> None:
 
 def test_matrices_follow_demand() -> None:
     result = step(device("t", "tx", 0), device("r", "rx", 30), parts=frozenset({"h"}))
-    assert [m.h.shape for m in product(result).h] == [(3, 3), (3, 3)]
+    assert [m.h.shape for m in channel_of(result).h] == [(3, 3), (3, 3)]
 
 
 def test_a_device_of_both_roles_has_no_path_to_itself() -> None:
     result = step(device("t", "tx", 0), device("x", "both", 20), parts=frozenset({"h"}))
-    channel = product(result)
+    channel = channel_of(result)
     assert channel.tx == ("t", "x")
     assert channel.rx == ("x",)
     assert channel.offsets.tolist() == [0, 1, 1]
@@ -79,15 +62,15 @@ def test_closer_than_a_wavelength_there_is_no_far_field() -> None:
     """λ of the lowest carrier is 10.7 mm."""
     near = step(device("t", "tx", 0), device("r", "rx", 0.010))
     far = step(device("t", "tx", 0), device("r", "rx", 0.011))
-    assert len(product(near).tau) == 0
+    assert len(channel_of(near).tau) == 0
     assert near.counts["too_close"] == 1
-    assert len(product(far).tau) == 1
-    assert np.abs(product(far).a).max() < 1
+    assert len(channel_of(far).tau) == 1
+    assert np.abs(channel_of(far).a).max() < 1
 
 
 @pytest.mark.parametrize("role", ["tx", "rx"])
-def test_without_an_end_there_is_an_empty_product(role: str) -> None:
-    channel = product(step(device("d", role, 0), parts=frozenset({"h"})))
+def test_without_an_end_there_is_an_empty_channel_of(role: str) -> None:
+    channel = channel_of(step(device("d", role, 0), parts=frozenset({"h"})))
     assert len(channel.tau) == 0
     assert channel.offsets.tolist() == [0]
     encode_payload(channel)

@@ -10,15 +10,15 @@ import pytest
 
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Panel, Scene
 from caviar_services.channel.propagation.clearance import Boxes
+from caviar_services.channel.stability.lab import channel_of, frame_of
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
+from caviar_services.service import Preparation, RunInfo, StepResult
 
 CARRIERS = (Carrier(name="a", frequency_hz=28e9), Carrier(name="b", frequency_hz=60e9))
 
@@ -59,15 +59,7 @@ def scene(*devices: AntennaDevice, boxes: dict[str, tuple[Any, Any, float]] | No
 def step(
     service: GeometricChannel, at: Scene, number: int = 0, episode: int = 0, seed: int = 7
 ) -> StepResult:
-    source = FrameInput(GrantInput(topic="scene", source="w", status=Status.FRESH), payload=at)
-    frame = Frame(episode=episode, number=number, t_ns=0, inputs=(source,), seed=seed, seed_episode=episode)
-    return service.step(frame)
-
-
-def product(result: StepResult) -> Channel:
-    channel = result.products["channel"]
-    assert isinstance(channel, Channel)
-    return channel
+    return service.step(frame_of(at, number, episode=episode, seed=seed, seed_episode=episode))
 
 
 TWO = (device("t", "tx", 0, 0, 10), device("r", "rx", 50, -9, 2))
@@ -76,12 +68,12 @@ TWO = (device("t", "tx", 0, 0, 10), device("r", "rx", 50, -9, 2))
 def test_it_is_registered_under_its_rung() -> None:
     assert load("channel", "geometric") is GeometricChannel
     result = step(model(), scene(*TWO))
-    assert result.fidelity == product(result).rung == "geometric"
+    assert result.fidelity == channel_of(result).rung == "geometric"
 
 
 def test_a_pair_draws_the_same_whoever_else_is_there() -> None:
     """The paths of t → r are equal bit by bit with three more receivers and one more transmitter."""
-    alone = product(step(model(), scene(*TWO), 130))
+    alone = channel_of(step(model(), scene(*TWO), 130))
     crowd = scene(
         *TWO,
         device("q", "rx", -40, 3, 2),
@@ -89,7 +81,7 @@ def test_a_pair_draws_the_same_whoever_else_is_there() -> None:
         device("u", "tx", 5, 5, 5),
         device("z", "rx", 1, 77, 3),
     )
-    among = product(step(model(), crowd, 130))
+    among = channel_of(step(model(), crowd, 130))
     mine = among.pair("t", "r")
     for field in ("id", "tau", "aod", "aoa", "points", "interactions"):
         assert np.array_equal(getattr(among, field)[mine], getattr(alone, field)), field
@@ -101,10 +93,12 @@ def test_a_pair_draws_the_same_whoever_else_is_there() -> None:
 def test_draws_depend_on_frame_episode_and_seed_and_not_on_what_came_before() -> None:
     """Frame 70 is the same after frame 69 and at once; other frames, episodes and seeds differ."""
     running = model()
-    delays = [product(step(running, scene(*TWO), number)).tau.tolist() for number in range(71)]
-    assert product(step(model(), scene(*TWO), 70)).tau.tolist() == delays[70]
+    delays = [channel_of(step(running, scene(*TWO), number)).tau.tolist() for number in range(71)]
+    assert channel_of(step(model(), scene(*TWO), 70)).tau.tolist() == delays[70]
     others = [{"episode": 1}, {"seed": 8}, {"number": 6}]
-    drawn = [product(step(model(), scene(*TWO), **{"number": 70, **other})).tau.tolist() for other in others]
+    drawn = [
+        channel_of(step(model(), scene(*TWO), **{"number": 70, **other})).tau.tolist() for other in others
+    ]
     assert len({tuple(d) for d in (*drawn, *delays)}) == len(others) - 1 + len(delays)  # frame 6 was there
 
 
@@ -112,17 +106,17 @@ def test_draws_can_last_an_episode() -> None:
     """The same seed in the next episode is not the same episode."""
     running = model(redraw="episode")
     running.reset(0, 7, 0)
-    first, later = (product(step(running, scene(*TWO), number)) for number in (0, 400))
+    first, later = (channel_of(step(running, scene(*TWO), number)) for number in (0, 400))
     assert encode_payload(first) == encode_payload(later)
     running.reset(1, 7, 0)
-    assert not np.array_equal(product(step(running, scene(*TWO), 0, episode=1)).tau, first.tau)
+    assert not np.array_equal(channel_of(step(running, scene(*TWO), 0, episode=1)).tau, first.tau)
 
 
 def test_the_product_is_canonical_and_survives_the_wire() -> None:
     """By delay; ids unique in a pair; both carriers share all but the phase."""
     crowd = scene(*TWO, device("q", "rx", -40, 3, 2), device("u", "tx", 25, -3, 5))
     for number in range(20):
-        channel = product(step(model(components=4), crowd, number))
+        channel = channel_of(step(model(components=4), crowd, number))
         assert channel.offsets.tolist() == [0, 4, 8, 12, 16]
         for begin in range(0, 16, 4):
             pair = slice(begin, begin + 4)
@@ -136,9 +130,9 @@ def test_the_product_is_canonical_and_survives_the_wire() -> None:
 def test_two_carriers_are_what_each_is_alone() -> None:
     """The same draws serve both."""
     crowd = scene(*TWO, device("q", "rx", -40, 3, 2))
-    both = product(step(model(normalization="path-loss"), crowd, 5))
+    both = channel_of(step(model(normalization="path-loss"), crowd, 5))
     for index, carrier in enumerate(CARRIERS):
-        alone = product(step(model(normalization="path-loss", of=(carrier,)), crowd, 5))
+        alone = channel_of(step(model(normalization="path-loss", of=(carrier,)), crowd, 5))
         assert np.array_equal(alone.a[0], both.a[index])
         assert np.array_equal(alone.doppler[0], both.doppler[index])
         assert np.array_equal(alone.tau, both.tau)
@@ -148,7 +142,7 @@ def test_two_carriers_are_what_each_is_alone() -> None:
 
 
 def test_a_single_component_is_the_line_alone() -> None:
-    channel = product(step(model(components=1), scene(*TWO)))
+    channel = channel_of(step(model(components=1), scene(*TWO)))
     assert np.abs(channel.a) == pytest.approx(1.0)
     encode_payload(channel)
 
@@ -156,7 +150,7 @@ def test_a_single_component_is_the_line_alone() -> None:
 def test_devices_at_one_place_have_no_path_and_are_counted() -> None:
     crowd = scene(*TWO, device("x", "both", 20, 0, 5))
     result = step(model(), crowd)
-    channel = product(result)
+    channel = channel_of(result)
     assert result.counts["too_close"] == 1
     assert channel.offsets.tolist() == [0, 3, 6, 9, 9]
     assert not channel.h[3].h.any()
@@ -165,7 +159,7 @@ def test_devices_at_one_place_have_no_path_and_are_counted() -> None:
 
 @pytest.mark.parametrize("role", ["tx", "rx"])
 def test_without_an_end_there_is_an_empty_product(role: str) -> None:
-    channel = product(step(model(), scene(device("d", role, 0, 0, 0))))
+    channel = channel_of(step(model(), scene(device("d", role, 0, 0, 0))))
     assert len(channel.tau) == 0
     assert channel.offsets.tolist() == [0]
     encode_payload(channel)
@@ -177,7 +171,7 @@ def test_a_range_of_angles_may_lie_behind() -> None:
     for azimuth, free in ((-179, False), (171, False), (169, True), (-170.5, False), (-169, True), (0, True)):
         angle = np.radians(azimuth)
         there = device("r", "rx", float(40 * np.cos(angle)), float(40 * np.sin(angle)), 12.0)
-        assert product(step(service, scene(TWO[0], there))).los.tolist() == [[free]], azimuth
+        assert channel_of(step(service, scene(TWO[0], there))).los.tolist() == [[free]], azimuth
 
 
 def test_boxes_between_the_ends_block_the_line() -> None:
@@ -192,13 +186,13 @@ def test_boxes_between_the_ends_block_the_line() -> None:
     }
     for name, (box, free) in others.items():
         world = scene(*ends, boxes={**carriers, name: box})
-        assert product(step(model(nlos="geometry"), world)).los.tolist() == [[free]], name
+        assert channel_of(step(model(nlos="geometry"), world)).los.tolist() == [[free]], name
 
 
 def test_boxes_of_the_settings_block_too() -> None:
     service = model(nlos="geometry", obstacles=[{"minimum_m": [10, -9, 0], "maximum_m": [12, -1, 30]}])
     behind, beside = device("r", "rx", 50, -9, 2), device("s", "rx", 50, 9, 2)
-    channel = product(step(service, scene(TWO[0], behind, beside)))
+    channel = channel_of(step(service, scene(TWO[0], behind, beside)))
     assert channel.los.tolist() == [[False, True]]
 
 

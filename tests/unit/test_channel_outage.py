@@ -19,6 +19,7 @@ from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.lab import frame_of
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.mesh.shapes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
@@ -209,8 +210,7 @@ def traced(tmp_path_factory: pytest.TempPathFactory) -> SionnaChannel:
 
 def causes(traced: SionnaChannel, town: Scene) -> dict[str, int]:
     """What the service reports of a scene, beside the counts that it always has."""
-    source = FrameInput(GrantInput(topic="scene", source="w", status=Status.FRESH), payload=town)
-    counts = traced.step(Frame(episode=0, number=0, t_ns=0, inputs=(source,))).counts
+    counts = traced.step(frame_of(town)).counts
     return {name: count for name, count in counts.items() if "/" in name}
 
 

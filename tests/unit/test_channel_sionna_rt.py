@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
-from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.channel.stability.lab import frame_of
 from caviar_services.registry import load
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
+from caviar_services.service import Preparation, RunInfo, StepResult
 
 RX = DeviceSpec(name="rx", kind="antenna", role="rx", on="car.*", count=3)
 PLY = """ply
@@ -72,8 +72,7 @@ def step(
         dimensions=np.tile([4.0, 2.0, 1.5], (count, 1)),
         devices=devices,
     )
-    source = FrameInput(GrantInput(topic="scene", source="w", status=Status.FRESH), payload=scene)
-    return channel.step(Frame(episode=0, number=0, t_ns=0, inputs=(source,)))
+    return channel.step(frame_of(scene))
 
 
 def test_it_is_registered_and_says_its_rung() -> None:

@@ -23,7 +23,7 @@ from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 
 Array = NDArray[Any]
 Point = Sequence[float] | Float64Array
@@ -311,16 +311,25 @@ def measure(model: Model, at: Scene, number: int = 0) -> Channel:
         >>> round(float(channel.tau[0] * 299_792_458.0), 6)  # [m]
         50.0
     """
-    source = FrameInput(GrantInput(topic="scene", source="world", status=Status.FRESH), payload=at)
-    frame = Frame(
-        episode=0,
-        number=number,
-        t_ns=number * 100_000_000,
-        inputs=(source,),
-        service=model.run.name,
-        seed=model.run.seed,
-    )
-    channel = model.step(frame).products["channel"]
+    return channel_of(model.step(frame_of(at, number, service=model.run.name, seed=model.run.seed)))
+
+
+def frame_of(at: Scene, number: int = 0, **more: Any) -> Frame:
+    """The frame of a scene, 100 ms behind the one before, for a channel model.
+
+    Args:
+        at: The scene.
+        number: Of the frame, in episode 0.
+        more: Other fields of `Frame`.
+    """
+    provenance = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=number)
+    inputs = (FrameInput(provenance, payload=at),)
+    return Frame(**{"episode": 0, "number": number, "t_ns": number * 100_000_000, "inputs": inputs, **more})
+
+
+def channel_of(result: StepResult) -> Channel:
+    """The channel product of a frame."""
+    channel = result.products["channel"]
     if not isinstance(channel, Channel):
         raise TypeError(f"a channel model made a {type(channel).__name__}")
     return channel
