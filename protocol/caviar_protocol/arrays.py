@@ -1,7 +1,7 @@
 """Payloads with arrays: their typed fields, the checks of these, and how arrays travel.
 
 A product is two byte strings: a *header* (msgpack map of the typed fields) and a *body* (the
-arrays, one behind the other). In the header an array stands as
+arrays, one after the other). In the header an array stands as
 ``{"dtype": "<f8", "shape": [3, 2], "offset": 0}``; its elements are in C order, little-endian,
 at ``offset`` bytes into the body. Offsets are multiples of 8, increase in field order, and
 gaps are zero, so that equal values give equal bytes (contract, clause 20).

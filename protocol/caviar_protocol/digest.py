@@ -93,7 +93,7 @@ class RunDigest:
     """
 
     def __init__(self, begun: str = "") -> None:
-        """Begin a chain, or go on behind the digest ``begun``."""
+        """Begin a chain, or continue after the digest ``begun``."""
         self._state = bytes.fromhex(begun) or hashlib.sha256(b"caviar-run-1").digest()
         # Hashing waits until no service waits for a grant: it is no part of a frame's latency.
         self._waiting: list[tuple[int, int, list[tuple[str, str, str]]]] = []

@@ -90,7 +90,7 @@ Period = Annotated[int, quantity("ns", "wall time, whole, at least 1", ge=1, le=
 Count = Annotated[int, quantity("1", "count", ge=0, le=MAX_INTEGER)]
 Size = Annotated[int, quantity("B", "number of bytes", ge=0, le=MAX_INTEGER)]
 
-# `max_length` keeps out a line feed, which ``$`` would let pass behind 64 digits.
+# `max_length` keeps out a line feed, which ``$`` would let pass after 64 digits.
 Digest = Annotated[
     str,
     quantity("1", "SHA-256, 64 lower-case hexadecimal digits", max_length=64, pattern="^[0-9a-f]{64}$"),

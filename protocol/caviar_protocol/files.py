@@ -152,7 +152,7 @@ def map_regular(path: Path) -> memoryview:
 
 
 def open_to_append(path: Path) -> FileIO:
-    """Open a file of a run behind its end, to be written and read; make it and its folder where missing.
+    """Open a file of a run at its end, to be written and read; make it and its folder where missing.
 
     Args:
         path: The file.

@@ -381,7 +381,7 @@ class CheckpointDone(_Message, frozen=True, kw_only=True, tag="CHECKPOINT_DONE")
 
 
 class Restore(_Message, frozen=True, kw_only=True, tag="RESTORE"):
-    """Broker to a service that rejoined, behind RESET: your state after this frame, in one further
+    """Broker to a service that rejoined, after RESET: your state after this frame, in one further
     part. Answered by READY. The grants since then follow, as they were, one after the other; each is
     answered by DONE as before. Needs capability ``checkpoint``."""
 
@@ -392,7 +392,7 @@ class Restore(_Message, frozen=True, kw_only=True, tag="RESTORE"):
 
 
 RUN_COMPLETE = "the run is complete"
-"""Reason of the SHUTDOWN behind the last frame."""
+"""Reason of the SHUTDOWN after the last frame."""
 STOPPED_BY = "stopped by"
 """Begins the reason of a SHUTDOWN that a signal to the broker brought."""
 

@@ -6,7 +6,7 @@ carrier the baseband channel is (Tse and Viswanath, Fundamentals of Wireless Com
 
     H(Δf, Δt) = Σ_p a_p · exp(j2πν_p·Δt) · exp(−j2πΔf·(τ_p − Δt·ν_p/f_c)),
 
-and its samples behind an ideal low-pass filter of bandwidth W (eq. 2.35)
+and its samples after an ideal low-pass filter of bandwidth W (eq. 2.35)
 
     h_l(Δt) = Σ_p a_p · exp(j2πν_p·Δt) · sinc(l − W·(τ_p − Δt·ν_p/f_c)).
 

@@ -295,7 +295,7 @@ def structs_below(hints: Iterable[Any]) -> list[type[msgspec.Struct]]:
         hints: Structs, or types of fields.
 
     Returns:
-        Each once, behind those that hold it.
+        Each once, after those that hold it.
 
     Example:
         >>> [cls.__name__ for cls in structs_below([tuple[topics.ChannelMatrix, ...] | None, topics.Camera])]

@@ -102,7 +102,7 @@ class ContentCheck:
         """Take note of the inputs of the next grant, before they are checked.
 
         A channel looks at every scene before it computes with it, so a product that was made of a frame's
-        scenes vouches for them. Behind the `FIRST_LOOKS` of a source, consumers that get the channel too do
+        scenes vouches for them. After the `FIRST_LOOKS` of a source, consumers that get the channel too do
         not look again: it would cost as much as a small service's own work.
         """
         self._derived = frozenset(
@@ -446,7 +446,7 @@ def _wrong_places(
             return f"{part}[{index}] is of carrier, tx and rx {place}, for which there is no part {part!r}"
         if index and place <= places[index - 1]:
             earlier = _pair_name(places[index - 1], channel)
-            return f"{part}[{index}] is of {_pair_name(place, channel)}, behind {earlier}"
+            return f"{part}[{index}] is of {_pair_name(place, channel)}, after {earlier}"
     return ""
 
 

@@ -46,7 +46,7 @@ def test_a_recording_that_breaks_off_has_a_digest_and_a_note(tmp_path, capsys):
     file = record(tmp_path) / "recording-0000.mcap"
     file.write_bytes(file.read_bytes()[: Segment(file).chunks[3].offset + 50])
     assert inspect_command(tmp_path, digest=True) == 1
-    assert "lost are all frames behind frame 2 of episode 0 up to frame 4" in capsys.readouterr().err
+    assert "lost are all frames after frame 2 of episode 0 up to frame 4" in capsys.readouterr().err
     (tmp_path / "recording.json").unlink()  # which a recorder that was killed does not say it closed
     assert inspect_command(tmp_path, digest=True) == 0
     out, err = capsys.readouterr()

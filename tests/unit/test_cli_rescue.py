@@ -77,7 +77,7 @@ def test_a_recording_without_its_last_segment_is_saved_without_damage(tmp_path):
     (run / "recording-0001.mcap").unlink()
     status, text = rescue(run)
     assert status == 1
-    assert "recording-0001.mcap is missing: lost are all frames behind frame 2" in text
+    assert "recording-0001.mcap is missing: lost are all frames after frame 2" in text
     assert Recording(tmp_path / "run-rescued").complete
     assert Recording(tmp_path / "run-rescued").run_digest().damage == ()
 

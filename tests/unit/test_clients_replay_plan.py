@@ -207,7 +207,7 @@ def test_a_recording_that_breaks_off_is_repeated_as_far_as_it_goes(
     file = next(copy.glob("*.mcap"))
     data = file.read_bytes()
     file.write_bytes(data[: len(data) * 2 // 3])
-    with pytest.warns(RecordingWarning, match="lost are all frames behind frame"):
+    with pytest.warns(RecordingWarning, match="lost are all frames after frame"):
         run = RecordedRun(Recording(copy))
     plan = planned(run)
     assert 0 < plan.frames < FRAMES

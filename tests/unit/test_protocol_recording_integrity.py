@@ -108,7 +108,7 @@ def test_zeros_at_the_end_cost_no_frame_before_them(tmp_path, zeros):
     assert [f.payloads("link", Link)["link"] for f in recording.frames()] == [link(k) for k in range(4)]
     assert not recording.complete
     if zeros >= 9:  # else it is a record whose head was not written whole
-        assert f"readable up to byte {len(left) - zeros} of {len(left)}: lost are all frames behind" in told
+        assert f"readable up to byte {len(left) - zeros} of {len(left)}: lost are all frames after" in told
 
 
 def test_a_hole_in_the_middle_ends_what_was_not_closed(tmp_path):
@@ -126,7 +126,7 @@ def test_a_hole_in_the_middle_ends_what_was_not_closed(tmp_path):
     (tmp_path / "recording.json").unlink()
     recording, told = read(tmp_path)
     assert [f.number for f in recording.frames()] == [0, 1, 2]
-    assert "lost are all frames behind frame 2 of episode 0" in recording.damage[0]
+    assert "lost are all frames after frame 2 of episode 0" in recording.damage[0]
     assert "are not what was written (CRC-32)" in recording.damage[1]
     assert recording.damage[0] in told
     assert recorded_until(tmp_path)[0] == (0, 2)
@@ -139,8 +139,7 @@ def test_a_last_segment_that_is_gone_is_missed(tmp_path):
     assert not recording.complete
     assert len(recording) == 4
     assert (
-        "recording-0002.mcap is missing: lost are all frames behind frame 3 of episode 0 up to frame 5"
-        in told
+        "recording-0002.mcap is missing: lost are all frames after frame 3 of episode 0 up to frame 5" in told
     )
     assert recorded_until(run) == ((0, 3), recording.damage)
 

@@ -187,7 +187,7 @@ def test_a_next_segment_that_was_only_begun_loses_nothing(run):
 
 def test_a_missing_segment_is_named(run):
     (run / "recording-0001.mcap").unlink()
-    lost = r"recording-0001\.mcap is missing: lost are all frames behind frame 1 of episode 0 up to frame 3"
+    lost = r"recording-0001\.mcap is missing: lost are all frames after frame 1 of episode 0 up to frame 3"
     with pytest.warns(RecordingWarning, match=lost + r" of episode 0, and those of recording-0002\.mcap"):
         recording = Recording(run)
     assert not recording.complete
@@ -203,10 +203,10 @@ def test_a_segment_that_breaks_off_before_others_is_read_up_to_there(run):
     with pytest.warns(RecordingWarning, match=r"0001\.mcap has \d+ B of \d+ B: its index is damaged, and no"):
         assert len(Recording(run)) == 6
     file.write_bytes(file.read_bytes()[: Segment(file).chunks[1].stop])
-    with pytest.warns(RecordingWarning, match="behind frame 2 of episode 0 up to frame 3"):
+    with pytest.warns(RecordingWarning, match="after frame 2 of episode 0 up to frame 3"):
         assert len(Recording(run)) == 3
     (run / "recording.json").unlink()
-    with pytest.warns(RecordingWarning, match=r"breaks off at byte \d+: lost are all frames behind frame 2"):
+    with pytest.warns(RecordingWarning, match=r"breaks off at byte \d+: lost are all frames after frame 2"):
         assert len(Recording(run)) == 3
 
 

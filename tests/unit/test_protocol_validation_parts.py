@@ -99,8 +99,8 @@ WRONG: dict[str, tuple[Callable[[], Channel], str]] = {
     "of no carrier with subcarriers": (lambda: channel(hf=(replace(RIGHT.hf[0], carrier=0), *RIGHT.hf)),
                                        r"hf\[0\] is of carrier, tx and rx \(0, 0, 0\), for which there is"),
     "out of range": (lambda: channel(h=(*RIGHT.h, replace(RIGHT.h[0], rx=7))), r"h\[4\] .* \(0, 0, 7\)"),
-    "out of order": (lambda: channel(hf=RIGHT.hf[::-1]), r"hf\[1\] is of bs → bs on 'wide', behind bs → car"),
-    "twice": (lambda: channel(hf=(*RIGHT.hf, RIGHT.hf[1])), r"hf\[2\] is of bs → car.1/rx on 'wide', behind"),
+    "out of order": (lambda: channel(hf=RIGHT.hf[::-1]), r"hf\[1\] is of bs → bs on 'wide', after bs → car"),
+    "twice": (lambda: channel(hf=(*RIGHT.hf, RIGHT.hf[1])), r"hf\[2\] is of bs → car.1/rx on 'wide', after"),
     "other carriers": (lambda: channel(carriers=CARRIERS[::-1]), r"\['wide', 'narrow'\], by the scenario"),
     "not finite": (lambda: channel(hf=(RIGHT.hf[0], NOT_FINITE)), r"hf\[1\]: ChannelResponse.h\[0, 0, "),
 }  # fmt: skip

@@ -90,7 +90,7 @@ def _deeper_than(data: bytes, limit: int) -> bool:
 
 def _open(data: bytes, position: int, byte: int) -> tuple[int, int]:
     """Position of the first value in a container, and how many there are (keys count too)."""
-    # fixmap and fixarray have their size in the low bits; the others two or four bytes behind.
+    # fixmap and fixarray have their size in the low bits; the others in two or four bytes after.
     if byte < 0xA0:
         return position + 1, (byte & 0x0F) * (1 if byte >= 0x90 else 2)
     width = 2 if byte in (0xDC, 0xDE) else 4

@@ -1,6 +1,6 @@
 """Payloads to bytes and back, in one canonical form (contract, clause 20).
 
-The header has the fields in declared order behind the tag, without those that equal their default, every
+The header has the fields in declared order after the tag, without those that equal their default, every
 number as the type its field declares. Equal payloads therefore give equal bytes, however they were made:
 `msgspec` alone leaves out a default only where it is the very same object.
 
@@ -39,7 +39,7 @@ _CODES = {dtype: code for code, dtype in WIRE_DTYPES.items()}
 
 
 class BodyWriter:
-    """Lays arrays behind each other."""
+    """Lays arrays one after another."""
 
     def __init__(self) -> None:
         self._chunks: list[bytes | memoryview] = []
@@ -81,7 +81,7 @@ class BodyWriter:
 
 
 class BodyReader:
-    """Gives out read-only views into a body, each behind the one before."""
+    """Gives out read-only views into a body, each after the one before."""
 
     def __init__(self, body: memoryview) -> None:
         self._body = body

@@ -52,7 +52,7 @@ class RecordedSegments:
     """Finished segments all of whose frames are before this (episode, frame), and whose size is that of the
     manifest, are not opened, the last one excepted; None: all are opened."""
     past_gaps: bool = False
-    """Whether segments behind one that is missing, broken or of another run are read too."""
+    """Whether segments after one that is missing, broken or of another run are read too."""
     trusted: list[SegmentRecord] = field(default_factory=list)
     """Those before `segments`."""
     manifest: Manifest | None = None
@@ -218,7 +218,7 @@ class RecordedSegments:
             self.damage.insert(0, f"{what}: its frames are lost{extent}")
             return
         instants = self.instants or [record.last for record in self.trusted[-1:] if record.last]
-        since = f"all frames behind {frame_name(instants[-1])}" if instants else "every frame"
+        since = f"all frames after {frame_name(instants[-1])}" if instants else "every frame"
         until = f" up to {frame_name(record.last)}" if record is not None and record.last else ""
         if later:
             until += f", and those of {later[0].name}" + (" and later segments" if len(later) > 1 else "")
@@ -236,7 +236,7 @@ def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]
         found = RecordedSegments(path, trusted_before=(sys.maxsize, 0))
     except RecordingError as error:
         return None, (str(error),)
-    # Trusted segments have no gap: the manifest lists them as finished, one behind the other.
+    # Trusted segments have no gap: the manifest lists them as finished, one after the other.
     last = found.trusted[-1].last if found.trusted else None
     for instant in found.instants:
         if last is not None and not follows(last, instant):

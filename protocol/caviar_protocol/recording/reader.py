@@ -66,7 +66,7 @@ class Recording:
 
     Args:
         path: The run directory, or one ``.mcap`` file of it.
-        past_gaps: Whether what is behind a segment that is missing or broken is read too.
+        past_gaps: Whether what comes after a segment that is missing or broken is read too.
 
     Raises:
         RecordingError: It is not a recording, nothing of it can be read, or the content contradicts itself.

@@ -5,9 +5,9 @@ over it touches a few pages a frame, and payloads are views into the map. The fr
 here, and not by the ``mcap`` package, because a recording must be readable up to where a
 killed process or a power loss left it, and what is damaged must be named with its place.
 
-Behind the metadata, and behind the chunk and the index of every frame, stands a *seal*: a private MCAP record
+After the metadata, and after the chunk and the index of every frame, stands a *seal*: a private MCAP record
 (opcode `SEAL_OPCODE`, which other MCAP readers skip) with the CRC-32 of all bytes of the file before it. So
-every byte up to the last seal is covered. The summary behind it is covered by MCAP's own CRC, and by
+every byte up to the last seal is covered. The summary after it is covered by MCAP's own CRC, and by
 the manifest (`caviar_protocol.recording`), which has the CRC-32 of every finished segment.
 A segment that was not finished is checked as it is opened, and is read up to its last good seal.
 Segments of earlier versions have no seals, but MCAP's CRC of the data section.
@@ -182,7 +182,7 @@ class Segment:
                 yield Message(channel, frame, data)
 
     def _scan(self) -> None:
-        """Find chunks, seals and the end; behind a record that does not fit, go on after the next seal."""
+        """Find chunks, seals and the end; after a record that does not fit, go on after the next seal."""
         data, position = self._data, len(MAGIC)
         if data[: len(MAGIC)] != MAGIC[: len(data)]:
             raise RecordingError(f"{self.path} does not begin as an MCAP file: it is not a recording")
@@ -201,7 +201,7 @@ class Segment:
                 position = start + length
                 self.readable = position + (len(MAGIC) if self.finished else 0)
                 continue
-            # A seal is the next place whose bytes vouch for what precedes: behind it records fit again.
+            # A seal is the next place whose bytes vouch for what precedes: after it records fit again.
             following = _find(data, _SEAL_HEAD, position + 1)
             if following < 0:
                 # A record that is cut at the end of a file without an end is what a kill leaves, no damage.
@@ -211,7 +211,7 @@ class Segment:
             self.damage.append(f"bytes {position} to {following}: the record {fault}")
             position = following
         if self.finished and self.readable != len(data):
-            self.damage.append(f"{len(data) - self.readable} bytes behind its end")
+            self.damage.append(f"{len(data) - self.readable} bytes past its end")
 
     def _end_is_in_place(self) -> bool:
         return len(self) > len(MAGIC) and self._data[-len(MAGIC) :] == MAGIC
@@ -258,7 +258,7 @@ class Segment:
         return ""
 
     def _summary_is_whole(self, data_end: int) -> bool:
-        """Whether the summary begins behind the data and has the CRC-32 that the footer says."""
+        """Whether the summary begins after the data and has the CRC-32 that the footer says."""
         footer = len(self) - len(MAGIC) - _FOOTER_CONTENT.size
         if footer < data_end:
             return False
@@ -313,7 +313,7 @@ class Segment:
             try:
                 return next(self._walk(chunk, self._content(chunk, size)), None)
             except RecordingError:
-                size *= 4  # it may go on behind these bytes
+                size *= 4  # it may go on after these bytes
         return next(self._walk(chunk, self._content(chunk, _LAST_LOOK)), None)
 
     def _walk(self, chunk: Chunk, content: memoryview) -> Iterator[tuple[int, int, memoryview]]:

@@ -97,7 +97,7 @@ class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The run as a whole."""
 
-    # The name of the run's directory has a date and a time behind it, and 255 B at most.
+    # The name of the run's directory has a date and a time after it, and 255 B at most.
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$")]
     """Name of the scenario, with which the run's directory begins."""
     frames: Annotated[int, quantity("frame", "frames of an episode", ge=1)]
@@ -138,7 +138,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    """Name of the device, behind that of the object it is mounted on."""
+    """Name of the device, after that of the object it is mounted on."""
     # One struct for all kinds: TOML has no types, and an error can name the kind that a key belongs to.
     kind: Literal["antenna", "lidar", "camera"]
     """What the device is; keys of the other kinds are refused."""

@@ -162,7 +162,7 @@ class _Scanner:
         return path
 
     def key(self) -> tuple[str, ...]:
-        """A possibly dotted key, up to the ``=`` or ``]`` behind it."""
+        """A possibly dotted key, up to the ``=`` or ``]`` after it."""
         parts: list[str] = []
         while True:
             self.skip(_SPACE)

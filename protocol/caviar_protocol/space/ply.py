@@ -93,7 +93,7 @@ def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
     found: dict[str, NDArray[Any]] = {}
     for element in elements:
         found[element.name] = body.triangles(element) if element.has_lists else body.columns(element)
-        # What stands behind the faces, such as lines and materials of some tools, need not be readable.
+        # What stands after the faces, such as lines and materials of some tools, need not be readable.
         if element.name == "face":
             break
     if missing := {"vertex", "face"} - set(found):
@@ -106,7 +106,7 @@ def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Byte order, elements, and where the data begin."""
-    # Before the lines are split: binary data behind the header may hold line feeds.
+    # Before the lines are split: binary data after the header may hold line feeds.
     end = data.index(b"end_header")
     order, elements = None, list[_Element]()
     for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):

@@ -163,10 +163,10 @@ class ChannelResponse(Payload, frozen=True, kw_only=True, omit_defaults=True):
 class ChannelTaps(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """Sampled impulse response of one carrier and one TX/RX pair, in each slot of the carrier.
 
-    Tap l is at the absolute delay (first + l)/W with the sampling rate W = ``bandwidth_hz``, behind an ideal
+    Tap l is at the absolute delay (first + l)/W with the sampling rate W = ``bandwidth_hz``, after an ideal
     low-pass filter: h = Σ a·sinc(first + l − W·(τ − Δt·ν/frequency_hz))·exp(j2πν·Δt), where
     sinc(x) = sin(πx)/(πx). ``first`` is ⌊W·τ⌋ − 6 with the delay τ of the pair's earliest path, which may be
-    negative, and 0 without a path; what arrives behind the last tap is left out.
+    negative, and 0 without a path; what arrives past the last tap is left out.
 
     Example:
         >>> import numpy as np
@@ -248,7 +248,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
             "P",
             "D",
             unit="1",
-            doc="what happens at each point, TX to RX: 0 nothing (behind the last), 1 reflection, "
+            doc="what happens at each point, TX to RX: 0 nothing (past the last), 1 reflection, "
             "2 diffraction, 3 scattering, 4 transmission",
         ),
     ]
