@@ -8,10 +8,10 @@ from caviar_protocol import spec
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Lines of a table, and an empty one behind it."""
+    """Lines of a table, and an empty one after it."""
     yield from (spec.table(head, rows), "")
 
 
 def toctree(names: Iterable[str], *options: str) -> Iterator[str]:
-    """Lines of a table of contents, and an empty one behind it."""
+    """Lines of a table of contents, and an empty one after it."""
     yield from ("```{toctree}", *options, "", *names, "```", "")
