@@ -153,6 +153,7 @@ class ChannelModel(Service[S]):
         """`options`, with the absorption that all models share; known once `load` is through."""
         if self.absorption_db_per_km is None:
             return self.options
+        # Part of what a product states, as the options of the model are.
         absorption = tuple(self.absorption_db_per_km.tolist())
         return msgspec.structs.replace(self.options, absorption_db_per_km=absorption)
 
@@ -255,6 +256,7 @@ class ChannelModel(Service[S]):
             PayloadError: A number of the scene is not finite, something is faster than light, or a path
                 brings more power than was sent.
         """
+        # Devices mostly are the object of the last frame: their numbers are summed once.
         scene = frame.scene()
         if scene.devices is not self._summed[0]:
             self._summed = scene.devices, _numbers_of(scene.devices)
@@ -319,6 +321,7 @@ def _numbers_in(scene: Scene) -> float:
 
 def _numbers_of(devices: tuple[Device, ...]) -> float:
     """The sum of all numbers of devices."""
+    # Python sums: of so few numbers each call of NumPy would cost more.
     numbers = [number for device in devices for number in (*device.position, *device.orientation)]
     for device in devices:
         if isinstance(device, AntennaDevice):

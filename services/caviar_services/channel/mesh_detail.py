@@ -296,6 +296,7 @@ def detailed(
     pieces = 0
     for name, mesh in shapes:
         label = piece_numbers(mesh)
+        # Pieces of a shape are judged one by one: a mesh of all trees of a park is many pieces.
         reasons = _reasons(mesh, label, settings)
         pieces += len(reasons)
         lost.update(reasons)

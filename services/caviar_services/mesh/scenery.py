@@ -123,6 +123,7 @@ def read_scenery(file: Path, called: str = "") -> Scenery:
     called = called or str(file)
     root, lines = _parse(file, called)
     _check_ids(called, root, lines)
+    # Mitsuba's parameters of a description, which users refer to as $name.
     defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
     materials = {b.get("id", ""): b for b in root.findall("bsdf")}
     for element in (*root.findall("bsdf"), *root.findall("shape/bsdf")):
@@ -255,6 +256,7 @@ def _material_of(
 
 def _colour(where: str, bsdf: ElementTree.Element) -> tuple[float, float, float] | None:
     """The first colour of a material under a name that renderers take one by."""
+    # Renderers differ in what they call the colour of a material.
     for rgb in bsdf.iter("rgb"):
         if rgb.get("name") in ("color", "reflectance", "base_color"):
             value = rgb.get("value", "")

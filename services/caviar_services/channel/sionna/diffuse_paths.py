@@ -207,6 +207,7 @@ class Thinning:
             brings = np.broadcast_to(power, len(shape)) * np.maximum(rough * reflected, _LEAST * rough)
             rows = np.concatenate([met.point[ray].T, met.normal[ray].T, brings[None, ray]])
             parts.append((ray, np.full(len(ray), d + 1, np.int64), rows))
+            # Divided by the probability of what was drawn: on average, all power goes on.
             if d + 1 < len(launch.bounces):
                 kinds = [met.kind == REFLECTED, met.kind == SCATTERED, met.kind == REFRACTED]
                 parts_on = [(1 - rough) * reflected, rough * reflected, 1 - reflected]
@@ -231,6 +232,7 @@ class Thinning:
         Returns:
             Which are kept, and with what probability, each of Shape ``[P, R]``.
         """
+        # Of integers, so that the sum does not depend on the order of the points.
         total = np.rint(weight * _UNIT).astype(np.int64).sum(0) / _UNIT
         probability = weight * (self._wanted / np.maximum(total, 1 / _UNIT))
         np.minimum(probability, 1.0, out=probability)
@@ -268,7 +270,7 @@ class _Met:
 
 
 def _at_normal(material: Any) -> float:
-    """|Γ|² of a half-space of a radio material at normal incidence (Fresnel)."""
+    """``|Γ|²`` of a half-space of a radio material at normal incidence (Fresnel)."""
     loss = float(material.conductivity[0]) / (float(material.scene.angular_frequency[0]) * EPSILON_0)
     root = complex(float(material.relative_permittivity[0]), -loss) ** 0.5
     return abs((1 - root) / (1 + root)) ** 2

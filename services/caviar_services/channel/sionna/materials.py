@@ -212,6 +212,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         Args:
             constants: As ITU-R P.2040 defines them.
         """
+        # What is not given stays as the Recommendation has it.
         permittivity, conductivity = constants
         if self.relative_permittivity is not None:
             permittivity = self.relative_permittivity
@@ -343,6 +344,7 @@ def itu_material(
     evaluated = gigahertz
     if taken is None:
         if policy.outside == "error":
+            # body_material and object_materials have remedies of their own: constants stand elsewhere.
             own = f"give it relative_permittivity and conductivity_s_per_m in {policy.key}.materials.{name}"
             raise ScenarioError(
                 f"material {name!r} ({label}) is defined for {_spans(tuple(table))}, the carrier is "
@@ -353,7 +355,9 @@ def itu_material(
         # Of two ranges that are as near, min takes the first.
         taken = min(table, key=lambda r: abs(gigahertz - _clamped(gigahertz, r)))
         if policy.outside == "nearest":
+            # The power law of the range, at its end.
             evaluated = _clamped(gigahertz, taken)
+    # Other materials have models of their own, ITU ones the power laws of table 3.
     if other is not None:
         constants = other.constants(evaluated)
     else:

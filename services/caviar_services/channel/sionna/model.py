@@ -320,6 +320,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
         table, too_close = with_near_pairs(table, los, *antennas, finder.wavelengths, self._scene.surfaces)
+        # Behind the near pairs, whose lines of sight foliage dims, too.
         if self.foliage is not None:
             table = self.foliage.attenuated(table, *path_ends(table.pair, *antennas))
         if not self.settings.los:
@@ -395,6 +396,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """Counts of the keys of settings that are for no object of a scene and no piece of scenery."""
         named = scene.names, scene.classes
         if self._known_unmatched[0] != named:
+            # Keys may be for scenery or objects, by the same names.
             pieces = [(name, "") for name in (*self._scene.names, *self._scene.foliage_meshes)]
             found = [*pieces, *zip(*named, strict=True)]
             counts = {

@@ -71,6 +71,7 @@ class PathFinder:
         """Of the carriers [m], Shape ``[C]``."""
         self.samples = settings.launched_samples(enumerated)
         """Rays of a launch; where candidates are enumerated, of scenery's."""
+        # Rays are then launched in frames only for what is not enumerated, and few do.
         if enumerated:
             options = replace(options, samples=settings.samples_per_frame)
         self.options = options
@@ -116,8 +117,7 @@ class PathFinder:
             self._following = Following(settings.follow, scene, self._without_body)
         self.missed: list[tuple[Int64Array, Traced, Float64Array]] = []
         """Of each launch of a frame for paths of all kinds, if asked for: pairs, paths, and the probability
-        that
-        half of the rays would have missed each path."""
+        that half of the rays would have missed each path."""
 
     def _tracer_of(self, options: LaunchOptions) -> Tracer:
         return Tracer(self._scene, self.wavelengths.tolist(), options)
@@ -296,13 +296,13 @@ class PathFinder:
         with_missed: bool,
     ) -> list[tuple[Traced, Float64Array | None]]:
         """Paths of one transmitter to targets [m], Shape ``[R, 3]``, with the probability that half of the
-        rays
-        would have missed them where it is asked for."""
+        rays would have missed them where it is asked for."""
         source, at_once = transmitter.position, self._settings.receivers_at_once
         tracer, over_edges = self.tracer, True
         if self._edge_range is not None and not self._edge_range.reaches(
             np.concatenate([source[None], targets])
         ):
+            # Diffraction doubles the time of a launch, found or not.
             tracer, over_edges = self._unbent, False
             self._without_edge += 1
         found: list[tuple[Traced, Float64Array | None]] = []

@@ -355,6 +355,7 @@ class Tracer:
                 buffer._interaction_types.array, mi.UInt(SCATTERED), place + interactions - 1, is_chosen
             )
             dr.scatter(buffer._probs.array, chosen, place + interactions - 1, is_chosen)
+        # A path has one edge at most: it is that of the whole ray.
         if self._options.diffraction and launch.wedges is not None:
             buffer._diffracting_wedges = dr.gather(WedgeGeometry, launch.wedges, ray, interactions > 0)
         buffer.schedule()
@@ -427,6 +428,7 @@ class Tracer:
         geometric, carried = dr.copy(buffer.valid), mi.Bool(False)
         amplitudes: list[Any] = []
         for carrier, wavelength in enumerate(self._wavelengths):
+            # The scene is tuned to the first carrier as it comes, and again when this is through.
             if carrier:
                 self._scene.tune(carrier)
                 buffer.valid = dr.copy(geometric)

@@ -194,6 +194,7 @@ class PartedLauncher:
     """
 
     def __init__(self, mi_scene: Any, options: LaunchOptions, generator: Any = None) -> None:
+        # All passes of a ray are lanes of one launch.
         at_once = max(1, options.rays_at_once // max(len(options.passes), 1))
         begins = range(0, options.samples, at_once)
         bounds = [(begin, min(begin + at_once, options.samples)) for begin in begins]

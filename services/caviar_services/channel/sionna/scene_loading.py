@@ -147,6 +147,7 @@ def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
     import mitsuba as mi
 
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
+    # Faces of each piece refer to its own vertices.
     before = np.cumsum(counts) - counts
     faces = np.concatenate([mesh.faces + begin for mesh, begin in zip(shape.meshes, before, strict=True)])
     properties = mi.Properties()
@@ -357,6 +358,7 @@ def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, An
         meshes: Of its pieces, by name.
         changed: Materials of pieces that are given another one than the scenery's.
     """
+    # One shape a material: each further shape costs a millisecond a trace, whatever its size.
     groups: dict[str, Shape] = {}
     for name, mesh in meshes.items():
         material = changed.get(name, scene.objects[name].radio_material)
@@ -446,6 +448,7 @@ def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
         The centre [m], Shape ``[3]``, and a warning that names the farthest piece, empty where none is far.
     """
     low, high = _boxes(shapes)
+    # The usual scene: its middle, so that products stay what they are.
     if not len(low) or (high.max(0) - low.min(0)).max() <= 2 * _FARTHEST:
         return near_middle(*bounds(shapes)), ""
     middles = (low + high) / 2

@@ -179,6 +179,7 @@ class Followed:
         """
         jumped = self._known is not None and np.linalg.norm(transmitter - self._from) > _JUMP
         known, number, source = None if jumped else self._known, self._number, positions(transmitter[None])
+        # Nothing is known at the beginning, nor where the transmitter has jumped: then all rays are launched.
         rays = None if known is None else self._rays(number)
         if rays is None:
             self._on_object = np.zeros(options.samples, np.bool_)
@@ -205,6 +206,7 @@ class Followed:
         for shift in _BESIDE:
             chosen[shift:] |= chosen[:-shift].copy()
             chosen[:-shift] |= chosen[shift:].copy()
+        # Every part-th ray, another one in each frame: after so many frames all have been launched.
         chosen[number % self._parts :: self._parts] = True
         return np.flatnonzero(chosen)
 

@@ -71,6 +71,7 @@ class NumberedTriangles:
         self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
+        # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
         self._relative = self._corners - centre
         self.joined: JoinedFaces
         """Which faces are one surface."""
@@ -143,8 +144,7 @@ class NumberedTriangles:
 
         Returns:
             The number of the plane within its object, or where a body's face is one surface with others, −1
-            minus the
-            place of that surface among the second: object and plane of each such surface.
+            minus the place of that surface among the second: object and plane of each such surface.
         """
         numbers = self._face_of[triangles].astype(np.int32)
         of, known = self.plane_of[triangles], []
@@ -152,6 +152,7 @@ class NumberedTriangles:
             its = np.isin(of, group[group >= self.first_moving_plane])
             if not its.any():
                 continue
+            # Named by scenery, a surface has the same name whichever bodies stand at it.
             touched = self.joined.scenery.get(int(group[0]))
             members = self.plane_table.triangle[group] if touched is None else np.array([touched])
             pieces = self.piece_of(members).tolist()
