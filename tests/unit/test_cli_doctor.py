@@ -13,7 +13,7 @@ from rich.console import Console
 from caviar_clients.cli import doctor
 from caviar_clients.cli.doctor import Check
 from caviar_protocol.errors import SetupError
-from caviar_services import ray_tracing
+from caviar_services import drjit_setup
 
 
 def shown(checks: list[Check], width: int = 80) -> str:
@@ -80,12 +80,12 @@ def test_a_remedy_is_shown_whole_so_that_it_can_be_copied() -> None:
 
 
 def test_a_missing_llvm_comes_with_its_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none() -> ray_tracing.LlvmLibrary:
+    def none() -> drjit_setup.LlvmLibrary:
         raise SetupError("no libLLVM of version 16 or newer")
 
-    monkeypatch.setattr(ray_tracing, "choose_llvm", none)
+    monkeypatch.setattr(drjit_setup, "choose_llvm", none)
     check = doctor.check_llvm()
-    assert (check.ok, check.remedy) == (False, ray_tracing.INSTALL)
+    assert (check.ok, check.remedy) == (False, drjit_setup.INSTALL)
     assert "no libLLVM" in check.found
 
 
@@ -96,11 +96,11 @@ def test_an_llvm_that_cannot_compile_is_found_by_compiling(
     pytest.importorskip("drjit")
     fake = tmp_path / "libLLVM.so.19.1"
     fake.write_bytes(b"not a library")
-    monkeypatch.setattr(ray_tracing, "choose_llvm", lambda: ray_tracing.LlvmLibrary((19, 1), fake))
+    monkeypatch.setattr(drjit_setup, "choose_llvm", lambda: drjit_setup.LlvmLibrary((19, 1), fake))
     check = doctor.check_llvm()
     assert not check.ok
     assert "cannot compile" in check.found
-    assert check.remedy == ray_tracing.INSTALL
+    assert check.remedy == drjit_setup.INSTALL
 
 
 def test_a_process_that_aborts_is_named_by_its_signal() -> None:
@@ -147,10 +147,10 @@ def test_a_base_install_is_whole_and_one_command_adds_every_extra(monkeypatch: p
     monkeypatch.setattr(doctor, "_version", versions.get)
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
 
-    def none() -> ray_tracing.LlvmLibrary:
+    def none() -> drjit_setup.LlvmLibrary:
         raise SetupError("no libLLVM of version 16 or newer")
 
-    monkeypatch.setattr(ray_tracing, "choose_llvm", none)
+    monkeypatch.setattr(drjit_setup, "choose_llvm", none)
     checks = [doctor.check_base(), *map(doctor.check_extra, doctor.EXTRAS), doctor.check_sumo()]
     checks.append(doctor.check_llvm())
     assert [check.extra for check in checks if not check.ok] == [*doctor.EXTRAS, "world"]

@@ -32,7 +32,7 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
-from caviar_services import ray_tracing
+from caviar_services import drjit_setup
 
 EXTRAS = ("channel", "sensors", "world", "plot", "learning")
 MINIMUM_PYTHON = (3, 11)
@@ -172,21 +172,21 @@ def check_llvm() -> Check:
     """Check the LLVM that the ray tracer would use: that it is there, and compiles."""
     tracer = importlib.util.find_spec("drjit") is not None
     try:
-        library = ray_tracing.choose_llvm()
+        library = drjit_setup.choose_llvm()
     except SetupError as error:
         if not tracer:
-            return Check("LLVM", True, f"none; extras channel and sensors need one: {ray_tracing.INSTALL}")
-        return Check("LLVM", False, str(error), ray_tracing.INSTALL)
+            return Check("LLVM", True, f"none; extras channel and sensors need one: {drjit_setup.INSTALL}")
+        return Check("LLVM", False, str(error), drjit_setup.INSTALL)
     if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
-    ok, text = _run([sys.executable, "-c", _KERNEL], {ray_tracing.ENVIRONMENT: str(library.path)})
+    ok, text = _run([sys.executable, "-c", _KERNEL], {drjit_setup.ENVIRONMENT: str(library.path)})
     found = f"{library}; compiled a kernel" if ok else f"{library} cannot compile: {text}"
-    return _check("LLVM", ok, found, ray_tracing.INSTALL)
+    return _check("LLVM", ok, found, drjit_setup.INSTALL)
 
 
 def check_gpu() -> Check:
     """Count CUDA devices; none is fine."""
-    count = ray_tracing.cuda_devices()
+    count = drjit_setup.cuda_devices()
     return Check("CUDA", True, f"{count} device(s)" if count else "none, the CPU computes")
 
 

@@ -22,7 +22,7 @@ from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, file_system_of, open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_services.ray_tracing import THREADS_VARIABLE, share_of_each
+from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""

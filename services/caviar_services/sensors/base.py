@@ -28,9 +28,7 @@ from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.mesh.scenery import SceneryShape, find_scenery, read_scenery, world_mesh
-from caviar_services.mesh.shapes import Mesh, assign_bodies, contains, joined, placed, unit_box
-from caviar_services.ray_tracing import (
+from caviar_services.drjit_setup import (
     activate_llvm,
     aligned_columns,
     aligned_indices,
@@ -38,6 +36,8 @@ from caviar_services.ray_tracing import (
     cuda_devices,
     limit_threads,
 )
+from caviar_services.mesh.scenery import SceneryShape, find_scenery, read_scenery, world_mesh
+from caviar_services.mesh.shapes import Mesh, assign_bodies, contains, joined, placed, unit_box
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
 
 NO_HIT = -1

@@ -25,7 +25,7 @@ from caviar_protocol.topics import (
     SegmentationImage,
 )
 from caviar_protocol.topics.scene import Device
-from caviar_services.ray_tracing import aligned_columns
+from caviar_services.drjit_setup import aligned_columns
 from caviar_services.sensors.base import (
     NO_HIT,
     Sensors,

@@ -24,7 +24,7 @@ from caviar_protocol.space.coordinates import Pose, Vector, rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, OccupancyGrid, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.ray_tracing import aligned_doubles, aligned_indices, several
+from caviar_services.drjit_setup import aligned_doubles, aligned_indices, several
 from caviar_services.sensors.base import Sensors, SensorSettings, TracedScene, sensor_poses, visible_names
 from caviar_services.service import Frame, Preparation, Prepared, StepResult
 

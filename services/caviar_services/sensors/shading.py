@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.topics import CameraDevice, Intrinsics
+from caviar_services.drjit_setup import aligned_columns
 from caviar_services.mesh.scenery import SceneryShape
-from caviar_services.ray_tracing import aligned_columns
 from caviar_services.sensors.base import TracedScene
 
 SUN = (1.0, 0.93, 0.80)

@@ -23,7 +23,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
+from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
 
 # Pairs that one kernel tests at most, so that its memory is bounded.
 _LANES = 1 << 23

@@ -45,7 +45,7 @@ from caviar_services.channel.sionna.candidates import chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
-from caviar_services.ray_tracing import positions
+from caviar_services.drjit_setup import positions
 
 MOST_CHAINS = 20_000
 """Largest number of sequences that are enumerated."""

@@ -34,7 +34,7 @@ from caviar_services.channel.sionna.ray_launcher import (
     Bounce,
     Launch,
 )
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, several
+from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
 
 # What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a
 # point that was chosen against all odds brings far too much.

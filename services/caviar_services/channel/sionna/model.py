@@ -37,7 +37,7 @@ from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, sce
 from caviar_services.channel.sionna.settings import SionnaSettings, contributing
 from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
-from caviar_services.ray_tracing import activate_llvm, choose_variant, limit_threads
+from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 
 

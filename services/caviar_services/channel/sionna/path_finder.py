@@ -37,7 +37,7 @@ from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.sionna.tracking import Followed, Following, FollowingState
-from caviar_services.ray_tracing import all_threads
+from caviar_services.drjit_setup import all_threads
 from caviar_services.service import RunInfo
 
 COMPILE_GRACE_S = 120.0

@@ -44,7 +44,7 @@ from caviar_services.channel.sionna.path_table import (
 from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions, several
+from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
 
 # Transmitters whose last launch is kept, in case nothing moves.
 _REMEMBERED = 4

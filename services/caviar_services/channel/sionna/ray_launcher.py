@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_services.ray_tracing import aligned_indices
+from caviar_services.drjit_setup import aligned_indices
 
 T = TypeVar("T")
 

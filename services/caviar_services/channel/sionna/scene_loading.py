@@ -30,9 +30,9 @@ from caviar_services.channel.sionna.materials import (
     ObjectMaterials,
     itu_material,
 )
+from caviar_services.drjit_setup import aligned_columns
 from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery
 from caviar_services.mesh.shapes import Mesh, unit_box
-from caviar_services.ray_tracing import aligned_columns
 
 # By how much of its size a mesh in float32 may differ from its file.
 _SAME_VERTEX = 1e-5

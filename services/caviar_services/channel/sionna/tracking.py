@@ -38,7 +38,7 @@ from caviar_services.channel.sionna.ray_launcher import (
 )
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
-from caviar_services.ray_tracing import aligned_columns, aligned_indices, positions
+from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions
 
 # [m] A transmitter that has moved farther since the frame before is looked for anew.
 _JUMP = 20.0

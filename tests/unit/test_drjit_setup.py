@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from caviar_protocol.errors import SetupError
-from caviar_services.ray_tracing import ENVIRONMENT, INSTALL, activate_llvm, choose_llvm, cuda_devices
+from caviar_services.drjit_setup import ENVIRONMENT, INSTALL, activate_llvm, choose_llvm, cuda_devices
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -114,7 +114,7 @@ def test_a_library_that_is_held_already_and_too_old_is_refused(
     monkeypatch.delenv(ENVIRONMENT, raising=False)
     monkeypatch.setitem(sys.modules, "drjit", drjit_holding((15, 0, 7)))
     good = choose_llvm({}, [], [str(tmp_path / "libLLVM-17.so.1")])
-    monkeypatch.setattr("caviar_services.ray_tracing.choose_llvm", lambda: good)
+    monkeypatch.setattr("caviar_services.drjit_setup.choose_llvm", lambda: good)
     with pytest.raises(SetupError, match=r"LLVM 15\.0\.7.*export DRJIT_LIBLLVM_PATH=.*libLLVM-17"):
         activate_llvm()
 

@@ -11,7 +11,7 @@ import pytest
 from caviar_clients.cli.launch import Launcher
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_services.ray_tracing import THREADS_VARIABLE, limited_threads, share_of_each
+from caviar_services.drjit_setup import THREADS_VARIABLE, limited_threads, share_of_each
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 
@@ -51,7 +51,7 @@ def test_a_limit_holds_but_for_what_is_done_once() -> None:
     """In a process of its own: threads are the process's."""
     code = (
         "import drjit as dr\n"
-        "from caviar_services.ray_tracing import all_threads, cores, limit_threads\n"
+        "from caviar_services.drjit_setup import all_threads, cores, limit_threads\n"
         "limit_threads()\n"
         "assert dr.thread_count() == 1, dr.thread_count()\n"
         "with all_threads():\n"
