@@ -134,7 +134,7 @@ def forward(socket: zmq.Socket[bytes], route: bytes, parts: list[Any]) -> None:
 
 
 def received(socket: zmq.Socket[bytes]) -> list[Any]:
-    """What the next client sent, behind its header."""
+    """What the next client sent, after its header."""
     socket.recv()
     socket.recv()
     parts = [socket.recv(0, False)]

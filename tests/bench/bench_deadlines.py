@@ -168,7 +168,7 @@ def main() -> None:
             late = measured()
             p50, p99 = np.percentile(late, (50, 99))
             figures[kind] = {"count": len(late), "p50_ms": p50, "p99_ms": p99, "max_ms": late.max()}
-            print(f"{kind:11} n {len(late)}: p50 {p50:.3f}, p99 {p99:.3f}, worst {late.max():.3f} ms behind")
+            print(f"{kind:11} n {len(late)}: p50 {p50:.3f}, p99 {p99:.3f}, worst {late.max():.3f} ms late")
     if arguments.json:
         arguments.json.write_text(json.dumps({"busy": arguments.busy, **figures}, indent=2) + "\n")
 

@@ -39,7 +39,7 @@ PAYLOAD = (b"\x80", b"x" * 900)
 
 
 def entries_of(frame: int, last: int, frames: int) -> Iterator[Journal]:
-    """The journal's entries of one frame, behind the one with the number ``last``."""
+    """The journal's entries of one frame, after the one with the number ``last``."""
     if frame == 0:
         facts = {"seed": 1, "seed_episode": 0, "frames": frames}
         yield Journal(last + 1, 0, 0, "", "episode", facts=facts, members=tuple(SERVICES))

@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     arguments = parser.parse_args()
     if arguments.frames < WARM_UP + 2 * LAST:
-        parser.error(f"--frames {arguments.frames} leaves nothing behind the first {WARM_UP} frames")
+        parser.error(f"--frames {arguments.frames} leaves nothing after the first {WARM_UP} frames")
     with tempfile.TemporaryDirectory() as folder:
         by_process, busiest, rate, count, digest = measured(
             arguments.scenario, arguments.frames, Path(folder)

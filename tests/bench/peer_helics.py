@@ -1,6 +1,6 @@
 """The exchange of `bench_broker` in HELICS: ``python peer_helics.py SERVICES PAYLOAD FRAMES [lagged]``.
 
-The hub steps half a frame behind the others: it takes what they made in this frame, and they take in the next
+The hub steps half a frame after the others: it takes what they made in this frame, and they take in the next
 what it made of that. With ``lagged`` it steps with them and takes what they made in the frame before, which
 depends on less and lets all of them work at a time.
 

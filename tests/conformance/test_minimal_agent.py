@@ -21,7 +21,7 @@ SCRIPT = [
 SENT = []
 
 class Socket:
-    """A DEALER whose SIGTERM comes behind the first part of DONE; a second caller of `send` is in its way."""
+    """A DEALER whose SIGTERM comes after the first part of DONE; a second caller of `send` is in its way."""
 
     def __init__(self):
         self.linger, self.lock = 0, threading.Lock()

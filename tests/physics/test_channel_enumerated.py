@@ -187,7 +187,7 @@ def chains_of(faces: list[Array], most: int) -> list[tuple[int, ...]]:
 
 
 def lengths_over_edges(start: Array, end: Array, at: Scene) -> list[float]:
-    """Lengths of all paths over one edge [m], by trying every sequence of faces before and behind each."""
+    """Lengths of all paths over one edge [m], by trying every sequence of faces before and after each."""
     faces = rectangles(at)
     edges = edges_of(at, len(PLATES))
     begin, other = (np.array([edge[side] for edge in edges]) for side in (0, 1))
@@ -359,7 +359,7 @@ def test_from_a_transmitter_that_moves_the_same_is_found(
 
 
 def test_there_are_the_paths_over_all_edges_of_bodies(tmp_path: Path) -> None:
-    """Of three boxes, by all sequences of faces before and behind; each once, and one ray decides nothing."""
+    """Of three boxes, by all sequences of faces before and after; each once, and one ray decides nothing."""
     model, _ = street(tmp_path, diffraction=True, samples_per_frame=1)
     plain, _ = street(tmp_path / "plain")
     at = traffic(1)

@@ -19,7 +19,7 @@ SPLIT, FRAMES = 7, 14
 
 
 def standing(frame: int) -> Scene:
-    """Everything waits from two frames before the other channel takes over to two behind."""
+    """Everything waits from two frames before the other channel takes over to two after."""
     return street(min(frame, SPLIT - 2) if frame < SPLIT + 2 else frame - 3)
 
 

@@ -76,7 +76,7 @@ def test_ids_follow_paths_through_a_drive() -> None:
 
 
 def strip(what: tuple[object, ...]) -> tuple[object, ...]:
-    """Without the fillers behind the last interaction."""
+    """Without the fillers past the last interaction."""
     return tuple(part for part in what if part not in (0, ""))
 
 
@@ -101,7 +101,7 @@ def test_both_walls_of_one_object_have_ids_of_their_own(tmp_path: Path) -> None:
 
 
 def test_the_service_counts_births_and_deaths(tmp_path: Path) -> None:
-    """A wall that drives away takes its reflection along; the first frame, and one behind a gap, say
+    """A wall that drives away takes its reflection along; the first frame, and one after a gap, say
     nothing."""
     assets = write_scenery(
         tmp_path, [Plate("ground", [(-90, -90, 0), (90, -90, 0), (90, 90, 0), (-90, 90, 0)])]

@@ -45,7 +45,7 @@ def phase_error(tau: float, length: float, frequency: float) -> float:
 
 
 def phase_of(channel: Channel, path: int, length: float, frequency: float) -> float:
-    """Angle of the amplitude behind the phase of this length [rad]: that of the interaction alone."""
+    """Angle of the amplitude without the phase of this length [rad]: that of the interaction alone."""
     return float(np.angle(channel.a[0, path] * np.exp(2j * np.pi * ((frequency * length / C) % 1.0))))
 
 

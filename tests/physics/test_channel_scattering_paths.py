@@ -53,7 +53,7 @@ def test_all_points_bring_what_those_that_are_drawn_bring() -> None:
 
 
 def test_no_more_are_found_than_are_wanted() -> None:
-    """At each of ten receivers, to half as many again: also ends behind a diffuse point are among them."""
+    """At each of ten receivers, to half as many again: also ends after a diffuse point are among them."""
     where = places(8, CANYON, 10)
     found = asked(model(CANYON, **ROUGH, scattering_samples=20_000, scattering_paths=100), CANYON, where, TEN)
     diffuse = (found.interactions == Interaction.SCATTERING).any(1)

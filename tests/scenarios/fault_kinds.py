@@ -44,7 +44,7 @@ def arm_service(case: Case, name: str) -> None:
 
 
 def arm_broker(case: Case) -> None:
-    """In the process of the broker: go wrong, or be wronged, behind the frame of the case."""
+    """In the process of the broker: go wrong, or be wronged, after the frame of the case."""
     if case.victim != "broker":
         return
     from caviar_broker.server import BrokerServer

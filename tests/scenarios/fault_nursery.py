@@ -42,7 +42,7 @@ IMPORTED = (
 )
 """What processes are forked for: they find it imported."""
 REMOTE_ENDS_S = 5.0
-"""[s] that services started by hand get to end behind the run."""
+"""[s] that services started by hand get to end after the run."""
 _SUBREAPER = 36
 """``PR_SET_CHILD_SUBREAPER`` of prctl(2): orphans below this process become its children."""
 

@@ -124,7 +124,7 @@ class Disturber:
         return found
 
     def kill_some(self, number: int, frame: int, names: list[str], *, overlap: bool) -> Kill | None:
-        """Kill one to all of these, at the frame or behind it; None where no victim lives."""
+        """Kill one to all of these, at the frame or after it; None where no victim lives."""
         self.until(lambda status: finished(status) >= frame, GO_ON_S)
         victims = self.rng.sample(names, self.rng.randint(1, len(names)))
         suspended_s = self.rng.uniform(0.0, SUSPENDED_S) if self.rng.random() < SUSPENDED_SHARE else 0.0

@@ -33,7 +33,7 @@ class Adding(Service[AddingSettings]):
         self._sum, self._frames = f"{episode} {seed}", 0
 
     def step(self, frame: Frame) -> StepResult:
-        assert frame.previous == self._frames - 1, f"{frame.number} behind {frame.previous}: a gap"
+        assert frame.previous == self._frames - 1, f"{frame.number} after {frame.previous}: a gap"
         until = time.monotonic() + self.settings.seconds
         told = [(i.provenance.topic, i.provenance.source, i.provenance.digest) for i in frame.inputs]
         self._sum = hashlib.sha256(f"{self._sum} {told}".encode()).hexdigest()

@@ -17,7 +17,7 @@ from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario
 
 BUDGET_MS, LATE_S = 500, 1.25
-"""Late by so much that the next frame comes while the service is busy, and the one behind it does not."""
+"""Late by so much that the next frame comes while the service is busy, and the one after it does not."""
 VICTIMS = {"channel": ("channel", 3), "eyes": ("lidar", 6), "link": ("link", 9), "agent": ("action", 12)}
 """Service to its topic, and the frame in which it is late."""
 FRAMES = 16

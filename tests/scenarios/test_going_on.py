@@ -102,7 +102,7 @@ def test_a_broker_that_is_killed_is_followed_by_another_and_the_digest_is_the_sa
     assert output.count("another one resumes the run") == 2
 
 
-def test_a_run_whose_machine_went_down_is_gone_on_with(scenario: Path, digest: str, tmp_path: Path) -> None:
+def test_a_run_whose_machine_went_down_is_resumed(scenario: Path, digest: str, tmp_path: Path) -> None:
     with running(scenario, tmp_path) as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 25, 30, "frame 25 is recorded")
         for entry in [f"{process.pid} ", *marked(mark)]:

@@ -116,7 +116,7 @@ def test_a_hundred_steps_are_equal_in_this_process_and_at_a_broker(tmp_path: Pat
     assert "did not come back within 0.5 s (timeouts.rejoin_s): it left: the session was closed" in output
 
 
-def test_an_environment_that_closes_behind_the_last_episode_lets_the_run_end_well(tmp_path: Path) -> None:
+def test_an_environment_that_closes_after_the_last_episode_lets_the_run_end_well(tmp_path: Path) -> None:
     rewards = []
     with waiting(tmp_path, frames=20, episodes=2) as run:
         with closing(run.environment()) as env:
@@ -165,7 +165,7 @@ def test_an_environment_takes_over_a_place_without_a_seed_at_the_next_episode(tm
             assert [env.step(np.int64(0))[1] for _ in range(8)] == wanted
 
 
-def test_a_reset_behind_the_last_episode_says_that_there_is_none(tmp_path: Path) -> None:
+def test_a_reset_after_the_last_episode_says_that_there_is_none(tmp_path: Path) -> None:
     with waiting(tmp_path, frames=4, episodes=1) as run, closing(run.environment()) as env:
         env.reset()
         while not env.step(np.int64(0))[3]:

@@ -76,7 +76,7 @@ def test_other_tokens_are_refused_and_named_and_a_revoked_one_ends_the_part_that
         with Peer(run.url, "agent", token=token, outputs=("action",)) as agent:
             agent.join()
             assert caviar("keys", "revoke", "agent", "--directory", keys).status == 0
-            with pytest.raises(ConnectionClosed, match="its token was revoked"):  # noqa: PT012  # it may come behind any message
+            with pytest.raises(ConnectionClosed, match="its token was revoked"):  # noqa: PT012  # it may come after any message
                 while True:
                     agent.socket.recv(timeout=WITHIN_S)
         assert "not, or no longer, known" in refused(run.url, token)

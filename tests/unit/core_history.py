@@ -113,7 +113,7 @@ class History:
             return False
         what = f"clause 18: {send.service} was granted frame {grant.frame} again"
         assert grant.attempt > before.attempt or grant.epoch > before.epoch, what
-        assert grant.frame > self.saved.get((grant.episode, send.service), -1), f"{what} behind its state"
+        assert grant.frame > self.saved.get((grant.episode, send.service), -1), f"{what} before its state"
         assert before.decisions.items() <= grant.decisions.items(), f"{what} with other decisions"
         for field in ("previous_frame", "inputs", "final", "t_ns"):
             assert getattr(grant, field) == getattr(before, field), f"{what} with another {field}"

@@ -106,7 +106,7 @@ def driver(users: tuple[str, ...], except_users: tuple[str, ...] = ()) -> Driver
     return DriverAgent(AgentSettings(users=users, except_users=except_users), RunInfo(name="pilot"))
 
 
-def test_other_commands_stand_behind_the_beams() -> None:
+def test_other_commands_stand_after_the_beams() -> None:
     """Sorted by actuator: ``beam:`` before ``motion:`` before ``schedule:``."""
     commands = action(driver(("motion:uav", "car.1*"))).commands
     assert [type(command) for command in commands] == [BeamChoice] * 4 + [VelocityCommand]

@@ -43,7 +43,7 @@ def test_a_quick_call_is_made_in_the_thread_that_serves() -> None:
 
 
 def test_the_standby_serves_while_a_call_waits_and_gives_the_loop_back() -> None:
-    """Every turn of the standby falls within the call; the leader goes on behind it, in the same turn."""
+    """Every turn of the standby falls within the call; the leader goes on after it, in the same turn."""
     answered, events = threading.Event(), list[str]()
 
     def wait() -> None:
@@ -114,7 +114,7 @@ def test_a_loop_that_is_over_meanwhile_ends_though_the_call_goes_on_waiting() ->
     leader = next(thread for thread in threading.enumerate() if thread.name == "leader")
     answered.set()
     leader.join(LONG_S)
-    assert not came_back, "what was to come behind the call uses what is closed now"
+    assert not came_back, "what was to come after the call uses what is closed now"
 
 
 @pytest.mark.parametrize("thread", ["leader", "standby"])

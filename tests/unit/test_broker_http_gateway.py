@@ -35,7 +35,7 @@ TOKENS = f'[[token]]\nname = "world"\nrole = "world"\nsha256 = "{AGENT}"\n'
 
 def closed(peer: Peer) -> tuple[int, str]:
     """Code and reason with which a WebSocket is closed, whatever comes before."""
-    with pytest.raises(ConnectionClosed) as ended:  # noqa: PT012  # it may come behind any of them
+    with pytest.raises(ConnectionClosed) as ended:  # noqa: PT012  # it may come after any of them
         while True:
             peer.socket.recv(timeout=PATIENCE_S)
     assert ended.value.rcvd is not None

@@ -115,7 +115,7 @@ def test_services_are_restored_from_their_last_state_and_get_the_grants_since(tm
     assert run.seen(m.Grant, "channel")[0].frame == finished + 1
 
 
-def test_a_journal_that_breaks_off_is_gone_on_with_behind_its_last_whole_entry(tmp_path: Path) -> None:
+def test_a_journal_that_breaks_off_is_continued_after_its_last_whole_entry(tmp_path: Path) -> None:
     runs = Runs(tmp_path, STATEFUL)
     runs.go(60 * MS)
     path = tmp_path / "journal.msgpack"

@@ -46,7 +46,7 @@ def in_background(body: Callable[[threading.Event], None]) -> Iterator[None]:
 
 
 def raw(endpoint: str) -> socket.socket:
-    """A ZMTP connection of our own, behind its handshake."""
+    """A ZMTP connection of our own, after its handshake."""
     connection = socket.create_connection(address(endpoint), timeout=5.0)
     connection.sendall(GREETING + READY)
     received = b""
@@ -184,7 +184,7 @@ def test_a_connection_that_never_shakes_hands_is_ended(tmp_path: Path) -> None:
 
 @contextmanager
 def beside_a_bad_member(tmp_path: Path, limits: PeerLimits | None = None) -> Iterator[tuple[Serving, Client]]:
-    """A run of ``world`` and ``bad``, both behind their first frame."""
+    """A run of ``world`` and ``bad``, both after their first frame."""
     with (
         serving(plan("world", "sensors:bad", frames=1000), tmp_path, peer_limits=limits) as broker,
         playing(broker.endpoint, "world", "sensors:bad") as (world, bad),

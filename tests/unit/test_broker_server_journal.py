@@ -191,7 +191,7 @@ def _stop(broker: server.BrokerServer, fd: int) -> None:
 def test_a_write_that_waits_for_a_sync_that_fails_ends_with_its_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No other sync comes behind it; the entry is in the file, and does not count as handed over."""
+    """No other sync comes after it; the entry is in the file, and does not count as handed over."""
     monkeypatch.setattr(journal_writer, "SYNC_PERIOD_S", 0.02)
     asked, fails = threading.Event(), threading.Event()
 

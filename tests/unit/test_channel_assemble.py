@@ -121,7 +121,7 @@ def test_what_is_not_finite_is_dropped_and_counted() -> None:
     assert np.array_equal(np.sort(channel.tau), np.sort(build(table.take(good)).tau))
 
 
-def test_garbage_behind_the_last_interaction_does_not_count() -> None:
+def test_garbage_past_the_last_interaction_does_not_count() -> None:
     """Solvers leave old values there; a NaN among them drops nothing."""
     table = random_table(np.random.default_rng(4))
     points = np.where(table.types[..., None] == 0, np.nan, table.points)

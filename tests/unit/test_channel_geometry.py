@@ -89,7 +89,7 @@ def test_a_scattering_point_stays_in_its_plane_and_the_rest_is_specular() -> Non
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_diffracted_path_behind_a_reflection_is_the_shortest(seed: int) -> None:
+def test_a_diffracted_path_after_a_reflection_is_the_shortest(seed: int) -> None:
     """Floor, edge, wall: the point on the edge, either end of it first, makes the length stationary."""
     rng = np.random.default_rng(seed)
     start, end = np.add(rng.uniform(-3, 3, (2, 1, 3)), [[[0, 0, 6]], [[4, 1, 7]]])
@@ -155,7 +155,7 @@ def test_a_path_found_twice_is_one() -> None:
     points = np.array([[[1.0, 2, 3], [4, 5, 6]]] * 6)
     points[1] += 1e-9
     points[2, 0, 1] += 1e-3
-    points[3:5, 1] = [7.0, 8, 9]  # behind the last interaction anything may stand
+    points[3:5, 1] = [7.0, 8, 9]  # past the last interaction anything may stand
     types = np.array([[R, R], [R, R], [R, R], [R, 0], [R, 0], [R, S]], np.uint8)
     points[4, 1] = 0.0
     pair = np.array([3, 3, 3, 3, 3, 3])

@@ -103,7 +103,7 @@ def test_an_http_address_that_is_taken_is_refused_before_the_run(tmp_path: Path)
         HttpProcess(tmp_path, address, None, again=True)  # the process of the broker before may still end
 
 
-def test_an_embedded_run_is_not_gone_on_with_and_says_why(
+def test_an_embedded_run_is_not_resumed_and_says_why(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert caviar(monkeypatch, "run", SMOKE, "--frames", "2", "--embedded", "--out", tmp_path) == 0
@@ -112,7 +112,7 @@ def test_an_embedded_run_is_not_gone_on_with_and_says_why(
     assert "an embedded run cannot be resumed" in capsys.readouterr().err
 
 
-def test_a_finished_run_is_not_gone_on_with_and_stays_as_it_is(
+def test_a_finished_run_is_not_resumed_and_stays_as_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert caviar(monkeypatch, "run", SMOKE, "--frames", "3", "--out", tmp_path) == 0

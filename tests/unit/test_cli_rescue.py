@@ -121,7 +121,7 @@ def test_a_closed_recording_of_a_run_without_a_summary_goes_on_too(tmp_path, cap
 
 
 @pytest.mark.parametrize("lost", ["recording-0000.mcap", "recording-0001.mcap"])
-def test_what_is_behind_a_segment_that_is_missing_is_saved(tmp_path, lost):
+def test_what_comes_after_a_segment_that_is_missing_is_saved(tmp_path, lost):
     run = record(tmp_path / "run", frames=9, segment_frames=3)
     (run / lost).unlink()
     status, text = rescue(run)

@@ -53,7 +53,7 @@ def test_a_run_is_in_progress_while_it_is_served_and_after_its_broker_died(tmp_p
     assert run.directory() is None
 
 
-def test_a_run_that_has_written_nothing_yet_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_a_run_that_has_written_nothing_yet_is_not_resumed(tmp_path: Path) -> None:
     (tmp_path / "smoke-1").mkdir()
     (tmp_path / "smoke.current").write_text("smoke-1\n")
     assert RunInProgress(tmp_path, "smoke").directory() is None
@@ -79,7 +79,7 @@ def lines_until(process: subprocess.Popen[str], word: str) -> str:
     raise AssertionError(f"no {word!r} in {found!r}")
 
 
-def test_a_killed_broker_goes_on_with_its_run_and_a_stopped_one_does_not(tmp_path: Path) -> None:
+def test_a_killed_broker_resumes_its_run_and_a_stopped_one_does_not(tmp_path: Path) -> None:
     with started(tmp_path) as first:
         lines_until(first, "listening")
         first.kill()

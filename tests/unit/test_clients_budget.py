@@ -110,7 +110,7 @@ def test_suggested_budgets_are_the_99th_percentile_and_a_margin(smoke: RecordedR
 def test_latencies_of_a_service_that_missed_frames_are_told_to_their_frames(
     smoke: RecordedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frame 3 was answered while 4 and 5 were missed, so its latency comes behind theirs; 8 was skipped."""
+    """Frame 3 was answered while 4 and 5 were missed, so its latency comes after theirs; 8 was skipped."""
     causes = {
         3: "channel missed frame 3 (hold, budget 20.0 ms)",
         4: "channel missed frame 4 (hold, budget 20.0 ms), still busy with frame 3",

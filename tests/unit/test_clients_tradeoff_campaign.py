@@ -85,7 +85,7 @@ def test_labels_are_unique_and_those_of_the_defaults_exist() -> None:
     assert {*REFERENCES, *BASELINES} <= {setting.label for setting in LADDER}
 
 
-def test_what_traces_every_pair_comes_behind_what_is_cheap() -> None:
+def test_what_traces_every_pair_comes_after_what_is_cheap() -> None:
     labels = [setting.label for setting in spacing_settings()]
     assert labels.index("spherical 0.25°") < labels.index("mimo-rt 1°") < labels.index("mimo-rt 0.5°")
     assert labels.index("spherical 0.5° (diffuse, 500 paths)") < labels.index("mimo-rt 1°")

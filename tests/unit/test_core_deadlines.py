@@ -116,7 +116,7 @@ def test_an_answer_at_the_very_deadline_is_in_time() -> None:
     ("policy", "status"),
     [("hold", Status.HELD), ("drop", Status.ABSENT), ("wait", Status.FRESH), ("abort", None)],
 )
-def test_clause_11_an_answer_behind_its_deadline_is_late_though_the_shell_looked_at_no_deadline_since(
+def test_clause_11_an_answer_after_its_deadline_is_late_though_the_shell_looked_at_no_deadline_since(
     policy: str, status: Status | None
 ) -> None:
     slow = sensors(latency=slow_at(3, takes=None), budget=20 * MS, policy=policy)

@@ -16,7 +16,7 @@ def ends(*at: tuple[int, int]) -> dict[str, frozenset[tuple[int, int]]]:
     return {"ends": frozenset(at)}
 
 
-def test_clause_16_reset_comes_before_frame_0_and_episode_end_behind_the_last() -> None:
+def test_clause_16_reset_comes_before_frame_0_and_episode_end_after_the_last() -> None:
     run = Simulation(loop(), episodes=2, frames=2, seed=5).join().run()
     kinds = [
         (type(a.message).__name__, a.message.episode, getattr(a.message, "frame", None))
@@ -82,7 +82,7 @@ def test_clause_16_what_ran_ahead_of_an_early_end_is_cancelled_and_its_answer_no
     assert run.outcome.digest == Simulation(loop(), frames=2).join().run().outcome.digest
 
 
-def test_clause_16_a_fault_behind_an_early_end_does_no_harm() -> None:
+def test_clause_16_a_fault_after_an_early_end_does_no_harm() -> None:
     world_ = {"latency": 20 * MS, "faults": {(0, 3): "no more waypoints"}}
     run = Simulation(loop(agent=ends((0, 1)) | {"latency": 25 * MS}, world=world_), frames=10).join().run()
     assert run.outcome.error == ""
@@ -184,7 +184,7 @@ def test_the_end_of_the_run_does_not_wait_for_whom_it_can_do_without() -> None:
     assert run.notices("late", "lidar")[-1].text == "was never answered"
 
 
-def test_the_end_of_the_run_waits_for_an_answer_behind_an_early_end() -> None:
+def test_the_end_of_the_run_waits_for_an_answer_after_an_early_end() -> None:
     services = loop(agent=ends((0, 0)), world={"latency": lambda e, k: 300 * MS if k else MS})
     run = Simulation(services).join().run()
     assert run.outcome.error == ""

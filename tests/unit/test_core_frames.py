@@ -348,7 +348,7 @@ def test_clause_20_under_wait_the_digest_does_not_depend_on_timing() -> None:
 
 
 @pytest.mark.parametrize("writing", [1, 3, 40])
-def test_clause_20_what_the_recorder_writes_behind_an_early_end_counts(writing: int) -> None:
+def test_clause_20_what_the_recorder_writes_after_an_early_end_counts(writing: int) -> None:
     """The agent fails in frame 3, while the recorder is still busy with a frame before that."""
     services = loop(agent={"faults": {(0, 3): "lost its mind"}}, recorder={"latency": writing * MS})
     run = Simulation(services).join().run()

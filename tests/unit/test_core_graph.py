@@ -33,7 +33,7 @@ def graph(*hellos: Hello, record: tuple[str, ...] = ()) -> Any:
 WORLD, AGENT = hello("world", "world", "", "scene"), hello("agent", "agent", "scene", "action")
 
 
-def test_services_stand_behind_the_producers_of_their_frame() -> None:
+def test_services_stand_after_the_producers_of_their_frame() -> None:
     found = graph(
         hello("a-link", "link", "channel action?", "link"),
         hello("b-agent", "agent", "scene link@1?", "action"),

@@ -60,7 +60,7 @@ def test_steps_let_exactly_so_many_frames_begin_over_the_end_of_an_episode_too()
 
 
 def test_a_pause_is_no_slip_of_real_time() -> None:
-    """Frames of 100 ms, paused for a second within frame 3: all behind it come a second later, lag 0."""
+    """Frames of 100 ms, paused for a second within frame 3: all after it come a second later, lag 0."""
     run = Simulation([world(), recorder()], frames=8, realtime=True, record=("scene",))
     run.after(330 * MS, lambda: run.feed(ev.PauseRequested()))
     run.after(1330 * MS, lambda: run.feed(ev.ResumeRequested()))

@@ -145,7 +145,7 @@ SCENARIOS: list[Callable[[], Simulation]] = [
     lambda: hold_run(latency=at(2, 15 * MS), ends=0),
     lambda: hold_run(latency=at(2, 300 * MS), ends=0),
     lambda: hold_run(latency=at(3, 49 * MS), ends=0),
-    lambda: hold_run(latency=at(3, 49 * MS), ends=0, faults={(0, 3): "behind the end"}),
+    lambda: hold_run(latency=at(3, 49 * MS), ends=0, faults={(0, 3): "after the end"}),
     lambda: Simulation(
         loop(agent={"ends": frozenset({(0, 1)}), "latency": 30 * MS}, world={"latency": 20 * MS})
     ).join(),

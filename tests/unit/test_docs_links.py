@@ -42,7 +42,7 @@ def anchor(heading: str) -> str:
 
 @cache
 def anchors(page: Path) -> frozenset[str]:
-    """Names of the headings of a page; the second heading of one name has ``-1`` behind it."""
+    """Names of the headings of a page; the second heading of one name has ``-1`` after it."""
     found: set[str] = set()
     seen: dict[str, int] = {}
     parsed = list(MarkdownIt("commonmark").enable("table").parse(page.read_text("utf-8")))

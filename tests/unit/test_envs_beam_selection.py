@@ -130,7 +130,7 @@ def test_a_reset_in_the_middle_begins_at_frame_0() -> None:
         assert play(env, 20, seed=9) == whole
 
 
-def test_an_episode_is_truncated_behind_its_last_frame_and_shows_that_frame_last(tmp_path: Path) -> None:
+def test_an_episode_is_truncated_after_its_last_frame_and_shows_that_frame_last(tmp_path: Path) -> None:
     frames = 12
     scenario = changed(tmp_path, GEOMETRIC, ("frames = 500", f"frames = {frames}"))
     with environment(scenario) as env:
@@ -150,7 +150,7 @@ def test_an_episode_is_truncated_behind_its_last_frame_and_shows_that_frame_last
     assert info["abs_y"].tolist() == [reward]
 
 
-def test_a_seed_behind_a_whole_episode_repeats_one_as_well(tmp_path: Path) -> None:
+def test_a_seed_after_a_whole_episode_repeats_one_as_well(tmp_path: Path) -> None:
     with environment(changed(tmp_path, GEOMETRIC, ("frames = 500", "frames = 6"))) as env:
         first = play(env, 6, seed=3)
         assert play(env, 6, seed=8) != first

@@ -138,7 +138,7 @@ def test_flying_away_from_the_goal_costs(tmp_path: Path) -> None:
     assert max(rewards) < 0
 
 
-def test_an_episode_behind_a_goal_begins_at_the_start_again(tmp_path: Path) -> None:
+def test_an_episode_after_a_goal_begins_at_the_start_again(tmp_path: Path) -> None:
     with flight(tmp_path, goal_m=(0.0, 140.0, 18.0), reach_m=1.0) as env:
         first, _ = env.reset(seed=1)
         while not env.step(np.array([0.1, 0, 0], np.float32))[2]:

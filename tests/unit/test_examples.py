@@ -170,7 +170,7 @@ def test_no_docstring_has_code_that_is_not_run() -> None:
 
 
 def literal_blocks(text: str) -> list[str]:
-    """What stands indented behind ``::``."""
+    """What stands indented after ``::``."""
     return [found[1] for found in re.finditer(r"::\n\n((?:    .*\n|\n)+)", text + "\n")]
 
 

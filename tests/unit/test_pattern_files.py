@@ -100,7 +100,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         read_pattern(tmp_path / "b.csv")
 
 
-def test_comments_may_stand_among_the_lines_of_a_cut_and_other_keys_behind(tmp_path: Path) -> None:
+def test_comments_may_stand_among_the_lines_of_a_cut_and_other_keys_after_them(tmp_path: Path) -> None:
     more = [*CUTS[:4], "COMMENT side lobe", *CUTS[4:], "ELECTRICAL_TILT 4"]
     plain, commented = written(tmp_path, "a.msi", *CUTS), written(tmp_path, "b.msi", *more)
     assert np.array_equal(plain.values, commented.values)

@@ -209,7 +209,7 @@ def test_what_is_no_reference_is_refused(reference: Any) -> None:
         BodyReader(memoryview(bytes(8))).read(reference)
 
 
-def test_an_array_behind_the_one_before_is_served_and_one_that_overlaps_is_not() -> None:
+def test_an_array_after_the_one_before_is_served_and_one_that_overlaps_is_not() -> None:
     def take(*offsets: int) -> None:
         reader = BodyReader(memoryview(bytes(32)))
         for offset in offsets:

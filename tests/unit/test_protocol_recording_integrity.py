@@ -209,7 +209,7 @@ def test_a_chunk_that_would_take_all_memory_is_refused(tmp_path, compression):
     for declared in (256 << 20, 1 << 20, 1 << 60):
         file = tmp_path / "recording-0000.mcap"
         data = _with_chunk(record(tmp_path / "clean", frames=0), compression, bomb, declared)
-        file.write_bytes(data if declared < 1 << 30 else data[:-13])  # with a seal behind it, and without
+        file.write_bytes(data if declared < 1 << 30 else data[:-13])  # with a seal after it, and without
         tracemalloc.start()
         try:
             recording, told = read(file)
@@ -244,7 +244,7 @@ def _compressed(compression: str, mebibytes: int) -> bytes:
 
 
 def _with_chunk(run: Path, compression: str, data: bytes, size: int) -> bytes:
-    """The head of an empty recording, and one chunk behind it."""
+    """The head of an empty recording, and one chunk after it."""
     clean = (run / "recording-0000.mcap").read_bytes()
     head = clean[: clean.index(b"\xca\x04\0\0\0\0\0\0\0") + 13]
     name = compression.encode()

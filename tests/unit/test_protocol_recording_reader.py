@@ -154,7 +154,7 @@ def test_cut_anywhere_it_yields_every_whole_frame(tmp_path):
     clean = file.read_bytes()
     chunks = Segment(file).chunks
     sealed = [clean.index(SEAL, chunk.stop) + len(SEAL) + 4 for chunk in chunks]
-    """Where each frame is covered by a seal behind it."""
+    """Where each frame is covered by a seal after it."""
     for size in [*range(chunks[0].offset, len(clean), 173), *(c.stop for c in chunks), *sealed]:
         (tmp_path / "cut").mkdir(exist_ok=True)
         cut = tmp_path / "cut" / file.name

@@ -21,7 +21,7 @@ DOCUMENT = '''\
 top = 1
 a.b."c.d" = "dotted, with a quoted part"
 
-[run]          # behind a header
+[run]          # after a header
 name = "x"
 text = """
 [not.a.table]

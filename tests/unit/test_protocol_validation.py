@@ -327,7 +327,7 @@ def test_a_false_digest_is_refused() -> None:
 # --- who looks --------------------------------------------------------------------------------------
 
 
-def test_a_scene_of_which_a_channel_was_made_is_looked_at_by_the_channel_alone_behind_the_first() -> None:
+def test_a_scene_of_which_a_channel_was_made_is_looked_at_by_the_channel_alone_after_the_first() -> None:
     vouched = GrantInput(topic="channel", source="channel", status=Status.FRESH, frame=3)
     wrong = scene(orientation=2 * scene().orientation)
     header, _ = encode_payload(scene())

@@ -253,7 +253,7 @@ def test_a_write_that_fails_ends_the_run_with_path_and_errno_and_leaves_a_readab
     recording = Recording(tmp_path)
     acknowledged = int(first.split()[0])
     assert acknowledged > 0
-    # The write may have broken off behind the frame, in its index.
+    # The write may have broken off after the frame, in its index.
     assert len(recording) in (acknowledged, acknowledged + 1)
     assert not recording.complete
 

@@ -1,4 +1,4 @@
-"""Saved states: one form, and errors that say why one cannot be gone on from."""
+"""Saved states: one form, and errors that say why one cannot be resumed from."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def test_a_second_episode_begins_anew(broker: Broker) -> None:
 
 
 def test_kept_memory_is_asked_for_between_frames(broker: Broker) -> None:
-    """Behind the answer, so that no frame waits for it; what fails there is a fault of that frame."""
+    """After the answer, so that no frame waits for it; what fails there is a fault of that frame."""
     with service(broker.endpoint, "sensors:Keeps") as process:
         broker.start()
         for frame in range(TRIM_EVERY):

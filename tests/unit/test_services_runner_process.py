@@ -8,7 +8,7 @@ from caviar_services import runner
 
 
 def test_a_service_process_keeps_the_memory_that_products_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else glibc returns it to the system behind every frame, and each page costs a fault in the next."""
+    """Else glibc returns it to the system after every frame, and each page costs a fault in the next."""
     called: list[str] = []
 
     class Ran:

@@ -53,7 +53,7 @@ def test_another_process_goes_on_where_the_one_before_was(broker: Broker) -> Non
 
 
 def test_frames_up_to_the_state_are_not_answered_again(broker: Broker) -> None:
-    """What they would get of the state behind them is not what they got."""
+    """What they would get of the state after them is not what they got."""
     with service(broker.endpoint, STATEFUL) as process:
         broker.start()
         broker.grant(0)

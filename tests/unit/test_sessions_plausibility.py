@@ -20,7 +20,7 @@ from caviar_services.mesh.shapes import Mesh, ply
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 GROUND = 'use = "trajectory"\nbudget_ms = 20\n'
-"""In the scenario, behind which the settings of its world begin."""
+"""In the scenario, after which the settings of its world begin."""
 
 
 def scenario(folder: Path, *changes: tuple[str, str]) -> Path:
