@@ -142,7 +142,7 @@ llvm_package() {
 }
 
 see_to_llvm() {
-  local choose='from caviar_services.ray_tracing import choose_llvm; print(choose_llvm())'
+  local choose='from caviar_services.drjit_setup import choose_llvm; print(choose_llvm())'
   if ! .venv/bin/python -c "$choose" >/dev/null 2>&1; then
     need_packages "the ray tracer compiles with libLLVM ≥ 16, which is missing" "$(llvm_package)"
   fi
