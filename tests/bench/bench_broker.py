@@ -10,7 +10,7 @@ by round, so that a machine's moods fall on all of them; ratios are medians of t
 - *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
 - *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
 - *helics*, *mosaik*: where they are installed (``pip install helics mosaik``);
-- *helics-lagged*: the hub too takes what was made in the frame before, which is less: nobody waits for it.
+- *helics-lagged*: the hub too takes what was made in the frame before, which is less: none waits for it.
 
 With ``--curve`` the bare loop and the broker are encrypted; with ``--transport ipc`` both use a socket
 file, as the services of `caviar run` do. The others know neither, and are left out.
@@ -162,7 +162,7 @@ def peer(name: str, *variant: str) -> Seconds:
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, timeout=600, check=True
         )
         found = re.search(rb"seconds a frame: ([-+.e0-9]+)", done.stdout)
-        assert found, f"{script.name} told no time: {done.stdout[-500:]!r}"
+        assert found, f"{script.name} printed no time: {done.stdout[-500:]!r}"
         return float(found[1])
 
     return seconds

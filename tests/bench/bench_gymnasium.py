@@ -1,7 +1,7 @@
 """Steps a second of `caviar/BeamSelection-v0` in one process, beside those of a trivial environment.
 
 Run as ``python tests/bench/bench_gymnasium.py [--json FILE]``. ``geometric`` is the scenario of that name;
-``siso-rt`` is ``street-canyon``, of which nobody asks for the LIDAR. CartPole, of gymnasium, says how
+``siso-rt`` is ``street-canyon``, of which no service asks for the LIDAR. CartPole, of gymnasium, says how
 fast the machine is at the moment. The three take turns, and the median of all turns counts.
 """
 

@@ -89,7 +89,7 @@ class Onlooker(ChannelModel[Anything]):
 
 @dataclass(frozen=True)
 class World:
-    """Frames of the scenario, and what its channel service is told before them."""
+    """Frames of the scenario, and what its channel service gets before them."""
 
     run: RunInfo
     preparation: Preparation

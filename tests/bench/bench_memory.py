@@ -4,7 +4,7 @@
                                        [--service NAME ...] [--limit KB]
 
 Runs ``caviar run`` and samples the resident memory (``VmRSS`` of /proc/PID/status) of the broker and
-of services. Frames are told by the instants at which the broker finished them (``latency.npz`` of the
+of services. Frames are recognised by the instants at which the broker finished them (``latency.npz`` of the
 run). A line is fitted to the last 80 % of the frames; its slope is printed in KB a frame. Within a frame
 the ray tracer takes and frees a hundred megabytes, and a sample meets any moment of it: so the line goes
 through the medians of 40 equal spans of frames. With ``--limit`` the status is 1 where one of them is

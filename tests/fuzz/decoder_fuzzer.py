@@ -118,7 +118,7 @@ class Mutator:
         return topic, header, body
 
     def restructured(self, header: bytes, tree: dict[Any, Any]) -> bytes:
-        """What a header says, with one or two things in it exchanged, taken out, or told twice."""
+        """What a header says, with one or two things in it exchanged, taken out, or said twice."""
         tree = copy.deepcopy(tree)
         for _ in range(1 + self.draw(2)):
             holder: Any = tree

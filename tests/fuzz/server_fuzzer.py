@@ -2,7 +2,7 @@
 
     python server_fuzzer.py [--inputs 100000] [--seed 6] [--connections 40] [--frames FRAMES]
 
-Two services play a run over real sockets. Between their frames, connections that nobody knows send
+Two services play a run over real sockets. Between their frames, unknown connections send
 mutated messages, in parts that fit or do not, out of turn, come and go, and speak no ZMTP at all; the
 services themselves repeat, guess and garble what has no place where it stands. Prints a JSON report: the
 digests of the run with and without all that, which must be equal, what was handled, how much the broker
@@ -151,7 +151,7 @@ class Player:
             case 0:
                 self.done(other, frame, b"of another incarnation")
             case 1:
-                self.done(self.who, frame + 1 + mutator.draw(1000), b"of a frame that nobody granted")
+                self.done(self.who, frame + 1 + mutator.draw(1000), b"of a frame that was not granted")
             case 2:
                 self.done(self.who, mutator.draw(frame) if frame else 7, b"of a frame that is over")
             case 3:
@@ -161,7 +161,7 @@ class Player:
 
 
 class Strangers:
-    """Connections that nobody knows."""
+    """Unknown connections."""
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, count: int, mutator: Mutator
@@ -181,7 +181,7 @@ class Strangers:
         """One input."""
         draw = self._mutator.draw
         which = draw(len(self._sockets))
-        if draw(1000) == 0:  # gone with whatever was not sent yet, and somebody else in its place
+        if draw(1000) == 0:  # gone with whatever was not sent yet, and another in its place
             self._sockets[which].close()
             self._sockets[which] = self._connected()
         if draw(2000) == 0:

@@ -28,7 +28,7 @@ def fuzzed(inputs: int, timeout_s: float) -> dict[str, int]:
     # Connections that close take what they had not sent along; a service's own noise comes on top.
     assert report["handled"] > 0.98 * inputs
     assert report["grown_kib"] < 64 << 10
-    # A service's noise is told each time, strangers are told of now and then: not for each input.
+    # A service's noise is reported each time, that of strangers now and then: not for each input.
     assert report["notices"] < 0.05 * inputs
     return report
 

@@ -133,7 +133,7 @@ def test_no_path_is_ruled_out(traced: tuple[str, ChannelModel[Any]], monkeypatch
 
 def test_coinciding_faces_are_told_apart() -> None:
     """Under the houses of the scene lies its ground, and their walls touch: with transmission, rays meet
-    two faces in one place. Which of them a path names depends on nobody else."""
+    two faces in one place. Which of them a path names depends on no other pair."""
     name = "simple_street_canyon_with_cars"
     smooth = model(name, max_depth=2, refraction=True, samples=5_000, materials={})
     for group in range(2):

@@ -307,7 +307,7 @@ def test_moving_objects_and_sensors_compile_nothing(service: LidarSensors) -> No
 
 
 def test_the_variant_of_a_neighbour_is_left_as_it_was(service: LidarSensors) -> None:
-    """Somebody else in the same process uses another variant of Mitsuba."""
+    """Another service in the same process uses another variant of Mitsuba."""
     import mitsuba as mi
 
     before = mi.variant()

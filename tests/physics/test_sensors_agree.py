@@ -1,7 +1,7 @@
 """One world for radio and light: LIDAR, depth images and the channel's line of sight agree.
 
 A base station, a camera and a LIDAR share one place above a street canyon with moving traffic.
-Whether the straight way to a receiver is free is told by three programs: the channel's path tracer,
+Whether the straight way to a receiver is free is said by three programs: the channel's path tracer,
 depth images, and LIDAR ranges.
 
 - *Aimed*: one camera and one LIDAR look exactly at each receiver, so that the ray in their middle is

@@ -24,7 +24,7 @@ GARBAGE = (b"\xff\x00\xff\x00", b"\xc1", bytes(range(256)), b"\x81\xa4type\xa6GE
 
 
 def arm_service(case: Case, name: str) -> None:
-    """In the process of a service: go wrong in the frame of the case, unless somebody did before."""
+    """In the process of a service: go wrong in the frame of the case, unless another process did before."""
     if name != case.victim:
         return
     from caviar_services import runner
@@ -109,14 +109,14 @@ def flood(runner: Any) -> None:
 
 
 def stranger(body: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Somebody else on the machine who wrongs the broker, as a process of its own."""
+    """Another user of the machine who wrongs the broker, as a process of its own."""
 
     def fault(server: Any) -> None:
         endpoint = server.endpoint
         if os.fork() == 0:
             try:
                 os.closerange(3, 1 << 12)
-                if os.fork() == 0:  # nobody's child, so that nobody has to wait for it
+                if os.fork() == 0:  # an orphan, so that no process has to wait for it
                     import zmq
 
                     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

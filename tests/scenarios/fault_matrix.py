@@ -177,7 +177,7 @@ def assert_same(result: Result, directory: Path, digest: str) -> None:
 
 
 def assert_blamed(result: Result, directory: Path, victim: str, words: Sequence[str]) -> None:
-    """The run ended early and names whom it is due to; what there was until then is recorded."""
+    """The run ended early and names the service that it is due to; what there was until then is recorded."""
     assert result.culprit == victim, result.error
     for word in (repr(victim), *words):
         assert word in result.error

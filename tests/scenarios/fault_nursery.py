@@ -53,7 +53,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     scenario: str
     directory: str
     victim: str = ""
-    """Name of the service, or ``broker``; "" for a run that nobody disturbs."""
+    """Name of the service, or ``broker``; "" for an undisturbed run."""
     fault: str = ""
     """Name of a function of `fault_kinds`."""
     frame: int = 10
@@ -73,7 +73,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     frames: int = 0
     seconds: float = 0.0
     notices: list[dict[str, Any]] = msgspec.field(default_factory=list)
-    """As the broker told them, each with ``at``, the monotonic time of its arrival [s]."""
+    """As the broker reported them, each with ``at``, the monotonic time of its arrival [s]."""
     fault_at: float = 0.0
     """Monotonic time of the fault [s]; 0: there was none."""
     remotes: list[int] = msgspec.field(default_factory=list)

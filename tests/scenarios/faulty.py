@@ -34,7 +34,7 @@ class _Faulty(Service[FaultSettings]):
 
 
 class Raises(_Faulty):
-    """Raises an exception that nobody foresaw."""
+    """Raises an unforeseen exception."""
 
     def go_wrong(self) -> None:
         raise ZeroDivisionError("the sensor's focal length is 0")

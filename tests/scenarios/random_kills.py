@@ -208,7 +208,7 @@ def grants_of(status: Mapping[str, Any]) -> dict[str, int]:
 
 
 def owed_by(victims: list[str], status: Mapping[str, Any]) -> int:
-    """Grants that nobody will answer once these are gone: without a broker, all of them."""
+    """Grants that no service will answer once these are gone: without a broker, all of them."""
     grants = grants_of(status)
     return sum(number for name, number in grants.items() if name in victims or "broker" in victims)
 
@@ -241,7 +241,7 @@ def disturb(
     """Run a scenario while its processes are killed: exit status, output, and who was killed."""
     names = [*load_scenario(scenario).services, "broker"]
     rng = random.Random(seed)
-    # Those that come late because somebody was waited for are made up for in the last third.
+    # Those that come late because a victim was waited for are made up for in the last third.
     at_frames = sorted(rng.sample(range(5, frames * 2 // 3), kills))
     command = [
         sys.executable,

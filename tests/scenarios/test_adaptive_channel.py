@@ -114,7 +114,7 @@ def test_equal_scenes_are_loaded_once(canyon: tuple[AdaptiveChannel, ScaledClock
 
 
 def test_products_are_those_of_a_channel_of_its_own(canyon: tuple[AdaptiveChannel, ScaledClock]) -> None:
-    """Whoever shares the scene leaves nothing of itself in it."""
+    """Another user of the scene leaves nothing of itself in it."""
     adaptive = canyon[0]
     rung = adaptive.rungs[0].model
     alone = SionnaChannel(rung.settings, rung.run)

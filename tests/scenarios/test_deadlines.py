@@ -63,7 +63,7 @@ def told(folder: Path) -> list[dict[str, Any]]:
 
 
 def notices(finished: Finished, kind: str, service: str) -> list[dict[str, Any]]:
-    """What was told of a service."""
+    """What was reported of a service."""
     lines = map(json.loads, (finished.directory / "events.jsonl").read_text().splitlines())
     return [line for line in lines if line.get("kind") == kind and line["service"] == service]
 
@@ -122,7 +122,7 @@ def test_a_frame_goes_on_without_who_is_late_and_every_consumer_is_told(tmp_path
     assert 0.0 <= decided["p99_ms"] <= decided["worst_ms"]
     with np.load(finished.directory / "latency.npz") as saved:
         assert len(saved["decision_lateness_ns"]) == decided["decisions"]
-        assert (saved["decision_lateness_ns"] >= 0).all(), "nobody is given up before the deadline"
+        assert (saved["decision_lateness_ns"] >= 0).all(), "no service is given up before the deadline"
 
 
 def test_under_wait_the_frame_waits_and_misses_are_counted(tmp_path: Path) -> None:

@@ -270,7 +270,7 @@ def test_an_unknown_implementation_is_named_with_file_line_and_suggestion(tmp_pa
 
 
 def test_an_agent_that_served_nobody_is_warned_of_when_the_run_is_over(tmp_path: Path) -> None:
-    """Before that, somebody might still have come."""
+    """Before that, a user might still have come."""
     users = ('use = "los-beam"', 'use = "los-beam"\nusers = ["car-9/rx"]')
     scenario = scenario_file(tmp_path, [users, ('on = "car"', 'on = "car*"')])
     finished = run(scenario, tmp_path / "out", "--embedded", "--frames", "3")

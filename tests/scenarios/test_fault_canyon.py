@@ -32,7 +32,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of the run that nobody disturbs."""
+    """Of the undisturbed run."""
     finished = run(scenario, tmp_path_factory.mktemp("undisturbed"), timeout=120)
     assert finished.status == 0, finished.output
     return str(json.loads((finished.directory / "summary.json").read_text())["digest"])

@@ -1,4 +1,4 @@
-"""Whoever is wronged, and however: no hang, the culprit is named, nothing is lost (clauses 9 to 18)."""
+"""Any process wronged in any way: no hang, the culprit is named, nothing is lost (clauses 9 to 18)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def nursery() -> Iterator[Nursery]:
 
 @pytest.fixture(scope="module")
 def digest(nursery: Nursery, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of the run that nobody disturbs."""
+    """Of the undisturbed run."""
     folder = tmp_path_factory.mktemp("undisturbed")
     result = nursery.run(Case(scenario=str(scenario(folder)), directory=str(folder / "run"), limit_s=HANG_S))
     assert result.error == ""
@@ -63,7 +63,7 @@ def digest(nursery: Nursery, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def wronged(nursery: Nursery, path: Path, victim: str, fault: str, **more: object) -> tuple[Result, Path]:
-    """A run in which somebody is wronged, once."""
+    """A run in which one process is wronged, once."""
     directory = path.parent / "run"
     case = Case(
         scenario=str(path),

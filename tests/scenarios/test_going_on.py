@@ -1,4 +1,4 @@
-"""Clause 18 with real processes: whoever is killed, the run ends with the digest that it would have had."""
+"""Clause 18 with real processes: any of them is killed, and the digest is what it would have been."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Of the run that nobody disturbs."""
+    """Of the undisturbed run."""
     finished = run(scenario, tmp_path_factory.mktemp("undisturbed"))
     assert finished.status == 0, finished.output
     return str(json.loads((finished.directory / "summary.json").read_text())["digest"])

@@ -78,7 +78,7 @@ def scenario(tmp_path: Path) -> Path:
 
 
 def test_every_kind_of_state_outlives_its_process(scenario: Path, tmp_path: Path) -> None:
-    """Each of the four is killed once; the digest is that of a run that nobody disturbs."""
+    """Each of the four is killed once; the digest is that of an undisturbed run."""
     whole = run(scenario, tmp_path / "whole", timeout=120)
     assert whole.status == 0, whole.output
     out = tmp_path / "broken"

@@ -222,7 +222,7 @@ def test_an_agent_that_the_run_does_not_wait_for_is_refused(tmp_path: Path) -> N
 
 
 def test_a_broker_that_is_killed_ends_the_next_step_and_not_this_process(tmp_path: Path) -> None:
-    with waiting(tmp_path, frames=10_000, rejoin_s=0.0) as run:  # nobody is started again
+    with waiting(tmp_path, frames=10_000, rejoin_s=0.0) as run:  # no service is started again
         env = run.environment()
         with closing(env):
             env.reset(seed=1)

@@ -80,7 +80,7 @@ def _answers(python: Path, version: str) -> bool:
 
 
 def constraints(label: str) -> list[str]:
-    """What pip is told beyond the requirements: for the oldest environment, their floors."""
+    """What pip is given beyond the requirements: for the oldest environment, their floors."""
     if label != OLDEST:
         return []
     return [f"{need.name}=={floor.version}" for need in REQUIREMENTS for floor in need.specifier]

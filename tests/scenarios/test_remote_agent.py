@@ -125,7 +125,7 @@ LONG = 500
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> object:
-    """Digest of such a run that nobody disturbs."""
+    """Digest of such a run, undisturbed."""
     with (
         remote(tmp_path_factory.mktemp("undisturbed"), LONG) as waiting,
         waiting.agent(python_agent) as process,

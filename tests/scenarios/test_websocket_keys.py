@@ -27,7 +27,7 @@ def locked_run(folder: Path, keys: Path, frames: int = FRAMES) -> Iterator[WebRu
 
 @pytest.fixture
 def keys(tmp_path: Path) -> Path:
-    """A keys directory with the broker's pair, and nobody else's."""
+    """A keys directory with the broker's pair, and no other's."""
     directory = tmp_path / "keys"
     assert caviar("keys", "new", "broker", "--directory", directory).status == 0
     return directory

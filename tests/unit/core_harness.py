@@ -3,7 +3,7 @@
 `Simulation` is a shell like any other: it performs actions, feeds events and the time, and calls
 `expire` when a deadline is up. Services are `Sim` objects that say how long they take, when they fail
 and when they are silent. After every step `FrameClock.validate` is called, and `History` holds what
-the clock told the services against what it decided before.
+the clock sent the services against what it decided before.
 """
 
 from __future__ import annotations

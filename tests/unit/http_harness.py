@@ -108,7 +108,7 @@ def port_of(directory: Path, process: subprocess.Popen[bytes]) -> int:
 
 
 def opened(url: str, **options: Any) -> ClientConnection:
-    """A WebSocket that is open; whoever opened it closes it."""
+    """A WebSocket that is open; the test that opened it closes it."""
     return connect(url, **options).__enter__()
 
 

@@ -29,7 +29,7 @@ def pair() -> k.Pair:
 
 @dataclass
 class Ring:
-    """A keys directory, and the credentials of whoever has a key there."""
+    """A keys directory, and the credentials of the peers that have a key there."""
 
     directory: Path
     pairs: dict[str, k.Pair] = field(default_factory=dict)

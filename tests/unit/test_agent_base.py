@@ -1,4 +1,4 @@
-"""Whom an agent serves, what it declares, and what its action looks like."""
+"""Which users an agent serves, what it declares, and what its action looks like."""
 
 from __future__ import annotations
 
@@ -155,5 +155,5 @@ def test_a_frame_without_users_is_counted(users: tuple[str, ...], counts: dict[s
 
 
 def test_an_action_without_users_is_an_action() -> None:
-    """The link then knows that nobody is served by choice, not by absence."""
+    """The link then knows that no user is served by choice, not by absence."""
     assert encode_payload(action(agent(())))[1] == b""

@@ -56,7 +56,7 @@ def notice(number: int) -> dict[str, Any]:
 
 
 def test_a_reader_that_comes_late_gets_every_notice_in_order(tmp_path: Path, pipe: tuple[int, int]) -> None:
-    """50,000 notices of 250 B into a pipe of 64 KiB that nobody reads, and none of them is lost."""
+    """50,000 notices of 250 B into a pipe of 64 KiB that is not read, and none of them is lost."""
     outbox = Outbox(pipe[1], tmp_path / "log", json.dumps)
     tracemalloc.start()
     started = time.monotonic()

@@ -94,7 +94,7 @@ def test_why_tells_phase_and_progress_of_the_last_heartbeat(tmp_path: Path) -> N
     with desk_of(tmp_path) as broker, playing(broker.endpoint, *PAIR) as (world, _):
         world.attach().send(m_heartbeat())
         world.expect(m.Grant)
-        eventually(lambda: "phase 'rays', progress 7" in why(tmp_path), "the heartbeat is told")
+        eventually(lambda: "phase 'rays', progress 7" in why(tmp_path), "the heartbeat is reported")
 
 
 def m_heartbeat() -> bytes:

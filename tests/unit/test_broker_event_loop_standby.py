@@ -15,7 +15,7 @@ LONG_S = 30.0
 
 
 class Loop:
-    """A loop that counts its turns by thread, and does in each what it is told to."""
+    """A loop that counts its turns by thread, and does in each what the test says."""
 
     def __init__(self, turn: Callable[[Loop], None]) -> None:
         self.turns: list[str] = []

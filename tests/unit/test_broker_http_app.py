@@ -1,4 +1,4 @@
-"""HTTP beside a running broker: what it tells, what it orders, and whom it lets in."""
+"""HTTP beside a running broker: what it tells, what it orders, and which peers it lets in."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_a_token_with_an_unknown_role_is_refused_by_naming_the_known_ones(tmp_pa
         Tokens(tmp_path)
 
 
-# --- with whom it lives -----------------------------------------------------------------------------------
+# --- which process it lives with --------------------------------------------------------------------------
 
 
 def test_it_says_where_no_broker_runs(tmp_path: Path) -> None:

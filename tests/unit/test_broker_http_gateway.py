@@ -193,7 +193,7 @@ def test_one_who_begins_with_something_else_is_cut_off_and_told_why(
         found, reason = closed(stranger)
         assert found == code
         assert told in reason
-        eventually(lambda: "has not said who it is was cut off" in http.broker.witness.texts(), "it is told")
+        eventually(lambda: "has not said who it is was cut off" in http.broker.witness.texts(), "it is said")
         assert http.get("/status").json["state"] == "joining"
 
 

@@ -1,4 +1,4 @@
-"""Slow, silent and oversized connections at the HTTP process keep nobody out, and leave no memory behind."""
+"""Slow, silent and oversized connections at the HTTP process keep no peer out, and leave no memory behind."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def unharmed(background: Background) -> None:
 
 
 def told(broker: Serving, words: str) -> None:
-    eventually(lambda: words in broker.witness.texts(), f"the user is told {words!r}", 5.0)
+    eventually(lambda: words in broker.witness.texts(), f"the user reads {words!r}", 5.0)
 
 
 # --- strangers -------------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def test_a_key_is_refused_for_another_name_role_or_topic(
         assert isinstance(refusal, m.Refuse)
         assert refusal.code == "unauthorized"
         assert words in refusal.message
-        eventually(lambda: words in broker.witness.texts(), "the user is told")
+        eventually(lambda: words in broker.witness.texts(), "the user reads it")
 
 
 def test_a_heartbeat_connection_needs_the_key_of_its_service(tmp_path: Path, keys: Ring) -> None:
@@ -111,7 +111,7 @@ def test_a_service_without_the_right_key_ends_within_seconds_with_the_remedy(
         connection.close()
         assert time.monotonic() - started < 5.0
         assert broker.server.clock.peer("world").attempt == 0  # type: ignore[union-attr]
-        eventually(lambda: "a connection from " in broker.witness.texts(), "the user is told")
+        eventually(lambda: "a connection from " in broker.witness.texts(), "the user reads it")
 
 
 def test_a_revoked_key_is_cut_off_and_named_within_a_second(tmp_path: Path, keys: Ring) -> None:
@@ -149,7 +149,7 @@ def test_a_damaged_authorized_file_is_told_and_changes_nothing(tmp_path: Path, k
         damaged = tmp_path / "damaged"
         damaged.write_text("[[key")
         damaged.replace(keys.directory / k.AUTHORIZED)  # at once: a file cut to nothing is one without keys
-        eventually(lambda: "goes on holding" in broker.witness.texts(), "the user is told", 1.0)
+        eventually(lambda: "goes on holding" in broker.witness.texts(), "the user reads it", 1.0)
         with Client(broker.endpoint, "world", credentials=own) as client:
             client.join()
 

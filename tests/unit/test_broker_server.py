@@ -149,7 +149,7 @@ def test_a_name_that_the_run_does_not_have_is_refused_with_the_nearest(tmp_path:
 
 
 def test_a_socket_with_a_routing_id_of_its_own_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    """Also one that looks like ROUTER's, as nobody sets it by mistake, and on the heartbeat connection."""
+    """Also one that looks like ROUTER's, as it is not set by mistake, and on the heartbeat connection."""
     with serving(plan(*PAIR), tmp_path) as broker, playing(broker.endpoint, *PAIR) as (world, sensors):
         for own in (b"world", b"\0own", b"\0chosen"):
             with Client(broker.endpoint, "world", routing_id=own) as again:

@@ -97,7 +97,7 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
     ]
     kept = {(e.service, e.frame): e.products for e in entries if e.products}
     assert kept["sensors", 3] == (("lidar", b"\x80", (b"sensors 3 " * 25)[:100]),)
-    assert not any(service == "world" for service, _ in kept)  # nobody takes the scene later
+    assert not any(service == "world" for service, _ in kept)  # no service takes the scene later
 
 
 def test_a_journal_that_cannot_be_written_ends_the_run_in_order(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_journal_that_cannot_be_written_ends_the_run_in_order(tmp_path: Path) 
 
 
 class Frozen(JournalFile):
-    """A journal on a disk that takes nothing of a frame until it is told to."""
+    """A journal on a disk that takes nothing of a frame until the test says so."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, 1)
@@ -165,7 +165,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
         sensors.answer()
         assert made[0].reached.wait(30)
         told = "the disk does not answer: write of"
-        eventually(lambda: told in broker.witness.texts(), "the disk is told of")
+        eventually(lambda: told in broker.witness.texts(), "the disk is reported")
         assert "mounted at" in broker.witness.texts()
         assert broker.server.clock.status(time.monotonic_ns()).frame == 1  # it can be asked
         if thaws:

@@ -69,7 +69,7 @@ def test_lateness_of_decisions_is_summed_up() -> None:
 
 
 def test_slips_are_counted_within_their_episode() -> None:
-    """The lag that is told with a frame is the sum of its episode."""
+    """The lag that is reported with a frame is the sum of its episode."""
     statistics = Statistics({})
     for episode, lag in [(0, 0), (0, 3), (0, 3), (0, 10), (1, 12), (1, 12), (2, 0)]:
         statistics.frame(1, episode, lag * MS)

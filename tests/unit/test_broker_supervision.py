@@ -131,7 +131,7 @@ def test_a_service_that_makes_no_progress_is_blamed_with_all_that_is_known(tmp_p
 
 
 def test_a_remote_service_that_is_back_before_its_death_is_known_takes_its_place(tmp_path: Path) -> None:
-    """Whoever starts it again at once is not told that the name is taken."""
+    """A process that starts it again at once is not refused because the name is taken."""
     run = plan("world", "sensors", limits={"heartbeat": 60_000 * MS, "liveness": 120_000 * MS})
     services = [replace(s, remote=True, rejoin=5000 * MS) for s in run.services]
     with serving(replace(run, services=tuple(services)), tmp_path) as broker:
@@ -144,7 +144,7 @@ def test_a_remote_service_that_is_back_before_its_death_is_known_takes_its_place
             with Client(broker.endpoint, "world") as third:
                 third.send(third.hello)
                 assert third.expect(m.Refuse).code == "name-taken"
-            eventually(lambda: any(n.kind == "refused" for n in broker.witness.notices), "it is told")
+            eventually(lambda: any(n.kind == "refused" for n in broker.witness.notices), "it is reported")
         assert [n.kind for n in broker.witness.notices if n.service == "world"][:3] == [
             "lost",
             "away",
@@ -201,7 +201,7 @@ def test_a_process_that_rejoins_is_watched_in_place_of_the_one_before(tmp_path: 
 
 
 def test_a_remote_service_whose_connection_ends_is_missed_at_once(tmp_path: Path) -> None:
-    """Its death need not wait for a heartbeat that is missed, nor for a message that finds nobody."""
+    """Its death need not wait for a heartbeat that is missed, nor for a message that finds no peer."""
     with serving(plan("world", "sensors"), tmp_path) as broker, Client(broker.endpoint, "sensors") as sensors:
         with Client(broker.endpoint, "world") as world:
             for client in (world, sensors):

@@ -1,4 +1,4 @@
-"""The cost model learns from durations that it is told; nothing here is timed."""
+"""The cost model learns from durations that it is given; nothing here is timed."""
 
 from __future__ import annotations
 

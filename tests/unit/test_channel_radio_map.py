@@ -62,7 +62,7 @@ def test_cells_without_ground_at_a_corner_are_left_out() -> None:
 
 
 def coverage(**more: object) -> Coverage:
-    """Two transmitters, three cells: the first serves, the second serves, nobody does."""
+    """Two transmitters, three cells: the first serves, the second serves, neither does."""
     gain = np.array([[[1e-8, 1e-10, 0.0]], [[1e-9, 4e-10, 0.0]]])
     given = {"gain": gain, "interference_gain": gain / 4, "power_w": np.array([1.0, 0.5]), "noise_w": 1e-11}
     return Coverage(**{**given, **more})  # type: ignore[arg-type]

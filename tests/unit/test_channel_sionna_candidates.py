@@ -11,7 +11,7 @@ from caviar_services.channel.sionna.candidates import first_of_each
 
 @given(st.lists(st.integers(0, 5), max_size=40), st.integers(1, 6))
 def test_each_receiver_keeps_its_first_candidates(receivers: list[int], count: int) -> None:
-    """In their order, whoever's stand between them."""
+    """In their order, whichever others stand between them."""
     kept = first_of_each(np.array(receivers, np.int64), count)
     for receiver in range(6):
         mine = [bool(k) for r, k in zip(receivers, kept, strict=True) if r == receiver]

@@ -26,7 +26,7 @@ def caviar(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
 
 @pytest.fixture
 def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A keys directory with a key that nobody has authorized yet."""
+    """A keys directory with a key that is not authorized yet."""
     monkeypatch.chdir(tmp_path)
     assert caviar(monkeypatch, "keys", "new", "agent") == 0
     return Path("keys")

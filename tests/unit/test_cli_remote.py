@@ -1,4 +1,4 @@
-"""Remote services: what is checked, what is planned, and what the user is told to type."""
+"""Remote services: what is checked, what is planned, and what the user has to type."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a summary says about agents that served nobody."""
+"""What a summary says about agents that served no user."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def test_an_implementation_that_replaces_another_has_its_own_settings(tmp_path: 
 
 
 def test_a_world_that_follows_actions_runs_again_unless_told_not_to(tmp_path: Path) -> None:
-    """The user is told that a recorded one does not follow the new agent."""
+    """The user reads that a recorded one does not follow the new agent."""
     scenario = load_scenario(SCENARIOS / "uav-path.toml")
     world = scenario.services["world"]
     settings = {key: value for key, value in world.settings.items() if key != "scenery"}
@@ -164,7 +164,7 @@ def test_what_cannot_be_done_is_told_with_a_remedy(
 
 
 def test_a_topic_that_was_not_recorded_is_told_with_who_made_it(tmp_path: Path) -> None:
-    """Nobody asked for the channel, so it was not run; the oracle needs it."""
+    """No service asked for the channel, so it was not run; the oracle needs it."""
     scenario = shipped(record=("scene", "action"))
     services = {name: spec for name, spec in scenario.services.items() if name != "link"}
     run = recorded(msgspec.structs.replace(scenario, services=services), tmp_path / "run")

@@ -283,7 +283,7 @@ def test_clause_18_a_late_product_is_journaled_before_anybody_may_hold_it() -> N
 
 
 def test_the_deadline_of_a_frame_runs_though_the_only_source_is_late() -> None:
-    # Nobody else could release the frame under realtime pace.
+    # Nothing else could release the frame under realtime pace.
     alone = Sim(
         "alone", "agent", outputs=("action",), policy="hold", budget=20 * MS, latency=slow_at(1, takes=None)
     )

@@ -1,4 +1,4 @@
-"""What each service is told about the scenario: its part of it, and who owns which users."""
+"""What each service learns about the scenario: its part of it, and who owns which users."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def plans() -> st.SearchStrategy[dict[str, Any]]:
 
 
 class Puppets(Simulation):
-    """A simulation in which nothing happens by itself: services answer when they are told to."""
+    """A simulation in which nothing happens by itself: services answer when the test says so."""
 
     def __init__(self, services: list[Sim], **plan: Any) -> None:
         super().__init__(services, **plan)
@@ -172,7 +172,7 @@ class Puppets(Simulation):
 
     def pass_deadline(self) -> None:
         due = self.clock.next_deadline()
-        assert due is not None, f"nobody is waited for in {self.clock.state}"
+        assert due is not None, f"no service is waited for in {self.clock.state}"
         self.fire(due)
 
 

@@ -118,7 +118,7 @@ def leaving_while_restored() -> Simulation:
 
 
 def an_episode_that_ends_while_somebody_is_restored() -> Simulation:
-    """Nobody needs the world any more, which dies with nothing outstanding."""
+    """No service needs the world any more, which dies with nothing outstanding."""
     services = loop(world={"stateful": True, "saving": 400 * MS}, link={"latency": 50 * MS})
     plan = {"frames": 4, "episodes": 2, "checkpoint_frames": 3, "limits": Limits(rejoin=5 * SECOND)}
     simulation = Simulation(services, **plan).join()

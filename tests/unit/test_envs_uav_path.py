@@ -1,4 +1,4 @@
-"""``caviar/UavPath-v0`` over open ground: what a flight is, and what is told where it cannot be."""
+"""``caviar/UavPath-v0`` over open ground: what a flight is, and what is said where it cannot be."""
 
 from __future__ import annotations
 

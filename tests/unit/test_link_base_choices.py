@@ -1,4 +1,4 @@
-"""Which agent chose what for whom; every contradiction names its culprit."""
+"""Which agent chose what for which user; every contradiction names its culprit."""
 
 from __future__ import annotations
 

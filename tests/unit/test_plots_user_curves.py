@@ -1,4 +1,4 @@
-"""Pictures of |y|: whom they show, and what of a run goes into the curves."""
+"""Pictures of |y|: which users they show, and what of a run goes into the curves."""
 
 from __future__ import annotations
 

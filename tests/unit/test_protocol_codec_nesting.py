@@ -1,4 +1,4 @@
-"""How deep a header nests is told without recursion, and rightly."""
+"""How deep a header nests is found without recursion, and rightly."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def test_importing_it_imports_no_ray_tracer() -> None:
 
 
 def test_without_demand_it_loads_and_produces_nothing(tmp_path: Path) -> None:
-    """The description does not exist, and nobody notices."""
+    """The description does not exist, and is not missed."""
     service = CameraSensors(CameraSettings(), RunInfo(name="camera"))
     prepared = service.prepare(Preparation(demand={}, assets={"scenery/a.xml": tmp_path / "a.xml"}))
     assert "not run" in prepared.notes[0]

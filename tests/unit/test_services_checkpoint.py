@@ -39,7 +39,7 @@ def test_what_was_saved_comes_back_bit_by_bit() -> None:
     array = back.numbers.array(np.float64)
     assert array.tobytes() == NUMBERS.tobytes()
     assert array.shape == (2, 3)
-    array[0, 0] = 9.0  # it is nobody else's
+    array[0, 0] = 9.0  # it is no other's
 
 
 def test_equal_states_give_equal_bytes() -> None:

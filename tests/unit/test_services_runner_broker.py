@@ -114,7 +114,7 @@ def test_a_service_that_is_stuck_ends_too_when_its_broker_dies(broker: Broker) -
 
 
 def test_a_service_that_held_the_interpreter_does_not_take_its_broker_for_dead(broker: Broker) -> None:
-    """Answers waited in the socket while nobody could look (clause 15, the other way round)."""
+    """Answers waited in the socket while nothing could look (clause 15, the other way round)."""
     with service(broker.endpoint, "sensors:HoldsTheInterpreter") as process:
         broker.start(heartbeat_ns=50 * MS, liveness_ns=400 * MS)
         for frame in range(3):

@@ -21,7 +21,7 @@ from caviar_services.testing import CONFORMANCE, ChannelConformance, ServiceConf
 
 
 class Unseeded(FreeSpaceChannel):
-    """Draws from a generator that nobody seeds."""
+    """Draws from a generator that is not seeded."""
 
     def step(self, frame: Frame) -> StepResult:
         result = super().step(frame)

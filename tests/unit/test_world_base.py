@@ -119,7 +119,7 @@ def test_a_device_without_an_object_is_counted() -> None:
 
 
 def test_first_come_keep_their_devices_and_the_next_takes_over() -> None:
-    """Two receivers for four cars: whoever came first has one; who leaves frees it for the next."""
+    """Two receivers for four cars: the first two to come have one; who leaves frees it for the next."""
     a, b, c, d = (state(f"car.{name}") for name in "abcd")
     world = ScriptedWorld(
         [[b, c], [b, c, a], [b, c, a, d], [c, a, d], [c, a, d], [a, d], [d]], [antenna(count=2)]

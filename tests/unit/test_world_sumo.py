@@ -264,7 +264,7 @@ def test_vehicles_come_and_go_and_keep_what_they_are(make: Make) -> None:
     assert present[-1] - present[0]
     assert present[0] - present[-1]
     assert {kind for kind, _ in seen.values()} == {"car", "truck", "bus"}
-    for name in seen:  # nobody flickers: each is there from its first to its last frame
+    for name in seen:  # no object flickers: each is there from its first to its last frame
         frames = [k for k, names in enumerate(present) if name in names]
         assert frames == list(range(frames[0], frames[-1] + 1))
 
