@@ -16,7 +16,7 @@ endif
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs doctor clean another-python
+.PHONY: help setup demo check test test-all lint docs doctor clean another-python
 
 help: ## List these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,6 +38,9 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+
+check: lint ## In a minute and a half: lint, and the unit tests that are quick
+	@$(BIN)/pytest --quiet --numprocesses=$(WORKERS) --dist=loadfile -m "not slow" tests/unit tests/vectors
 
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
 	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder --durations=10 $(TESTS)

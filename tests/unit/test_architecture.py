@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+pytestmark = pytest.mark.slow
+
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",

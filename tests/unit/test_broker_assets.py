@@ -16,6 +16,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.fields import MAX_ASSET_CHUNK
 
+pytestmark = pytest.mark.slow
+
 Files = dict[str, bytes]
 
 

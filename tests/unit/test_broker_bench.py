@@ -15,6 +15,8 @@ from caviar_clients.cli.main import app
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("topology", ["hub", "all"])
 @pytest.mark.parametrize("services", [2, 5])

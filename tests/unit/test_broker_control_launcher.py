@@ -27,6 +27,8 @@ from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
 from caviar_protocol.assets import AssetStore
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 

@@ -35,6 +35,8 @@ from caviar_clients.cli.remote import newest_run, why_command
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 
+pytestmark = pytest.mark.slow
+
 SOCKET, NOTE = "control.sock", "control.json"
 
 

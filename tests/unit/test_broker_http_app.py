@@ -19,6 +19,8 @@ from caviar_broker.http.auth import Tokens, http_address
 from caviar_protocol import messages as m
 from caviar_protocol.errors import SetupError
 
+pytestmark = pytest.mark.slow
+
 
 def token_file(**tokens: tuple[str, str]) -> str:
     """tokens.toml, from text to name and role."""

@@ -27,6 +27,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message, join_parts, split_frame
 from caviar_protocol.codec.messages import MAX_FRAME
 
+pytestmark = pytest.mark.slow
+
 LIMITS = {"heartbeat": 50 * MS, "liveness": 300 * MS}
 SECRET = "a-token-of-the-world"  # noqa: S105
 AGENT = hashlib.sha256(SECRET.encode()).hexdigest()

@@ -29,6 +29,8 @@ from caviar_broker.http.process import gateway_in_front
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message, join_parts
 
+pytestmark = pytest.mark.slow
+
 MIB = 1 << 20
 UPGRADE = (
     "GET /ws HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"

@@ -19,6 +19,8 @@ from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 from caviar_protocol.digest import RunDigest
 
+pytestmark = pytest.mark.slow
+
 STATEFUL: dict[str, dict[str, Any]] = {
     "world": {"stateful": True},
     "channel": {"latency": 3 * MS},

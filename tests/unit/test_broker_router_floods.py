@@ -11,6 +11,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 FLOODS = r"""
 import socket, struct, sys, time
 import zmq

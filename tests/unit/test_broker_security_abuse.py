@@ -18,6 +18,8 @@ from caviar_broker.security.limits import PeerLimits
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
 
+pytestmark = pytest.mark.slow
+
 BESIDE_S = 1.5
 """[s] for which the run goes on beside the peer that means ill."""
 STRETCHES = 5

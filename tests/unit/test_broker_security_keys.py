@@ -19,6 +19,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.errors import CaviarError, RunError, SetupError
 from caviar_services.connection import Connection, Termination
 
+pytestmark = pytest.mark.slow
+
 REVOKED_WITHIN_S = 1.0
 
 

@@ -7,11 +7,14 @@ import re
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from caviar_broker.router import HANDSHAKE_MS
 from caviar_broker.security.access import BAR_NS
 from caviar_broker.security.limits import PeerLimits
 from caviar_protocol.scenario import Limits
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "topics" / "threat-model.md").read_text()

@@ -28,6 +28,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message, encode_message
 from caviar_protocol.digest import RunDigest, payload_digest
 
+pytestmark = pytest.mark.slow
+
 # --- the ordinary course -------------------------------------------------------------------------------
 
 

@@ -18,6 +18,8 @@ from broker_harness import MS, Client, Serving, eventually, plan, serving
 from caviar_broker.supervision import describe_exit, watch
 from caviar_protocol import messages as m
 
+pytestmark = pytest.mark.slow
+
 PEER = Path(__file__).with_name("broker_peer.py")
 LOCAL_S, REMOTE_S = 0.1, 1.5
 MARGIN_S = 0.4

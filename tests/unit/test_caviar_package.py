@@ -12,6 +12,8 @@ import pytest
 import caviar
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_run_gives_its_directory_and_open_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -7,6 +7,8 @@ import pytest
 
 from caviar_services.channel.adaptive.controller import CostModel, Workload
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 WORK = Workload(pairs=10, objects=0)
 

@@ -20,6 +20,8 @@ from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
 
+pytestmark = pytest.mark.slow
+
 CARRIERS = (Carrier(name="a", frequency_hz=28e9), Carrier(name="b", frequency_hz=60e9))
 
 

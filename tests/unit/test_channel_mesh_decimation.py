@@ -11,6 +11,8 @@ from caviar_protocol.arrays import Float64Array
 from caviar_services.channel.mesh_detail import decimated, welded
 from caviar_services.mesh.shapes import Mesh, box, unit_box
 
+pytestmark = pytest.mark.slow
+
 
 def sphere(count: int) -> Mesh:
     """Closed, of a radius of 1 m: an octahedron whose triangles are split."""

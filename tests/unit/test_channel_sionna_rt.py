@@ -19,6 +19,8 @@ from caviar_services.channel.stability.lab import frame_of
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
 
+pytestmark = pytest.mark.slow
+
 RX = DeviceSpec(name="rx", kind="antenna", role="rx", on="car.*", count=3)
 PLY = """ply
 format ascii 1.0

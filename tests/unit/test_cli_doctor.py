@@ -15,6 +15,8 @@ from caviar_clients.cli.doctor import Check
 from caviar_protocol.errors import SetupError
 from caviar_services import drjit_setup
 
+pytestmark = pytest.mark.slow
+
 
 def shown(checks: list[Check], width: int = 80) -> str:
     console = Console(file=io.StringIO(), width=width)

@@ -19,6 +19,8 @@ from caviar_clients.cli.launch import TAIL, Child, Launcher
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"
 

@@ -11,6 +11,8 @@ from recording_builders import record_run
 
 from caviar_clients.cli import main as command
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 

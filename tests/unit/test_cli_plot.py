@@ -12,6 +12,8 @@ from caviar_clients.cli.plot import plot_run, scenery
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 
 

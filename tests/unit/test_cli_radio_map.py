@@ -28,6 +28,8 @@ from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.radio_map.mapping import transmitters_of
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 
 

@@ -16,6 +16,8 @@ from caviar_clients.cli.remote import RunInProgress
 from caviar_protocol.host import VARIABLE, SignOfLife
 from caviar_services.runner import TERMINATED, restart_status
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

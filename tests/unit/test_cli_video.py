@@ -21,6 +21,8 @@ from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Camera, CameraImage, Intrinsics
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 

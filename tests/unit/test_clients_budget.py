@@ -19,6 +19,8 @@ from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 FRAMES = 40
 MS = 1_000_000

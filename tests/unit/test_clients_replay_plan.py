@@ -15,6 +15,8 @@ from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.recording import Recording, RecordingWarning
 from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
 
+pytestmark = pytest.mark.slow
+
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 FRAMES = 6
 

@@ -19,6 +19,8 @@ from caviar_clients.tradeoff.worker import Rung
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel
 
+pytestmark = pytest.mark.slow
+
 NOISE = Noise(figure_db=9.0, temperature_k=290.0)
 FREE_SPACE = Setting(label="free-space", use="free-space")
 PERIOD_NS = 100_000_000

@@ -17,6 +17,8 @@ from caviar_clients.tradeoff.plot import comparable_times, draw_convergence, dra
 from caviar_clients.tradeoff.report import Options, Point, Report
 from caviar_clients.tradeoff.tables import level, markdown, significant
 
+pytestmark = pytest.mark.slow
+
 
 def row(setting: str, time_ms: float, nmse_db: float, **more: Any) -> Row:
     fields: dict[str, Any] = {

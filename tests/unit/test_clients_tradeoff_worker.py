@@ -15,6 +15,8 @@ from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_clients.tradeoff.worker import Worker
 from caviar_protocol.errors import RunError
 
+pytestmark = pytest.mark.slow
+
 SCENES = Scenes(
     name="one",
     origin="made by hand",

@@ -14,6 +14,8 @@ from test_core_stateful import play
 
 from caviar_broker.core.dispatch import Dispatcher
 
+pytestmark = pytest.mark.slow
+
 advance = Dispatcher.advance
 
 

@@ -32,6 +32,8 @@ from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 
+pytestmark = pytest.mark.slow
+
 ANSWERED = m.Prepare | m.Reset | m.Grant | m.Shutdown | m.Checkpoint | m.Restore
 BETWEEN = (RunState.RESETTING, RunState.RUNNING)
 TOPICS = ("scene", "channel", "lidar", "action", "link")

@@ -21,6 +21,8 @@ from caviar_protocol.errors import CaviarError, PayloadError, RunError, Scenario
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, BeamChoice, Link
 
+pytestmark = pytest.mark.slow
+
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 GEOMETRIC, SMOKE = SCENARIOS / "geometric.toml", SCENARIOS / "smoke.toml"
 PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")

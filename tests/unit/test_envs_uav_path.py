@@ -18,6 +18,8 @@ from caviar_protocol.recording import Recording
 from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.topics import Action, BeamChoice, VelocityCommand
 
+pytestmark = pytest.mark.slow
+
 SHIPPED = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 MAX_SPEED = 15.0
 START = (-2.0, 140.0, 18.0)

@@ -20,6 +20,8 @@ from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_services.mesh.shapes import Mesh, box, ply
 
+pytestmark = pytest.mark.slow
+
 gymnasium.register_envs(caviar_clients.envs)
 
 LOW, HIGH = (-100.0, 0.0, 2.0), (200.0, 300.0, 80.0)

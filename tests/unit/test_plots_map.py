@@ -31,6 +31,8 @@ from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan
 from caviar_services.antenna_arrays import pointing_directions
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 

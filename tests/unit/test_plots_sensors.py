@@ -22,6 +22,8 @@ from caviar_protocol.topics import (
     SegmentationImage,
 )
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 
 RNG = np.random.default_rng(5)

@@ -19,6 +19,8 @@ from caviar_clients.plots.user_curves import (
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 

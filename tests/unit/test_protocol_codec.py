@@ -55,6 +55,8 @@ from caviar_protocol.topics import (
     WaypointCommand,
 )
 
+pytestmark = pytest.mark.slow
+
 DIGEST = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 

@@ -14,6 +14,8 @@ from caviar_protocol.codec.decoding import HARMLESS, _deeper_than, check_nesting
 from caviar_protocol.errors import LimitError
 from caviar_protocol.fields import MAX_NESTING
 
+pytestmark = pytest.mark.slow
+
 SCALARS = (
     st.none()
     | st.booleans()

@@ -14,6 +14,8 @@ from caviar_protocol import fields
 from caviar_protocol.fields import MAX_PARTS
 from caviar_protocol.messages import Asset, Message, Status
 
+pytestmark = pytest.mark.slow
+
 DIGEST = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 TYPES = get_args(Message)
 

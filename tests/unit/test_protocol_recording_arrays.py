@@ -36,6 +36,8 @@ from caviar_protocol.topics import (
 from caviar_protocol.validation import ContentCheck, ContentRules
 from caviar_services.service import FrameInput
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def street(tmp_path: Path) -> Path:

@@ -27,6 +27,8 @@ from caviar_protocol.recording.integrity import declared_digest, recorded_until
 from caviar_protocol.recording.segment import Segment, expand, may_expand
 from caviar_protocol.topics import Link
 
+pytestmark = pytest.mark.slow
+
 FLIPS = 500
 
 

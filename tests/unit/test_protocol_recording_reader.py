@@ -18,6 +18,8 @@ from caviar_protocol.recording import Recording, RecordingWarning, newest_run
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.topics import Link, Scene
 
+pytestmark = pytest.mark.slow
+
 SEAL = b"\xca\x04\0\0\0\0\0\0\0"
 """Of the private record with a CRC-32, without that."""
 

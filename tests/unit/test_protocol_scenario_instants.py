@@ -14,6 +14,8 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario, instants_ns, parse_scenario
 from caviar_protocol.scenario.rules import resolved, with_overrides
 
+pytestmark = pytest.mark.slow
+
 TEXT = """\
 [run]
 name = "x"

@@ -26,6 +26,8 @@ from caviar_services.recorder.mcap import McapRecorder
 from caviar_services.registry import load
 from caviar_services.service import FrameInput
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 
 

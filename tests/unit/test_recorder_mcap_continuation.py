@@ -13,6 +13,8 @@ from caviar_protocol.messages import Status
 from caviar_protocol.recording import Manifest, Recording, integrity, read_manifest
 from caviar_services.recorder.mcap import McapRecorder
 
+pytestmark = pytest.mark.slow
+
 
 def killed(made: McapRecorder) -> None:
     """What is buffered is lost, and no index is written."""

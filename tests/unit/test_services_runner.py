@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from runner_harness import IDS, MS, Broker, ends, hears, played_broker, service
 
 from caviar_protocol import messages as m
@@ -11,6 +12,8 @@ from caviar_protocol.codec import decode_payload, encode_message
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.topics import Lidar
 from caviar_services.session import TRIM_EVERY
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["played_broker"]
 

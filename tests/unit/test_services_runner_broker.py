@@ -10,6 +10,8 @@ from runner_harness import IDS, MS, Broker, ends, hears, played_broker, service
 
 from caviar_protocol import messages as m
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["played_broker"]
 
 

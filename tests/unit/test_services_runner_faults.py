@@ -9,6 +9,8 @@ from caviar_clients.conform.street import product
 from caviar_protocol import messages as m
 from caviar_protocol.digest import payload_digest
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["played_broker"]
 
 

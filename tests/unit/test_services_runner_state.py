@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from runner_harness import IDS, Broker, ends, played_broker, service
 
 from caviar_protocol import messages as m
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["played_broker"]
 

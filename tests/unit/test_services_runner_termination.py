@@ -12,6 +12,8 @@ from runner_harness import Broker, ends, hears, played_broker, service
 
 from caviar_protocol import messages as m
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["played_broker"]
 
 

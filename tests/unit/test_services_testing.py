@@ -19,6 +19,8 @@ from caviar_services.channel.statistical.free_space import FreeSpaceChannel
 from caviar_services.service import Frame, Service, StepResult
 from caviar_services.testing import CONFORMANCE, ChannelConformance, ServiceConformance, samples
 
+pytestmark = pytest.mark.slow
+
 
 class Unseeded(FreeSpaceChannel):
     """Draws from a generator that is not seeded."""

@@ -18,6 +18,8 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import shipped_scenarios
 from caviar_services.mesh.shapes import Mesh, ply
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 GROUND = 'use = "trajectory"\nbudget_ms = 20\n'
 """In the scenario, after which the settings of its world begin."""

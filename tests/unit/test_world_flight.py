@@ -20,6 +20,8 @@ from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, Ste
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.trajectory import MovingObject
 
+pytestmark = pytest.mark.slow
+
 SPEED, ACCELERATION = 12.0, 4.0
 PERIOD_NS = 100_000_000
 

@@ -22,6 +22,8 @@ from caviar_services.world.flight_dynamics import (
 )
 from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 
+pytestmark = pytest.mark.slow
+
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
 needs_scenes = pytest.mark.skipif(

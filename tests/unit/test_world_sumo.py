@@ -25,6 +25,7 @@ from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
 from caviar_services.world.sumo_process import check_file, load_libsumo
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.sumo,
     pytest.mark.skipif(importlib.util.find_spec("libsumo") is None, reason="needs the world extra"),
 ]

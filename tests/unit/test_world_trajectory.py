@@ -25,6 +25,8 @@ from caviar_services.world.trajectory import (
     read_waypoints,
 )
 
+pytestmark = pytest.mark.slow
+
 lengths = st.floats(-300.0, 300.0, allow_subnormal=False)
 gaps = st.floats(0.25, 20.0)
 
