@@ -165,7 +165,7 @@ class TestCoverage:
         stated = bound.bounds_db(600, PAIRS, np.zeros(10))
         assert (stated[2:] < -35).all()
         assert (stated[:2] > -12).all()
-        assert (bound.bounds_db(640, PAIRS, np.zeros(10)) > -15).all(), "nobody knows any more which they are"
+        assert (bound.bounds_db(640, PAIRS, np.zeros(10)) > -15).all(), "which they are is not known any more"
 
 
 class TestKnowledge:

@@ -294,7 +294,7 @@ def test_clause_18_lag_1_products_stand_in_the_journal() -> None:
     ((header, body),) = [p.payload for p in entries["link", 2].products]
     assert header.startswith(b"link link 0 2 ")
     assert body == b""
-    assert entries["world", 2].products == (), "nobody takes a scene later"
+    assert entries["world", 2].products == (), "no service takes a scene later"
     assert [d.topic for d in entries["world", 2].decisions] == ["scene"]
 
 

@@ -124,7 +124,7 @@ class Checkpoints:
 
     def reset(self, peer: Peer, *, begins: bool) -> None:
         """Note that a service is reset, as an episode ``begins`` or within one."""
-        # A recorder's state is its recording, which it goes on with by itself.
+        # A recorder's state is its recording, which it continues by itself.
         able = peer.hello is not None and CAPABILITY in peer.hello.capabilities
         if not (able and peer.role != "recorder" and self._run.plan.remembers):
             # It may have had one: this incarnation can lack the capability that the one before had.
@@ -192,7 +192,7 @@ class Checkpoints:
         history = self.histories.get(peer.name)
         if history is None or fault.episode != self._run.episode:
             return False
-        # RESTORE and CHECKPOINT name the frame behind which the state was taken, a grant names the next one.
+        # RESTORE and CHECKPOINT name the frame after which the state was taken, a grant names the next one.
         restoring = peer.state is ServiceState.RESTORING and not peer.restored
         return fault.frame == (history.frame if restoring else history.asked)
 

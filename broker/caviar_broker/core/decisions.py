@@ -442,7 +442,7 @@ class DecisionTable:
                 old = participant.tasks.get(frame - 1)
                 if old is not None and old.state not in OUTSTANDING:
                     del participant.tasks[frame - 1]
-        # Frames are finished from behind: as long as this service lags, no other can have finished one.
+        # Looked for from the last on: as long as this service lags, no other can have finished one.
         self._last = min(reversed(participants), key=lambda participant: participant.next_frame)
 
     def _fresh(self, frame: int) -> Iterable[tuple[str, str, str]]:

@@ -180,7 +180,7 @@ class Episodes:
         if self.checkpoints.histories:
             self._remember(peer, dispatcher, message)
         dispatcher.handle_done(peer.name, products, now, report, end=message.end_episode)
-        # Behind the decision of its task, so that a broker that resumes reads them in this order.
+        # After the decision of its task, so that a broker that resumes reads them in this order.
         if message.end_episode and peer.role == "agent":
             facts = {"frames": dispatcher.table.frames}
             run.enter_journal("end", peer.name, message.frame, now, facts=facts)

@@ -187,7 +187,7 @@ class Registration:
             run.unexpected(peer, "ASSET_OFFER", "only of a world, between PREPARE and READY")
             return
         digests = {asset.name: asset.digest for asset in event.assets}
-        # Others have loaded what it offered first: the run would go on with two geometries.
+        # Others have loaded what it offered first: the run would continue with two geometries.
         if peer.ready and digests != {asset.name: asset.digest for asset in peer.assets}:
             self._refuse(peer, "geometry", f"{peer} came back with other scenery than it had before", now)
             return
@@ -227,7 +227,7 @@ class Registration:
         if not self._accepted(peer, message, now):
             return
         peer.ready = message
-        # Behind the first episode an agent chooses seeds with DONE; a run that goes on has its seed.
+        # After the first episode an agent chooses seeds with DONE; a run that goes on has its seed.
         if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
             run.wish(message.seed, peer, now)
         self._prepare_whoever_can(now)

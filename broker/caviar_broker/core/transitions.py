@@ -138,7 +138,7 @@ SERVICE: dict[tuple[ServiceState, ServiceEvent], ServiceState] = {
     (ServiceState.JOINED, ServiceEvent.PREPARE): ServiceState.PREPARING,
     (ServiceState.PREPARING, ServiceEvent.READY): ServiceState.READY,
     (ServiceState.READY, ServiceEvent.RESET): ServiceState.RESETTING,
-    # Without state, or behind a first reset; else RESTORE comes in between.
+    # Without state, or after a first reset; else RESTORE comes in between.
     (ServiceState.RESETTING, ServiceEvent.RESET_DONE): ServiceState.ACTIVE,
     (ServiceState.RESETTING, ServiceEvent.RESTORE): ServiceState.RESTORING,
     (ServiceState.RESTORING, ServiceEvent.RESTORED): ServiceState.ACTIVE,

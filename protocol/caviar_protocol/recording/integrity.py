@@ -26,7 +26,7 @@ from caviar_protocol.recording import (
 )
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
 
-# A recorder replaces the manifest a few times while it goes on with a recording, then once a segment.
+# A recorder replaces the manifest a few times while it continues a recording, then once a segment.
 _READINGS = 8
 
 

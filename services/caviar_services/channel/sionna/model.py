@@ -320,7 +320,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
         table, too_close = with_near_pairs(table, los, *antennas, finder.wavelengths, self._scene.surfaces)
-        # Behind the near pairs, whose lines of sight foliage dims, too.
+        # After the near pairs, whose lines of sight foliage dims, too.
         if self.foliage is not None:
             table = self.foliage.attenuated(table, *path_ends(table.pair, *antennas))
         if not self.settings.los:

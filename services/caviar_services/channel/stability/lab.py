@@ -315,7 +315,7 @@ def measure(model: Model, at: Scene, number: int = 0) -> Channel:
 
 
 def frame_of(at: Scene, number: int = 0, **more: Any) -> Frame:
-    """The frame of a scene, 100 ms behind the one before, for a channel model.
+    """The frame of a scene, 100 ms after the one before, for a channel model.
 
     Args:
         at: The scene.
