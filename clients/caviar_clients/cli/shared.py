@@ -113,6 +113,11 @@ def require_installed(what: str, extras: Iterable[str]) -> None:
 def require_known(option: str, name: str, known: Iterable[str]) -> None:
     """Refuse the value of an option that names nothing.
 
+    Args:
+        option: As the user writes it, ``--part``.
+        name: Its value.
+        known: What there is.
+
     Raises:
         RunError: ``name`` is not among ``known``; the text has the near name, or the known ones.
     """
@@ -160,7 +165,13 @@ def new_run_directory(root: Path, name: str) -> Path:
 
 
 def print_line(console: Console, text: object, style: str = "") -> None:
-    """Print a line as it is: Rich neither folds it, so that it can be copied, nor reads ``[…]`` as markup."""
+    """Print a line as it is: Rich neither folds it, so that it can be copied, nor reads ``[…]`` as markup.
+
+    Args:
+        console: Where it is printed.
+        text: The line, or what has it as text, as a path.
+        style: Of Rich, as ``bold red``; empty: none.
+    """
     console.print(Text(str(text), style=style), soft_wrap=True)
 
 
@@ -180,7 +191,11 @@ def progress_bar(console: Console, *columns: str | ProgressColumn, transient: bo
 
 
 def write_json(file: Path | None, found: Any) -> None:
-    """Write a structure as indented JSON; nothing where no file is asked for.
+    """Write a structure as indented JSON.
+
+    Args:
+        file: Where it is written; None: nowhere.
+        found: What msgspec encodes: structs, lists, dictionaries, numbers.
 
     Raises:
         RunError: The file cannot be written; it stays as it was.

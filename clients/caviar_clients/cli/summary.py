@@ -139,7 +139,12 @@ class ReportTally:
         self._changes: Counter[tuple[str, str]] = Counter()
 
     def add(self, episode: int, reports: Iterable[Report]) -> None:
-        """Count the reports of a frame. Frames come in their order."""
+        """Count the reports of a frame. Frames come in their order.
+
+        Args:
+            episode: Of the frame.
+            reports: What each service reported of it.
+        """
         self._frames += 1
         for report in reports:
             self._reported[report.source] += 1

@@ -135,7 +135,15 @@ class Reward:
         return self._served
 
     def mean(self, link: Link, pairs: Collection[tuple[str, str]]) -> float:
-        """Work out the reward for a frame; 0 where no user of the pairs has a path."""
+        """Work out the reward for a frame.
+
+        Args:
+            link: What the decision led to.
+            pairs: Names of transmitter and receiver of the users that count.
+
+        Returns:
+            The mean over these users; 0 where none of them has a path.
+        """
         values = self._values(link)
         counted, served = link.has_path, self.served(link, pairs)
         if served is not None:

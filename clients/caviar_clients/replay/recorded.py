@@ -121,7 +121,11 @@ class RecordedRun:
         return sum(any(i.source == name and i.status in statuses for i in entry.inputs) for entry in entries)
 
     def digest(self, frames: int) -> str:
-        """Work out the digest of the run, had its episodes had ``frames`` frames at most."""
+        """Work out the digest of the run, had it been shorter.
+
+        Args:
+            frames: Of each episode, at most.
+        """
         # As the broker does: of each frame the digests of its fresh products.
         chain = RunDigest()
         for index in range(len(self.recording)):
@@ -151,7 +155,15 @@ class Timing:
     """Whether each latency could be assigned to its frame."""
 
     def at(self, episode: int, frame: int) -> int:
-        """Look up what a frame took [ns]; the median where the service had no part in it."""
+        """Look up what a frame took.
+
+        Args:
+            episode: From 0 on.
+            frame: From 0 on; of an agent's final grant, the number behind the last frame.
+
+        Returns:
+            Time [ns]; the median where the service had no part in the frame.
+        """
         return self.times.get((episode, frame), self.typical)
 
 

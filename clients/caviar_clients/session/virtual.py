@@ -184,7 +184,12 @@ def virtual_plan(scenario: Scenario, services: Collection[str], lengths: Mapping
 
 
 def under_policy(plan: RunPlan, policy: Policy | None) -> RunPlan:
-    """Put all services that may have it under one late policy; None: each keeps its own."""
+    """Put the services of a plan under one late policy.
+
+    Args:
+        plan: The run.
+        policy: Of all services but worlds and recorders, which wait; None: each keeps its own.
+    """
     return replace(plan, services=tuple(_under(service, policy) for service in plan.services))
 
 
