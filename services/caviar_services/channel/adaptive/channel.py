@@ -105,8 +105,8 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         with shared_scenes():
             for rung in self._every:
                 with naming(rung.label):
-                    told = rung.model.prepare(preparation).notes
-                notes += [note for note in told if note not in notes]
+                    said = rung.model.prepare(preparation).notes
+                notes += [note for note in said if note not in notes]
         notes += self._time_rungs()
         return Prepared(notes=tuple(notes))
 
