@@ -125,7 +125,7 @@ class BrokerServer:
         self._next_check = self._look_at = 0
         self._budgets_are_long = not plan.realtime and all(s.budget_ns >= LONG_NS for s in plan.services)
         self._unhurried = False
-        self._router = Router(endpoint, plan.limits.liveness, access, peer_limits)
+        self._router = Router(endpoint, plan.timeouts.liveness, access, peer_limits)
         self._guard = self._router.guard
         self.access = access
         """The keys of those who may take part; None: every process of this machine may."""
@@ -141,8 +141,8 @@ class BrokerServer:
         self.loop.watch(self._standby.fd, self._disk_answers_again, prompt=True)
         self._watchdog = Watchdog(
             clock=self.clock,
-            heartbeat_ns=plan.limits.heartbeat,
-            liveness_ns=plan.limits.liveness,
+            heartbeat_ns=plan.timeouts.heartbeat,
+            liveness_ns=plan.timeouts.liveness,
             probe=lambda route: self._router.send(route, encode_message(m.HeartbeatAck(sequence=0))),
             lost=lambda service, verdict: self.feed(ev.Lost(service, verdict)),
             warn=self.note,
@@ -372,7 +372,7 @@ class BrokerServer:
         waited = 0.0 if since is None else time.monotonic() - since
         if waited >= DISK_NOTE_S and not self._disk_told:
             place = f"{self._journal.path} ({file_system_of(self._journal.path)})"
-            limit = f"at most {self._plan.limits.stall / 1e9:g} s (timeouts.stall_s)"
+            limit = f"at most {self._plan.timeouts.stall / 1e9:g} s (timeouts.stall_s)"
             text = f"the disk does not answer: {doing} of {place} has waited for {waited:.1f} s"
             self.note("", f"{text}; the run waits for it, {limit}", "disk")
         elif self._disk_told and not waited:

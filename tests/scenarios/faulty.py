@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from typing import Any, ClassVar
 
@@ -38,6 +39,13 @@ class Raises(_Faulty):
 
     def go_wrong(self) -> None:
         raise ZeroDivisionError("the sensor's focal length is 0")
+
+
+class Leaves(_Faulty):
+    """Ends its program, as a script does."""
+
+    def go_wrong(self) -> None:
+        sys.exit(0)
 
 
 class Exits(_Faulty):

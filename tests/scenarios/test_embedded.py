@@ -116,6 +116,24 @@ def test_a_service_that_raises_is_blamed_and_the_recording_readable(tmp_path: Pa
     assert (digest.status, digest.output.split()) == (0, [summary["digest"]])
 
 
+def test_a_service_that_ends_its_program_is_blamed(tmp_path: Path) -> None:
+    """``sys.exit()`` in a plug-in ended the caller's program, with status 0 and without a word."""
+    changes = [('"action", "link"]', '"action", "link", "lidar"]')]
+    sick = SICK.replace("faulty:Raises", "faulty:Leaves")
+    finished = run(scenario_file(tmp_path, changes, sick), tmp_path / "out", "--embedded")
+    assert finished.status == 1
+    assert "sensors 'sick'" in finished.output
+    assert "it called sys.exit(0)" in finished.output
+
+
+@pytest.mark.parametrize("option", [("--bind", "tcp://127.0.0.1:0"), ("--keys", "keys")])
+def test_options_of_sockets_are_refused(tmp_path: Path, option: tuple[str, str]) -> None:
+    finished = caviar("run", "smoke", "--embedded", "--out", tmp_path / "out", *option)
+    assert finished.status == 1
+    assert "an embedded run has no sockets" in finished.output
+    assert not (tmp_path / "out").exists()
+
+
 def test_ctrl_c_ends_it_cleanly(tmp_path: Path) -> None:
     arguments = ("--frames", "100000", "--embedded")
     with running(scenario_file(tmp_path), tmp_path / "out", *arguments) as (process, mark):

@@ -15,7 +15,7 @@ import zmq
 
 from caviar_broker.control.server import ControlServer
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits, RunPlan, ServicePlan
+from caviar_broker.core.plan import RunPlan, ServicePlan, Timeouts
 from caviar_broker.journal import JournalFile
 from caviar_broker.server import BrokerServer
 from caviar_broker.statistics import Statistics
@@ -84,7 +84,7 @@ def plan(*services: str, limits: dict[str, int] | None = None, **run: Any) -> Ru
         role, _, name = service.rpartition(":")
         plans.append(ServicePlan(name=name, role=role or name, budget_ns=50 * MS))
     defaults = {"run": "test", "frames": 3, "sampling_period_ns": 100 * MS, "record": ("lidar",)}
-    return RunPlan(services=tuple(plans), limits=Limits(**times | (limits or {})), **defaults | run)
+    return RunPlan(services=tuple(plans), timeouts=Timeouts(**times | (limits or {})), **defaults | run)
 
 
 @contextmanager

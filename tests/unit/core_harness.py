@@ -19,7 +19,7 @@ from core_history import History
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import Feature, Limits, RunPlan, ServicePlan
+from caviar_broker.core.plan import Feature, RunPlan, ServicePlan, Timeouts
 from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
@@ -50,7 +50,7 @@ class Sim:
     """Implementation that the scenario names."""
     remote: bool = False
     rejoin: int | None = None
-    """How long its return is waited for [ns], instead of what the limits say."""
+    """How long its return is waited for [ns], instead of what the timeouts say."""
     budget: int = 100 * MS
     max_in_flight: int = 1
     hello: Mapping[str, Any] = field(default_factory=dict)
@@ -141,7 +141,7 @@ class Simulation:
         self,
         services: Iterable[Sim],
         *,
-        limits: Limits | None = None,
+        timeouts: Timeouts | None = None,
         journal_after: int = 0,
         strict: bool = True,
         journal: JournalFile | None = None,
@@ -153,7 +153,7 @@ class Simulation:
         self.plan = RunPlan(
             run="virtual",
             services=tuple(s.plan() for s in self.services.values()),
-            limits=limits or Limits(),
+            timeouts=timeouts or Timeouts(),
             **settings,
         )
         self.now = SECOND  # not 0, so that a forgotten offset shows

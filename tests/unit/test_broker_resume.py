@@ -11,7 +11,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, loop
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.run import Resumption
 from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.journal_format import read_journal
@@ -41,7 +41,7 @@ class Runs:
 
     def __init__(self, folder: Path, services: dict[str, dict[str, Any]], **plan: Any) -> None:
         self.folder, self.services = folder, services
-        self.plan = {"frames": 9, "checkpoint_frames": 3, "limits": Limits(rejoin=5 * SECOND)} | plan
+        self.plan = {"frames": 9, "checkpoint_frames": 3, "timeouts": Timeouts(rejoin=5 * SECOND)} | plan
         self.epoch = 0
 
     def go(self, until: int | None = None) -> Simulation:

@@ -69,7 +69,7 @@ def test_only_remote_services_are_waited_for_unless_the_scenario_says_how_long(
     tmp_path: Path, changes: tuple[tuple[str, str], ...], agent: int, others: int
 ) -> None:
     plan = plan_run(load_scenario(scenario(tmp_path, *changes)), "run", {})
-    waits = {s.name: plan.limits.rejoin if s.rejoin is None else s.rejoin for s in plan.services}
+    waits = {s.name: plan.timeouts.rejoin if s.rejoin is None else s.rejoin for s in plan.services}
     assert waits.pop("agent") == agent
     assert set(waits.values()) == {others}
 

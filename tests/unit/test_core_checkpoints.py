@@ -10,15 +10,15 @@ from core_harness import MS, SECOND, Simulation, loop
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.checkpoints import MAX_HISTORY_BYTES
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_protocol import messages as m
 
-REJOIN = Limits(rejoin=5 * SECOND)
+REJOIN = Timeouts(rejoin=5 * SECOND)
 STATEFUL = {name: {"stateful": True} for name in ("world", "channel", "agent", "link")}
 
 
 def simulation(**plan: Any) -> Simulation:
-    settings = {"frames": 9, "checkpoint_frames": 3, "limits": REJOIN} | plan
+    settings = {"frames": 9, "checkpoint_frames": 3, "timeouts": REJOIN} | plan
     services: dict[str, dict[str, Any]] = settings.pop("services", STATEFUL)
     return Simulation(loop(**services), **settings).join()
 
@@ -143,7 +143,7 @@ def test_a_service_that_is_not_reproducible_is_told_of_and_the_run_goes_on() -> 
 
 def test_a_service_that_never_saves_ends_the_run_with_blame() -> None:
     services = STATEFUL | {"link": {"stateful": True, "saving": None}}
-    run = simulation(services=services, limits=Limits(stall=SECOND)).run()
+    run = simulation(services=services, timeouts=Timeouts(stall=SECOND)).run()
     assert run.outcome.culprit == "link"
     assert "CHECKPOINT" in run.outcome.error
 

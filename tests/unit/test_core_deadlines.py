@@ -9,7 +9,7 @@ import pytest
 from core_harness import MS, SECOND, Sim, Simulation, agent, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_protocol import messages as m
 from caviar_protocol.messages import Status
 
@@ -53,7 +53,7 @@ def test_clause_9_under_wait_the_frame_waits_and_the_miss_is_counted_and_blamed(
 def test_clause_9_under_wait_a_stall_ends_the_run_with_blame() -> None:
     heart = {"heartbeat": (SECOND, False), "phase": "tracing"}
     services = loop(channel={"latency": slow_at(2, takes=None)} | heart)
-    run = Simulation(services, limits=Limits(stall=30 * SECOND)).join().run()
+    run = Simulation(services, timeouts=Timeouts(stall=30 * SECOND)).join().run()
     assert run.outcome.culprit == "channel"
     for part in ("channel 'channel'", "frame 2", "budget 100 ms", "phase 'tracing'", "progress 0"):
         assert part in run.outcome.error
@@ -65,14 +65,14 @@ def test_clause_9_under_wait_a_stall_ends_the_run_with_blame() -> None:
 def test_clause_9_progress_is_no_stall() -> None:
     heart = {"heartbeat": (SECOND, True)}
     services = loop(channel={"latency": slow_at(2, takes=100 * SECOND)} | heart)
-    run = Simulation(services, limits=Limits(stall=30 * SECOND)).join().run()
+    run = Simulation(services, timeouts=Timeouts(stall=30 * SECOND)).join().run()
     assert run.outcome.error == ""
 
 
 def test_clause_14_compilation_has_its_declared_grace() -> None:
     heart = {"heartbeat": (SECOND, False), "grace": 200 * SECOND}
     services = loop(channel={"latency": slow_at(2, takes=100 * SECOND)} | heart)
-    run = Simulation(services, limits=Limits(stall=30 * SECOND)).join().run()
+    run = Simulation(services, timeouts=Timeouts(stall=30 * SECOND)).join().run()
     assert run.outcome.error == ""
 
 

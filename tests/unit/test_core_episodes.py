@@ -6,7 +6,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.messages import Status
@@ -169,7 +169,7 @@ def test_reset_waits_for_a_late_answer_of_the_episode_before() -> None:
 def test_a_service_that_never_answers_is_blamed_when_the_next_episode_needs_it() -> None:
     dead = sensors(policy="hold", budget=5 * MS, latency=lambda e, k: None if k == 1 else MS)
     services = [world(), agent(inputs=(m.Input(topic="lidar", required=False),)), dead]
-    run = Simulation(services, episodes=2, limits=Limits(stall=30 * SECOND)).join().run()
+    run = Simulation(services, episodes=2, timeouts=Timeouts(stall=30 * SECOND)).join().run()
     assert run.outcome.culprit == "lidar"
     assert "frame 1" in run.outcome.error
     assert run.now >= run.time_of("lidar", 1) + 30 * SECOND

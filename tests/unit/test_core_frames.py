@@ -9,7 +9,7 @@ from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, rec
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.decisions import Ledger
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.digest import RunDigest
@@ -316,7 +316,7 @@ def test_the_ledger_tells_since_when_nothing_was_confirmed() -> None:
 
 
 def test_a_journal_that_is_not_written_ends_the_run() -> None:
-    run = Simulation(loop(), journal_after=10**6 * SECOND, limits=Limits(stall=30 * SECOND)).join().run()
+    run = Simulation(loop(), journal_after=10**6 * SECOND, timeouts=Timeouts(stall=30 * SECOND)).join().run()
     assert "journal was not written for 30 s" in run.outcome.error
     assert run.outcome.culprit == ""
 

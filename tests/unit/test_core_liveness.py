@@ -9,11 +9,11 @@ from core_harness import MS, SECOND, Simulation, agent, loop, recorder, sensors,
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.liveness import MAX_LOSSES
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 
-REJOIN = Limits(rejoin=10 * SECOND)
+REJOIN = Timeouts(rejoin=10 * SECOND)
 
 
 def granted(service: str, frame: int, episode: int = 0) -> Any:
@@ -84,7 +84,7 @@ def test_clause_18_a_service_that_rejoins_gets_the_grant_it_owes_and_the_digest_
     name: str, overlap: int
 ) -> None:
     services = loop(**{name: {"latency": 20 * MS}})
-    run = Simulation(services, frames=8, frames_in_flight=overlap, limits=REJOIN).join()
+    run = Simulation(services, frames=8, frames_in_flight=overlap, timeouts=REJOIN).join()
     run.run(granted(name, 3))
     run.run_to(run.now + 10 * MS)
     run.kill(name)
@@ -102,7 +102,7 @@ def test_clause_18_a_service_that_rejoins_gets_the_grant_it_owes_and_the_digest_
 
 def test_clause_18_a_service_that_owed_nothing_steps_the_whole_gap_after_its_return() -> None:
     services = loop(link={"latency": lambda e, k: 500 * MS if k == 3 else MS})
-    run = Simulation(services, frames=8, frames_in_flight=1, limits=REJOIN).join().run(granted("link", 3))
+    run = Simulation(services, frames=8, frames_in_flight=1, timeouts=REJOIN).join().run(granted("link", 3))
     run.kill("world")
     run.after(SECOND, lambda: run.hello("world"))
     run.run()
@@ -112,7 +112,7 @@ def test_clause_18_a_service_that_owed_nothing_steps_the_whole_gap_after_its_ret
 
 def test_clause_18_all_queued_grants_are_sent_again_in_order() -> None:
     services = loop(channel={"latency": 20 * MS, "max_in_flight": 3})
-    run = Simulation(services, frames=8, limits=REJOIN).join().run(granted("channel", 4))
+    run = Simulation(services, frames=8, timeouts=REJOIN).join().run(granted("channel", 4))
     owed = len(run.history.owed["channel"]) if run.history else 0
     assert owed > 1
     run.kill("channel")
@@ -125,7 +125,7 @@ def test_clause_18_all_queued_grants_are_sent_again_in_order() -> None:
 
 
 def test_clause_1_an_answer_of_the_incarnation_that_died_is_not_used() -> None:
-    run = Simulation(loop(channel={"latency": 20 * MS}), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(channel={"latency": 20 * MS}), timeouts=REJOIN).join().run(granted("channel", 1))
     run.kill("channel")
     old = m.Done(epoch=1, attempt=1, episode=0, frame=1)
     run.feed(ev.DoneReceived("channel", old))
@@ -139,7 +139,7 @@ def test_clause_1_an_answer_of_the_incarnation_that_died_is_not_used() -> None:
 
 def test_what_a_former_incarnation_told_does_not_count_for_the_next() -> None:
     heart = {"heartbeat": (SECOND, False), "grace": 1000 * SECOND, "phase": "compiling"}
-    run = Simulation(loop(channel={"latency": 20 * MS} | heart), limits=REJOIN).join()
+    run = Simulation(loop(channel={"latency": 20 * MS} | heart), timeouts=REJOIN).join()
     run.run(granted("channel", 1))
     run.kill("channel")
     run.services["channel"].heartbeat = None
@@ -151,7 +151,7 @@ def test_what_a_former_incarnation_told_does_not_count_for_the_next() -> None:
 
 
 def test_the_time_to_come_back_is_limited() -> None:
-    run = Simulation(loop(), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(), timeouts=REJOIN).join().run(granted("channel", 1))
     run.kill("channel", "exit status 1")
     died = run.now
     run.run()
@@ -162,7 +162,7 @@ def test_the_time_to_come_back_is_limited() -> None:
 
 
 def test_a_service_that_dies_again_and_again_is_given_up() -> None:
-    run = Simulation(loop(channel={"latency": 20 * MS}), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(channel={"latency": 20 * MS}), timeouts=REJOIN).join().run(granted("channel", 1))
     for _ in range(MAX_LOSSES - 1):
         run.kill("channel")
         assert run.clock.error == ""
@@ -174,7 +174,7 @@ def test_a_service_that_dies_again_and_again_is_given_up() -> None:
 
 
 def test_a_service_that_gets_somewhere_may_die_more_often() -> None:
-    run = Simulation(loop(channel={"latency": 20 * MS}), frames=9, limits=REJOIN).join()
+    run = Simulation(loop(channel={"latency": 20 * MS}), frames=9, timeouts=REJOIN).join()
     for frame in range(1, 2 * MAX_LOSSES):
         run.run(granted("channel", frame))
         run.kill("channel")
@@ -183,7 +183,7 @@ def test_a_service_that_gets_somewhere_may_die_more_often() -> None:
 
 
 def test_after_a_return_the_time_counts_from_the_grant_that_was_sent_again() -> None:
-    run = Simulation(loop(channel={"latency": 20 * MS}), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(channel={"latency": 20 * MS}), timeouts=REJOIN).join().run(granted("channel", 1))
     run.kill("channel")
     run.after(SECOND, lambda: run.hello("channel"))
     run.run()
@@ -192,7 +192,7 @@ def test_after_a_return_the_time_counts_from_the_grant_that_was_sent_again() -> 
 
 
 def test_a_service_that_never_was_ready_is_not_waited_for() -> None:
-    run = Simulation(loop(channel={"ready_after": None}), limits=REJOIN).join()
+    run = Simulation(loop(channel={"ready_after": None}), timeouts=REJOIN).join()
     run.run(lambda run: bool(run.seen(m.Prepare, "channel")))
     run.kill("channel")
     assert run.run().outcome.culprit == "channel"
@@ -200,7 +200,7 @@ def test_a_service_that_never_was_ready_is_not_waited_for() -> None:
 
 
 def test_a_service_that_comes_back_with_another_declaration_is_refused() -> None:
-    run = Simulation(loop(), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(), timeouts=REJOIN).join().run(granted("channel", 1))
     run.kill("channel")
     run.hello("channel", outputs=("channel", "lidar"))
     assert [t.refusal.code for t in run.seen(ev.TurnAway)] == ["declaration"]
@@ -209,7 +209,7 @@ def test_a_service_that_comes_back_with_another_declaration_is_refused() -> None
 
 def test_a_world_that_comes_back_with_other_scenery_is_refused() -> None:
     mesh = m.Asset(name="x.ply", digest="a" * 64, size=1)
-    run = Simulation(loop(world={"assets": (mesh,)}), limits=REJOIN).join().run(granted("channel", 1))
+    run = Simulation(loop(world={"assets": (mesh,)}), timeouts=REJOIN).join().run(granted("channel", 1))
     run.kill("world")
     run.services["world"].assets = (m.Asset(name="x.ply", digest="b" * 64, size=1),)
     run.hello("world")
@@ -221,7 +221,7 @@ def test_a_world_that_comes_back_with_other_scenery_is_refused() -> None:
 @pytest.mark.parametrize("gap", [0, 30 * MS, 300 * MS])
 def test_a_service_may_die_between_two_episodes(gap: int) -> None:
     services = loop(link={"latency": 50 * MS}, world={"reset_after": 40 * MS})
-    run = Simulation(services, episodes=2, frames=3, limits=REJOIN).join()
+    run = Simulation(services, episodes=2, frames=3, timeouts=REJOIN).join()
     run.run(granted("link", 2))  # the world is through with its episode
     run.kill("world")
     run.after(gap, lambda: run.hello("world"))
@@ -231,7 +231,7 @@ def test_a_service_may_die_between_two_episodes(gap: int) -> None:
 
 
 def test_a_service_may_die_while_it_is_reset_and_the_episode_waits_for_it() -> None:
-    run = Simulation(loop(world={"reset_after": 50 * MS}), limits=REJOIN).join()
+    run = Simulation(loop(world={"reset_after": 50 * MS}), timeouts=REJOIN).join()
     run.run(lambda run: run.clock.state is RunState.RESETTING)
     run.kill("world")
     run.after(SECOND, lambda: run.hello("world"))
@@ -240,7 +240,7 @@ def test_a_service_may_die_while_it_is_reset_and_the_episode_waits_for_it() -> N
 
 def test_world_and_channel_may_die_together() -> None:
     services = loop(world={"latency": 9 * MS}, channel={"latency": 9 * MS})
-    run = Simulation(services, limits=REJOIN).join().run(granted("channel", 2))
+    run = Simulation(services, timeouts=REJOIN).join().run(granted("channel", 2))
     run.kill("world")
     run.kill("channel")
     run.after(SECOND, lambda: run.hello("channel"))
@@ -252,7 +252,7 @@ def test_under_hold_frames_go_on_without_a_service_that_died() -> None:
     lidar = sensors(policy="hold", budget=20 * MS, latency=5 * MS)
     takes = (m.Input(topic="lidar", required=False),)
     services = [world(), lidar, agent(inputs=takes, latency=9 * MS), recorder()]
-    run = Simulation(services, frames=40, limits=REJOIN).join().run(granted("lidar", 3))
+    run = Simulation(services, frames=40, timeouts=REJOIN).join().run(granted("lidar", 3))
     run.kill("lidar")
     run.after(200 * MS, lambda: run.hello("lidar"))
     run.run()
@@ -326,7 +326,7 @@ def test_welcome_says_for_how_long_a_service_may_come_back_by_itself(
     remote: bool, local: bool, rejoin: int, told: int
 ) -> None:
     """A local one is started again with its broker, and must not keep its successor out."""
-    run = Simulation(loop(agent=REMOTE if remote else {}), limits=Limits(rejoin=rejoin))
+    run = Simulation(loop(agent=REMOTE if remote else {}), timeouts=Timeouts(rejoin=rejoin))
     run.feed(ev.Joined(m.Hello(version=m.PROTOCOL_VERSION, name="agent", role="agent"), local))
     assert run.seen(m.Welcome, "agent")[0].rejoin_ns == told
 
@@ -339,7 +339,7 @@ def test_a_run_is_the_same_after_a_remote_service_came_back() -> None:
 
 
 def test_a_remote_service_that_stays_away_is_blamed_after_its_own_time() -> None:
-    run = Simulation(loop(agent=REMOTE), limits=Limits(rejoin=SECOND)).join().run(granted("agent", 1))
+    run = Simulation(loop(agent=REMOTE), timeouts=Timeouts(rejoin=SECOND)).join().run(granted("agent", 1))
     lost = run.now
     run.kill("agent", "its connection is gone")
     run.run()

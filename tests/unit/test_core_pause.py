@@ -8,7 +8,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, loop, recorder, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 
 
@@ -22,10 +22,10 @@ def digest_of(run: Simulation) -> str:
 
 def test_a_paused_run_finishes_what_has_begun_and_then_rests_without_stalling() -> None:
     """Far longer than ``stall_s``; afterwards the run is the one that was never paused."""
-    limits = Limits(stall=SECOND)
-    undisturbed = Simulation(loop(), limits=limits, frames=20)
+    timeouts = Timeouts(stall=SECOND)
+    undisturbed = Simulation(loop(), timeouts=timeouts, frames=20)
     undisturbed.join().run()
-    run = Simulation(loop(), limits=limits, frames=20)
+    run = Simulation(loop(), timeouts=timeouts, frames=20)
     seen: list[tuple[int, int, bool]] = []
     run.after(20 * MS, lambda: run.feed(ev.PauseRequested()))
     for later in (1, 50):
@@ -106,7 +106,9 @@ def test_the_view_tells_who_is_late_in_which_frame_and_who_lacks_what() -> None:
 
 
 def test_the_view_tells_who_has_not_come_yet() -> None:
-    run = Simulation([world(ready_after=None), recorder()], record=("scene",), limits=Limits(ready=SECOND))
+    run = Simulation(
+        [world(ready_after=None), recorder()], record=("scene",), timeouts=Timeouts(ready=SECOND)
+    )
     views = []
     run.after(500 * MS, lambda: views.append(run.clock.status(run.now)))
     run.join().run()

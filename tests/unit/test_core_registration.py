@@ -6,7 +6,7 @@ import pytest
 from core_harness import MS, SECOND, Sim, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Feature, Limits, PatternFile, plan_run
+from caviar_broker.core.plan import Feature, PatternFile, Timeouts, plan_run
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.digest import geometry_digest
@@ -325,7 +325,7 @@ def test_ready_out_of_turn_is_answered_with_an_error() -> None:
 
 
 def test_the_time_to_connect_is_limited_and_the_missing_are_named() -> None:
-    run = Simulation(loop(), limits=Limits(connect=3 * SECOND))
+    run = Simulation(loop(), timeouts=Timeouts(connect=3 * SECOND))
     run.join("world", "agent", "recorder").run()
     assert run.outcome.error.startswith("channel 'channel', link 'link' did not connect within 3 s")
     assert run.outcome.culprit == "channel"
@@ -333,7 +333,7 @@ def test_the_time_to_connect_is_limited_and_the_missing_are_named() -> None:
 
 
 def test_the_time_to_get_ready_is_limited() -> None:
-    run = Simulation(loop(channel={"ready_after": None}), limits=Limits(ready=5 * SECOND)).join().run()
+    run = Simulation(loop(channel={"ready_after": None}), timeouts=Timeouts(ready=5 * SECOND)).join().run()
     assert run.outcome.culprit == "channel"
     assert "preparing" in run.outcome.error
     assert "no heartbeat ever came" in run.outcome.error
@@ -341,26 +341,28 @@ def test_the_time_to_get_ready_is_limited() -> None:
 
 def test_clause_14_a_declared_grace_lets_loading_take_longer() -> None:
     slow = {"ready_after": 60 * SECOND, "heartbeat": (SECOND, False), "phase": "compiling kernels"}
-    limits = Limits(ready=5 * SECOND)
-    impatient = Simulation(loop(channel=slow), limits=limits).join().run()
+    timeouts = Timeouts(ready=5 * SECOND)
+    impatient = Simulation(loop(channel=slow), timeouts=timeouts).join().run()
     assert "phase 'compiling kernels'" in impatient.outcome.error
-    patient = Simulation(loop(channel=slow | {"grace": 90 * SECOND}), limits=limits).join().run()
+    patient = Simulation(loop(channel=slow | {"grace": 90 * SECOND}), timeouts=timeouts).join().run()
     assert patient.outcome.error == ""
 
 
 def test_progress_lets_loading_take_longer() -> None:
     slow = {"ready_after": 60 * SECOND, "heartbeat": (SECOND, True), "phase": "loading"}
-    assert Simulation(loop(channel=slow), limits=Limits(ready=5 * SECOND)).join().run().outcome.error == ""
+    assert (
+        Simulation(loop(channel=slow), timeouts=Timeouts(ready=5 * SECOND)).join().run().outcome.error == ""
+    )
 
 
 def test_the_time_to_reset_is_limited() -> None:
-    run = Simulation(loop(world={"reset_after": None}), limits=Limits(reset=5 * SECOND)).join().run()
+    run = Simulation(loop(world={"reset_after": None}), timeouts=Timeouts(reset=5 * SECOND)).join().run()
     assert run.outcome.culprit == "world"
     assert "resetting" in run.outcome.error
 
 
 def test_the_time_to_leave_is_limited_and_who_stays_is_named() -> None:
-    run = Simulation(loop(link={"says_bye": False}), limits=Limits(shutdown=2 * SECOND)).join().run()
+    run = Simulation(loop(link={"says_bye": False}), timeouts=Timeouts(shutdown=2 * SECOND)).join().run()
     assert run.outcome.error == ""
     assert [n.service for n in run.notices("lost")] == ["link"]
 

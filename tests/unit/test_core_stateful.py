@@ -26,7 +26,7 @@ from hypothesis.stateful import (
 )
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import CheckpointFiles, JournalFile
 from caviar_broker.resume import read_resumption
@@ -187,11 +187,11 @@ class Runs(RuleBasedStateMachine):
         services=graphs(), plan=plans(), rejoin=st.sampled_from([0, 5 * SECOND]), journal=st.booleans()
     )
     def begin(self, services: list[Sim], plan: dict[str, Any], rejoin: int, journal: bool) -> None:
-        limits = Limits(
+        timeouts = Timeouts(
             connect=2 * SECOND, ready=SECOND, reset=SECOND, stall=SECOND, shutdown=SECOND, rejoin=rejoin
         )
         self.prompt_journal = journal
-        self.run = Puppets(services, limits=limits, **plan)
+        self.run = Puppets(services, timeouts=timeouts, **plan)
         for name in self.run.services:
             self.run.hello(name)
         assume(self.run.clock.graph is not None)
@@ -252,7 +252,7 @@ class Runs(RuleBasedStateMachine):
             self.run.fire(due)
 
     @rule(data=st.data())
-    @precondition(lambda self: self.run.plan.limits.rejoin and self.run.clock.state is RunState.RUNNING)
+    @precondition(lambda self: self.run.plan.timeouts.rejoin and self.run.clock.state is RunState.RUNNING)
     def somebody_dies(self, data: st.DataObject) -> None:
         alive = self.names(lambda n: n in self.run.alive)
         if alive:
@@ -359,8 +359,8 @@ def test_clauses_18_and_20_under_wait_equal_inputs_give_equal_digests_kills_or_n
         sim.latency = lambda e, k, times=times: times.setdefault((e, k), timing.randrange(40 * MS))
         sim.ready_after, sim.reset_after = timing.randrange(9 * MS), timing.randrange(9 * MS)
     other = plan | {"frames_in_flight": timing.randint(1, 5), "realtime": timing.random() < 0.5}
-    limits = Limits(rejoin=20 * SECOND)
-    slow = Simulation(services, limits=limits, journal_after=timing.randrange(20 * MS), **other)
+    timeouts = Timeouts(rejoin=20 * SECOND)
+    slow = Simulation(services, timeouts=timeouts, journal_after=timing.randrange(20 * MS), **other)
     for sim in services:
         slow.join(sim.name, at=timing.randrange(20 * MS))
 

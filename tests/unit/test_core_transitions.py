@@ -11,7 +11,7 @@ from core_harness import MS, SECOND, Simulation, agent, loop, sensors, world
 
 from caviar_broker.core import decisions, run, transitions
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import Limits
+from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import (
     DECIDED,
     OUTSTANDING,
@@ -86,7 +86,7 @@ def at(frame: int, takes: int) -> Callable[[int, int], int]:
 
 def rejoining_between_episodes() -> Simulation:
     services = loop(link={"latency": 50 * MS}, world={"reset_after": 400 * MS})
-    simulation = Simulation(services, episodes=2, frames=2, limits=Limits(rejoin=SECOND)).join()
+    simulation = Simulation(services, episodes=2, frames=2, timeouts=Timeouts(rejoin=SECOND)).join()
     simulation.run(lambda s: any(g.frame == 1 for g in s.grants("link")))
     simulation.kill("world")
     simulation.hello("world")
@@ -96,7 +96,7 @@ def rejoining_between_episodes() -> Simulation:
 def restored(*, until: int, **how: Any) -> Simulation:
     """A link that dies with a state to get back, and something happens so much later."""
     services = loop(link={"stateful": True, "latency": 5 * MS, "saving": 20 * MS} | how)
-    plan = {"frames": 6, "checkpoint_frames": 2, "limits": Limits(rejoin=SECOND)}
+    plan = {"frames": 6, "checkpoint_frames": 2, "timeouts": Timeouts(rejoin=SECOND)}
     simulation = Simulation(services, **plan).join()
     simulation.run(lambda s: any(g.frame == 3 for g in s.grants("link")))
     simulation.kill("link")
@@ -120,7 +120,7 @@ def leaving_while_restored() -> Simulation:
 def an_episode_that_ends_while_somebody_is_restored() -> Simulation:
     """No service needs the world any more, which dies with nothing outstanding."""
     services = loop(world={"stateful": True, "saving": 400 * MS}, link={"latency": 50 * MS})
-    plan = {"frames": 4, "episodes": 2, "checkpoint_frames": 3, "limits": Limits(rejoin=5 * SECOND)}
+    plan = {"frames": 4, "episodes": 2, "checkpoint_frames": 3, "timeouts": Timeouts(rejoin=5 * SECOND)}
     simulation = Simulation(services, **plan).join()
     simulation.run(lambda s: any(g.frame == 3 for g in s.grants("link")))
     simulation.kill("world")

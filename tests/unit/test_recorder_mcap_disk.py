@@ -45,6 +45,7 @@ def fill(made: McapRecorder, first: int = 0) -> tuple[int, str]:
 @pytest.mark.parametrize("settings", [{}, {"segment_frames": 10}], ids=str)
 def test_a_full_disk_is_named_with_its_remedy_and_what_was_written_is_read(small_disk, capfd, settings):
     made = recorder(small_disk / "run", **settings)
+    (small_disk / "run" / "run.json").touch()  # of a run that can be resumed
     number, text = fill(made)
     assert "the recorder cannot write" in text
     assert str(small_disk / "run") in text
@@ -170,3 +171,9 @@ def test_with_none_nothing_is_synced(tmp_path, monkeypatch):
     made.close()
     assert syncs.sizes == []
     assert Recording(tmp_path).complete
+
+
+def test_what_cannot_be_resumed_is_not_said_to_be(tmp_path):
+    """An embedded run has no run.json."""
+    text = str(failure(tmp_path / "recording-0000.mcap", OSError(errno.ENOSPC, "No space left on device")))
+    assert "free space on its file system, or choose another directory with --out" in text

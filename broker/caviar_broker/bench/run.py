@@ -15,7 +15,7 @@ import numpy as np
 
 from caviar_broker.bench.client import Part, Topology, deliveries, parts
 from caviar_broker.core import events as ev
-from caviar_broker.core.plan import SECOND, Limits, RunPlan, ServicePlan
+from caviar_broker.core.plan import SECOND, RunPlan, ServicePlan, Timeouts
 from caviar_broker.journal import JournalFile
 from caviar_broker.launch import tune_garbage_collector
 from caviar_broker.security.access import Access
@@ -102,7 +102,7 @@ def measure(
         frames=frames + WARM_UP,
         sampling_period_ns=SECOND,
         record=("lidar",),
-        limits=Limits(connect=CONNECT_NS),
+        timeouts=Timeouts(connect=CONNECT_NS),
     )
     with (
         TemporaryDirectory() as folder,

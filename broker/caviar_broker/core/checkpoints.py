@@ -246,11 +246,7 @@ class Checkpoints:
             return
         # Under hold and drop the frame did without the answer once, and its decision stands whatever comes
         # now.
-        if (
-            isinstance(answer, Fault)
-            and pending.digests is not None
-            and peer.plan.policy in ("wait", "abort")
-        ):
+        if isinstance(answer, Fault) and pending.digests is not None and peer.plan.is_indispensable:
             text = f"failed in frame {answer.frame}, {answer.phase}: {answer.message}"
             run.fail(f"{peer} was restored and {text}", peer.name, now)
             return

@@ -233,7 +233,7 @@ class FrameClock:
         if dispatcher is not None:
             dispatcher.validate()
             away = [p for p in peers if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
-            absent = [p.name for p in away if not p.rejoin(self.plan.limits)]
+            absent = [p.name for p in away if not p.rejoin(self.plan.timeouts)]
             assert not absent, f"{absent} are not in the episode"
         if run.state is RunState.FINISHED:
             assert not any(p.present for p in peers), "finished while a service is here"

@@ -213,7 +213,7 @@ class Deadlines:
         """
         task, plan = participant.outstanding[0], participant.plan
         deadline = task.started_at + plan.budget_ns
-        if now > deadline and plan.policy != "wait" and task.state is _GRANTED and not task.overran:
+        if now > deadline and not plan.waits_for_answer and task.state is _GRANTED and not task.overran:
             self._expire(participant, task, deadline, now)
 
     def _expire(self, participant: Participant, task: Task, deadline: int, now: int) -> None:
@@ -221,10 +221,10 @@ class Deadlines:
         plan, granted = participant.plan, task.state is _GRANTED
         # Noted before the policy is asked: `measure` counts a miss under each of them.
         task.overran = granted
-        if plan.policy == "abort":
+        if plan.ends_run_when_late:
             self.aborted = self.aborted or task
             return
-        if plan.policy == "wait":
+        if plan.waits_for_answer:
             self.overruns.append((task, "the frame waits"))
             return
         # The cause travels with the held or absent product to consumers and into the recording (clause 9).
@@ -254,6 +254,6 @@ def _budget_end(participant: Participant) -> tuple[int, Task] | None:
     if task.state is _GRANTED:
         return None if task.overran else (task.started_at + plan.budget_ns, task)
     if task.state is _PENDING and task.eligible_at is not None:
-        waits = plan.policy == "wait" or (plan.policy == "abort" and participant.saving)
+        waits = plan.waits_for_answer or (plan.ends_run_when_late and participant.saving)
         return None if waits else (task.eligible_at + plan.budget_ns, task)
     return None

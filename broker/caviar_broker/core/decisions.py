@@ -226,7 +226,7 @@ class DecisionTable:
             participant.latest = self._with_sources(graph.latest[name])
         self._graph, self._plan, self._episode = graph, plan, episode
         self._digest, self._ledger, self._actions = digest, ledger, actions
-        self._holding = frozenset(p.name for p in plan.services if p.policy == "hold")
+        self._holding = frozenset(p.name for p in plan.services if p.holds_last_product)
         self._kept = self._holding | graph.retained | frozenset(sources)
         # A service that has not decided the first frame yet that is not finished.
         self._last = self.participants[graph.order[-1]]

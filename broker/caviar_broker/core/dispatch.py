@@ -240,7 +240,7 @@ class Dispatcher:
         participant.saving = False
         self.ready.add(participant)
         task = participant.tasks.get(participant.next_frame)
-        if task is not None and participant.plan.policy == "abort" and task.eligible_at is not None:
+        if task is not None and participant.plan.ends_run_when_late and task.eligible_at is not None:
             task.eligible_at = now  # it could not have been granted before
 
     # --- who is looked at next -----------------------------------------------------------------------
@@ -439,7 +439,7 @@ class Dispatcher:
         do without is not waited for.
         """
         last = self.episode + 1 >= self.plan.episodes
-        return not last or participant.plan.policy in ("wait", "abort")
+        return not last or participant.plan.is_indispensable
 
     # --- what can be asked ---------------------------------------------------------------------------
 
@@ -466,7 +466,7 @@ class Dispatcher:
         owed = participant.outstanding
         if not owed:
             return None
-        waits = participant.plan.policy == "wait" and owed[0].state is _GRANTED
+        waits = participant.plan.waits_for_answer and owed[0].state is _GRANTED
         return owed[0] if waits or (self._all_decided and self._must_answer(participant)) else None
 
     def validate(self) -> None:

@@ -247,7 +247,7 @@ class Episodes:
             run.fail(text, wrong.name, now)
             return
         needed = task.state is not TaskState.ABANDONED
-        if needed and peer.plan.policy in ("wait", "abort"):
+        if needed and peer.plan.is_indispensable:
             run.fail(f"{peer} failed in frame {message.frame}, {text}", peer.name, now)
         else:
             self._remember(peer, dispatcher, message)
@@ -359,6 +359,6 @@ class Episodes:
 
 def _capacity(peer: Peer) -> int:
     """Grants that a service may have outstanding: one, or under wait as planned and as it says it can."""
-    if peer.plan.policy != "wait" or peer.hello is None:
+    if not peer.plan.waits_for_answer or peer.hello is None:
         return 1
     return min(peer.plan.max_in_flight, peer.hello.max_in_flight)

@@ -65,7 +65,7 @@ class Liveness:
         if not self._may_return(peer):
             run.fail(text, peer.name, now)
             return
-        limit = peer.rejoin(run.plan.limits) / 1e9
+        limit = peer.rejoin(run.plan.timeouts) / 1e9
         text = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
         run.notice("away", peer.name, text, owed[0].frame if owed else -1)
         if dispatcher:
@@ -75,7 +75,7 @@ class Liveness:
         """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
         broker before, or is started by hand and can be again; and it got somewhere."""
         was_ready = peer.ready is not None or peer.plan.remote or self._run.plan.epoch > 1
-        return peer.rejoin(self._run.plan.limits) > 0 and was_ready and peer.losses < MAX_LOSSES
+        return peer.rejoin(self._run.plan.timeouts) > 0 and was_ready and peer.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
 
@@ -85,10 +85,10 @@ class Liveness:
         if run.state is RunState.FINISHED:
             return None
         if run.state is RunState.STOPPING:
-            return run.since + run.plan.limits.shutdown
+            return run.since + run.plan.timeouts.shutdown
         # A disk that takes nothing stalls the run as a service does.
         waiting = run.ledger.waiting_since
-        earliest = None if waiting is None else waiting + run.plan.limits.stall
+        earliest = None if waiting is None else waiting + run.plan.timeouts.stall
         for peer in run.peers.values():
             due = self._due(peer)
             if due is not None and (earliest is None or due < earliest):
@@ -99,7 +99,7 @@ class Liveness:
         """Act on silence that has been too long: the run ends with blame."""
         run = self._run
         if run.state is RunState.STOPPING:
-            if run.since + run.plan.limits.shutdown <= now:
+            if run.since + run.plan.timeouts.shutdown <= now:
                 self._give_up_waiting(now)
             return
         if run.over:
@@ -109,40 +109,38 @@ class Liveness:
         if silent:
             _, culprit = min(silent, key=lambda pair: pair[0])
             run.fail(self._blame(culprit, now), culprit.name, now)
-        elif (since := run.ledger.waiting_since) is not None and since + run.plan.limits.stall <= now:
-            waited = run.plan.limits.stall / 1e9
+        elif (since := run.ledger.waiting_since) is not None and since + run.plan.timeouts.stall <= now:
+            waited = run.plan.timeouts.stall / 1e9
             run.fail(f"the journal was not written for {waited:g} s; the disk may be full or gone", "", now)
 
     def _due(self, peer: Peer) -> int | None:
         """When a service has to have shown life or progress [ns]."""
-        limits = self._run.plan.limits
+        timeouts = self._run.plan.timeouts
         if not self._run.takes_part(peer):
             return None
         match peer.state:
             case ServiceState.EXPECTED:
-                return self._run.since + limits.connect
+                return self._run.since + timeouts.connect
             case ServiceState.PREPARING:
-                return peer.silent_until(peer.since, limits.ready)
+                return peer.silent_until(peer.since, timeouts.ready)
             case ServiceState.RESETTING | ServiceState.RESTORING:
-                return peer.silent_until(peer.since, limits.reset)
+                return peer.silent_until(peer.since, timeouts.reset)
             case ServiceState.LOST:
-                return peer.since + peer.rejoin(limits)
+                return peer.since + peer.rejoin(timeouts)
             case ServiceState.ACTIVE:
                 dispatcher = self._episodes.dispatcher
                 task = dispatcher.awaited(peer.name) if dispatcher else None
                 since = task.started_at if task else self._saving_since(peer)
-                return None if since is None else peer.silent_until(since, limits.stall)
+                return None if since is None else peer.silent_until(since, timeouts.stall)
             case _:
                 return None  # it waits for others
 
     def _saving_since(self, peer: Peer) -> int | None:
         """Since when a service without which the run cannot go on saves its state [ns]."""
-        return (
-            self._episodes.checkpoints.saving_since(peer) if peer.plan.policy in ("wait", "abort") else None
-        )
+        return self._episodes.checkpoints.saving_since(peer) if peer.plan.is_indispensable else None
 
     def _blame(self, peer: Peer, now: int) -> str:
-        limits, dispatcher = self._run.plan.limits, self._episodes.dispatcher
+        timeouts, dispatcher = self._run.plan.timeouts, self._episodes.dispatcher
         task = dispatcher.awaited(peer.name) if dispatcher and peer.state is ServiceState.ACTIVE else None
         if dispatcher and task:
             waiting = dispatcher.table.describe_waiting(peer.name)
@@ -157,10 +155,10 @@ class Liveness:
                 names = ", ".join(str(p) for p in missing)
                 remote = [p.name for p in missing if p.plan.remote]
                 hint = f"; start {' and '.join(remote)} while the run waits" if remote else ""
-                waited = f"{limits.connect / 1e9:g} s (timeouts.connect_s)"
+                waited = f"{timeouts.connect / 1e9:g} s (timeouts.connect_s)"
                 return f"{names} did not connect within {waited}{hint}"
             case ServiceState.LOST:
-                waited = f"{peer.rejoin(limits) / 1e9:g} s (timeouts.rejoin_s)"
+                waited = f"{peer.rejoin(timeouts) / 1e9:g} s (timeouts.rejoin_s)"
                 return f"{peer} died and did not come back within {waited}: {peer.verdict}"
             case _:
                 key = "ready_s" if peer.state is ServiceState.PREPARING else "reset_s"

@@ -73,13 +73,39 @@ class ServicePlan:
     scenario: Mapping[str, Any] = field(default_factory=dict)
     """What WELCOME tells it about the scenario."""
     rejoin: int | None = None
-    """How long its return is waited for [ns]; None: as `Limits` says."""
+    """How long its return is waited for [ns]; None: as `Timeouts` says."""
     features: tuple[Feature, ...] = ()
     """Of its devices: what the service has to know of later minor versions than 1.0."""
 
+    # What a policy means, contract clause 9. At the deadline
+    #   wait   the frame waits for the answer;
+    #   abort  the run ends;
+    #   hold   consumers get the newest earlier product, held; without one it is absent;
+    #   drop   the product is absent.
+
+    @property
+    def waits_for_answer(self) -> bool:
+        """Whether frames wait for it after its deadline."""
+        return self.policy == "wait"
+
+    @property
+    def ends_run_when_late(self) -> bool:
+        """Whether the run ends at its deadline."""
+        return self.policy == "abort"
+
+    @property
+    def is_indispensable(self) -> bool:
+        """Whether no frame goes on without its answer."""
+        return self.waits_for_answer or self.ends_run_when_late
+
+    @property
+    def holds_last_product(self) -> bool:
+        """Whether its newest product is held for frames that it misses."""
+        return self.policy == "hold"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class Timeouts:
     """How long the core waits for what [ns]; see `caviar_protocol.scenario.schema.Timeouts`."""
 
     connect: int = 30 * SECOND
@@ -112,7 +138,7 @@ class RunPlan:
     record: tuple[str, ...] = ()
     """``topic`` or ``topic.part`` that is produced because it shall be recorded (clause 5)."""
     frames_in_flight: int = 4
-    limits: Limits = Limits()
+    timeouts: Timeouts = Timeouts()
     epoch: int = 1
     ephemeral: bool = False
     """Whether nothing is kept of the run: no journal, digest or latencies. An embedded run without files."""
@@ -182,7 +208,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
         source=scenario.source,
         frames_in_flight=scenario.run.frames_in_flight,
         checkpoint_frames=scenario.run.checkpoint_frames,
-        limits=Limits(
+        timeouts=Timeouts(
             connect=round(t.connect_s * SECOND),
             ready=round(t.ready_s * SECOND),
             reset=round(t.reset_s * SECOND),

@@ -64,8 +64,8 @@ class Registration:
                 epoch=run.plan.epoch,
                 attempt=peer.attempt,
                 capabilities=tuple(c for c in hello.capabilities if c in CAPABILITIES),
-                heartbeat_ns=run.plan.limits.heartbeat,
-                liveness_ns=run.plan.limits.liveness,
+                heartbeat_ns=run.plan.timeouts.heartbeat,
+                liveness_ns=run.plan.timeouts.liveness,
                 seed=run.plan.seed,
                 settings=dict(peer.plan.settings),
                 scenario=dict(peer.plan.scenario),
@@ -85,7 +85,7 @@ class Registration:
         A connection within one machine is lost with the broker alone. What started the broker starts the
         local services again too, and one that tried to come back would take the place of its successor.
         """
-        return peer.rejoin(self._run.plan.limits) if peer.plan.remote or not local else 0
+        return peer.rejoin(self._run.plan.timeouts) if peer.plan.remote or not local else 0
 
     def _refusal(self, hello: Hello) -> Refuse | None:
         peer = self._run.peers.get(hello.name)

@@ -10,7 +10,7 @@ from caviar_broker.core.deadlines import PauseGate
 from caviar_broker.core.decisions import Ledger, Task
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.plan import Limits, RunPlan, ServicePlan, duration
+from caviar_broker.core.plan import RunPlan, ServicePlan, Timeouts, duration
 from caviar_broker.core.transitions import (
     PRESENT,
     RUN,
@@ -108,9 +108,9 @@ class Peer:
         """
         return max(since, self.advanced_at) + max(limit, self.grace_ns)
 
-    def rejoin(self, limits: Limits) -> int:
+    def rejoin(self, timeouts: Timeouts) -> int:
         """How long its return is waited for once it is lost [ns]; 0: not at all."""
-        return limits.rejoin if self.plan.rejoin is None else self.plan.rejoin
+        return timeouts.rejoin if self.plan.rejoin is None else self.plan.rejoin
 
     @property
     def doing(self) -> str:
@@ -293,7 +293,7 @@ class Run:
         # Also those that are not ready yet: they have joined, and wait for a word.
         for peer in self.peers.values():
             if peer.present:
-                self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.limits.shutdown))
+                self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.timeouts.shutdown))
 
     def finish_if_alone(self, now: int) -> None:
         """Finish the run once every service has left."""

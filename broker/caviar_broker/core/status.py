@@ -152,7 +152,7 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
     if run.state is RunState.STOPPING:
         if not peer.present:
             return None
-        limit = run.plan.limits.shutdown
+        limit = run.plan.timeouts.shutdown
         text = f"{peer} has not said BYE for {duration(now - run.since)}; {peer.last_words(now)}"
         return _of(peer, -1, now - run.since, limit, "", text, now)
     # What an early end cut is not waited for, though its answer is due.
@@ -161,12 +161,12 @@ def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
     lacking = dispatcher.table.describe_waiting(peer.name) if dispatcher is not None else ""
     # Before what it owes: a service that is lost owes its grants too, and its return comes first.
     if peer.state in _UNDER_WAY:
-        limits = run.plan.limits
+        timeouts = run.plan.timeouts
         limit = {
-            ServiceState.EXPECTED: limits.connect,
-            ServiceState.PREPARING: limits.ready,
-            ServiceState.RESETTING: limits.reset,
-            ServiceState.LOST: peer.rejoin(limits),
+            ServiceState.EXPECTED: timeouts.connect,
+            ServiceState.PREPARING: timeouts.ready,
+            ServiceState.RESETTING: timeouts.reset,
+            ServiceState.LOST: peer.rejoin(timeouts),
         }[peer.state]
         text = f"{peer} {_UNDER_WAY[peer.state]}, for {duration(now - peer.since)} now, "
         text += f"at most {duration(limit)}; {peer.last_words(now)}"

@@ -339,15 +339,15 @@ def radio_map(
         list[str] | None,
         typer.Option(help="gain, rss, sinr or best-server; by default gain; may be repeated"),
     ] = None,
-    height: Annotated[float, typer.Option(help="of the cells above the ground [m]")] = 1.5,
-    cell: Annotated[float, typer.Option(help="side of a cell [m]")] = 5.0,
+    height: Annotated[float, typer.Option(help="of the cells above the ground, in m")] = 1.5,
+    cell: Annotated[float, typer.Option(help="side of a cell, in m")] = 5.0,
     surface: Annotated[
         str,
         typer.Option(help="plane, ground, or a piece of scenery by its name, over which the cells follow"),
     ] = "plane",
     area: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(help="lowest x and y, highest x and y [m]; by default all of the scenery"),
+        typer.Option(help="lowest x and y, highest x and y, in m; by default all of the scenery"),
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="instant of the first episode that is mapped")] = 0,
     carrier: Annotated[str | None, typer.Option(help="by its name; by default the first")] = None,

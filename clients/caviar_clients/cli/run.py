@@ -216,6 +216,8 @@ def run_scenario(
         refuse_remote(scenario)
     if http and embedded:
         raise SetupError("an embedded run has no broker process that HTTP could ask; leave out --http")
+    if embedded and (bind or keys is not None):
+        raise SetupError("an embedded run has no sockets: leave out --bind and --keys, or --embedded")
     if http:
         from caviar_broker.http.auth import http_address
 

@@ -204,7 +204,13 @@ class EmbeddedRun:
         parts = [part for payload in payloads for part in payload] if self._encodes else payloads
         # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
-        session.handle(order.message, parts)
+        try:
+            session.handle(order.message, parts)
+        except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
+            phase, episode, frame = "start", 0, -1
+            if isinstance(order.message, m.Grant):
+                phase, episode, frame = "step", order.message.episode, order.message.frame
+            session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
         if self._journal is not None and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
 

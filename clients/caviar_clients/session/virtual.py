@@ -179,7 +179,7 @@ def virtual_plan(scenario: Scenario, services: Collection[str], lengths: Mapping
         episodes=max(1, min(len(lengths), LONGEST // frames)),
         realtime=False,
         # [ns] Eleven days: a service that is slow in virtual time is slow, and not lost.
-        limits=replace(plan.limits, stall=10**15, reset=10**15, ready=10**15),
+        timeouts=replace(plan.timeouts, stall=10**15, reset=10**15, ready=10**15),
     )
 
 

@@ -22,7 +22,7 @@ import msgspec
 
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import AssetError, RunError
-from caviar_protocol.files import sync_file
+from caviar_protocol.files import RunDirectory, sync_file
 from caviar_protocol.messages import Asset, GrantInput, Input, Role, Status
 from caviar_services.service import Service
 
@@ -153,10 +153,8 @@ class StoredProducts:
 
 # Whatever else the system says, another directory may help.
 _REMEDIES = {
-    errno.ENOSPC: "free space on its file system, then resume with caviar run --resume {folder}, "
-    "or choose another directory with --out",
-    errno.EDQUOT: "free space within your quota, then resume with caviar run --resume {folder}, "
-    "or choose another directory with --out",
+    errno.ENOSPC: "free space on its file system{resume}, or choose another directory with --out",
+    errno.EDQUOT: "free space within your quota{resume}, or choose another directory with --out",
     errno.EFBIG: "raise the limit of file sizes (ulimit -f), or set segment_mib of the recorder below it",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
     errno.ENFILE: "the machine has too many open files: end programs, or raise fs.file-max",
@@ -182,9 +180,12 @@ def failure(path: Path, error: OSError) -> RunError:
 read: choose another directory with --out
     """
     remedy = _REMEDIES.get(error.errno or 0, "choose another directory with --out")
+    # A run in one process has no run.json, and cannot be resumed.
+    resumable = RunDirectory(path.parent).record.exists()
+    resume = f", then resume with caviar run --resume {path.parent}" if resumable else ""
     return RunError(
         f"the recorder cannot write {path}: {error.strerror or error} (errno {error.errno}); "
-        f"{remedy.format(folder=path.parent)}"
+        f"{remedy.format(folder=path.parent, resume=resume)}"
     )
 
 
