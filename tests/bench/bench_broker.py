@@ -1,7 +1,7 @@
 """What a frame costs in the broker, beside a bare loop that forwards the same bytes, HELICS and mosaik.
 
     python tests/bench/bench_broker.py [--services 2 4 8 32] [--payload 100] [--frames 2000] [--curve]
-                                       [--transport tcp ipc] [--json FILE]
+                                       [--transport tcp ipc] [--json FILE] [--markdown FILE]
 
 One hub and N - 1 others, each a process of its own. In every frame the hub takes what each of the others
 made in it, and each of them takes what the hub made in the frame before. The kinds of loop take turns, round
@@ -231,6 +231,7 @@ def main() -> None:
     parser.add_argument("--curve", action="store_true", help="encrypted; without helics and mosaik")
     parser.add_argument("--transport", nargs="+", choices=["tcp", "ipc"], default=["tcp"], help="one or both")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path, help="write a table of bare loop and broker there")
     options = parser.parse_args()
     kinds = ["bare", *(kind for kind in options.kinds if kind != "bare")]
     for kind in [k for k in kinds if k in PLAIN and importlib.util.find_spec(PLAIN[k]) is None]:
@@ -248,6 +249,24 @@ def main() -> None:
                 lines += report(services, payload, rows, wire)
     if options.json:
         options.json.write_text(json.dumps(lines, indent=2) + "\n")
+    if options.markdown:
+        options.markdown.write_text(markdown(lines))
+
+
+def markdown(lines: list[dict[str, Any]]) -> str:
+    """A table of the bare loop and the broker for the documentation, from what ``--json`` has."""
+    found = {(line["wire"], line["services"], line["payload"], line["kind"]): line for line in lines}
+    rows = ["| transport | N | payload | bare loop | broker | to bare | of all rounds |"]
+    rows.append("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
+    for (wire, services, payload, kind), line in found.items():
+        if kind != "broker":
+            continue
+        bare = found[wire, services, payload, "bare"]["us_per_frame"]
+        least, most = line["time_to_bare_range"]
+        cells = [wire, f"{services}", f"{payload} B", f"{bare:.0f} µs", f"{line['us_per_frame']:.0f} µs"]
+        cells += [f"{line['time_to_bare']:.2f}", f"{least:.2f} to {most:.2f}"]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows) + "\n"
 
 
 if __name__ == "__main__":
