@@ -138,7 +138,8 @@ def static_munich(frames: int) -> Case:
 
 
 def _emptied(case: Case) -> Case:
-    nothing = {"bodies": 0} if "bodies" in case.settings else {"pool": {}}
+    nothing: dict[str, Any] = {"bodies": 0} if "bodies" in case.settings else {"pool": {}}
+    nothing["outside_itu_range"] = "nearest"  # brick, at 60 GHz
     return replace(case, settings=case.settings | nothing, scenes=tuple(map(_without_bodies, case.scenes)))
 
 
