@@ -16,9 +16,10 @@ from recording_builders import channel, frame, frame_of, lidar, link, product, r
 from caviar_clients.cli import main as command
 from caviar_clients.cli.video import film_run
 from caviar_clients.plots import film
-from caviar_clients.plots.rays import rays, unit_vectors
+from caviar_clients.plots.rays import rays
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.recording import Recording
+from caviar_protocol.space.coordinates import unit_vectors
 from caviar_protocol.topics import Camera, CameraImage, Intrinsics
 
 pytestmark = pytest.mark.slow

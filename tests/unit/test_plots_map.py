@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recording_builders import channel, lidar, link, scene
 
-from caviar_clients.cli.plot import beam_gain
+from caviar_clients.cli.plot import beam_amplitude
 from caviar_clients.plots.labels import Labels, common_prefix
 from caviar_clients.plots.map import (
     RECEIVER,
@@ -45,7 +45,7 @@ def a_map(**changes) -> MapData:
         "channel": channel(2),
         "link": link(2),
         "footprints": None,
-        "beam_gain": beam_gain,
+        "beam_gain": beam_amplitude,
         "user": USER,
         "title": "sample",
     }
@@ -100,7 +100,7 @@ def test_the_gain_of_a_beam_is_greatest_where_the_beam_points(pattern, rows, col
     level = math.hypot(pointing[0], pointing[1])
     azimuth = np.linspace(-np.pi / 2, np.pi / 2, 1801)
     around = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.full(1801, pointing[2])], axis=-1)
-    gain = beam_gain(array, beam, around)
+    gain = beam_amplitude(array, beam, around)
     found = azimuth[np.argmax(gain)]
     # The element pattern pulls the greatest gain a little towards boresight.
     assert found == pytest.approx(

@@ -108,8 +108,10 @@ def plot_run(
     return files
 
 
-def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
+def beam_amplitude(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
     """Work out the amplitude of a codebook beam: ``|c_k* a(k̂)| / sqrt(N)`` times that of the element pattern.
+
+    `caviar_protocol.space.beams.beam_gain` is the array factor alone.
 
     A pattern that comes from a file is left out.
 
@@ -155,7 +157,7 @@ def map_data(
         channel=next(iter(frame.payloads("channel", Channel).values()), None),
         link=next(iter(frame.payloads("link", Link).values()), None),
         footprints=footprints,
-        beam_gain=beam_gain,
+        beam_gain=beam_amplitude,
         user=user,
         title=f"{recording.metadata.name}: {moment(frame)}",
     )

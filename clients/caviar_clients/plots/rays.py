@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Channel, Scene
@@ -99,18 +99,6 @@ def scale(gains: Float64Array) -> tuple[float, float]:
     # A little below the weakest: equal limits, as those of a single path, are no scale.
     top = float(gains.max())
     return max(float(gains.min()), top - RANGE_DB) - 1e-9, top
-
-
-def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Convert (zenith, azimuth) [rad] to unit vectors, Shape ``[N, 2]`` to ``[N, 3]``.
-
-    Example:
-        >>> unit_vectors(np.array([[np.pi / 2, 0.0]])).round(3).tolist()
-        [[1.0, 0.0, 0.0]]
-    """
-    zenith, azimuth = angles[:, 0], angles[:, 1]
-    sine = np.sin(zenith)
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def _straight(

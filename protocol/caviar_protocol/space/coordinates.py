@@ -222,3 +222,21 @@ def angles(vectors: Float64Array) -> Float64Array:
     found[..., 0] = np.arctan2(np.hypot(vectors[..., 0], vectors[..., 1]), vectors[..., 2])
     found[..., 1] = np.arctan2(vectors[..., 1], vectors[..., 0])
     return found
+
+
+def unit_vectors(angles: Float64Array) -> Float64Array:
+    """Unit vectors of directions, the inverse of `angles`.
+
+    Args:
+        angles: (zenith from +z, azimuth from +x) [rad], Shape ``[..., 2]``.
+
+    Returns:
+        Shape ``[..., 3]``.
+
+    Example:
+        >>> unit_vectors(np.array([np.pi / 2, np.pi / 2])).round(9).tolist()  # north
+        [0.0, 1.0, 0.0]
+    """
+    zenith, azimuth = angles[..., 0], angles[..., 1]
+    sine = np.sin(zenith)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)

@@ -147,7 +147,7 @@ class SphericalWaves:
 
     Coefficients of reflection, transmission, diffraction and scattering are those of the path between the
     arrays' centres, as in ``siso-rt``. Pattern and polarisation are each element's own, to first order in the
-    size of the arrays (`element_gains`). Subarrays, of one panel and one polarisation, are looked at one by
+    size of the arrays. Subarrays, of one panel and one polarisation, are looked at one by
     one.
 
     Args:

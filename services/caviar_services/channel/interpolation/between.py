@@ -24,7 +24,7 @@ from caviar_protocol.arrays import (
     UInt64Array,
 )
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles, unit_vectors
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.antenna_arrays import element_positions, steering_vector
@@ -432,15 +432,3 @@ def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
         gain=a * tau / carrier_phase(channels[0].carriers, tau),
         points=np.concatenate([table.points for table in tables])[rows],
     )
-
-
-def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Unit vectors of directions (zenith, azimuth) [rad], Shape ``[K, 2]`` to ``[K, 3]``.
-
-    Example:
-        >>> unit_vectors(np.array([[np.pi / 2, np.pi / 2]])).round(9).tolist()
-        [[0.0, 1.0, 0.0]]
-    """
-    zenith, azimuth = angles[:, 0], angles[:, 1]
-    sine = np.sin(zenith)
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith)], axis=-1)
