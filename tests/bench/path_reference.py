@@ -174,8 +174,8 @@ class OwnLaunches:
 
     def __init__(self, channel: SionnaChannel, launches: int) -> None:
         self._channel, self._launches = channel, launches
-        self._tracer: Any = channel._tracer
-        self._launcher = self._tracer._launcher
+        self._tracer = channel._finder.tracer
+        self._launcher: Any = self._tracer._launcher
         self._each = self._launcher.each
 
     def __call__(self, step: Any, scene: Scene) -> list[list[Path]]:
