@@ -40,6 +40,7 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/mypy tests/bench
 	@$(BIN)/lint-imports
 
 check: lint ## In a minute and a half: lint, and the unit tests that are quick

@@ -73,7 +73,7 @@ def bare_loop(services: int, payload: int, frames: int, wire: str, folder: Path)
     command = [sys.executable, __file__, "--echo", str(payload), socket.getsockopt_string(zmq.LAST_ENDPOINT)]
     started = [subprocess.Popen([*command, str(number), public_key]) for number in range(services)]
     try:
-        routes = {}
+        routes: dict[int, bytes] = {}
         while len(routes) < services:
             route, name = socket.recv_multipart()
             routes[int(name)] = route
@@ -183,23 +183,24 @@ def report(services: int, payload: int, rows: dict[str, list[float]], wire: str)
     delivered = deliveries("hub", services) * payload
     for kind, seconds in rows.items():
         to_bare = [mine / bare for mine, bare in zip(seconds, rows["bare"], strict=True)]
+        low, high = min(to_bare), max(to_bare)
+        ratio, took = statistics.median(to_bare), statistics.median(seconds)
         line = {
             "services": services,
             "payload": payload,
             "kind": kind,
             "wire": wire,
             "curve": wire == "curve",
-            "us_per_frame": statistics.median(seconds) * 1e6,
-            "bytes_per_second": delivered / statistics.median(seconds),
-            "time_to_bare": statistics.median(to_bare),
-            "time_to_bare_range": [min(to_bare), max(to_bare)],
+            "us_per_frame": took * 1e6,
+            "bytes_per_second": delivered / took,
+            "time_to_bare": ratio,
+            "time_to_bare_range": [low, high],
         }
         lines.append(line)
-        low, high = line["time_to_bare_range"]
         print(
-            f"N = {services:3} {payload:8} B {wire:5} {kind:13}{line['us_per_frame']:9.0f} µs "
-            f"a frame {line['time_to_bare']:7.2f} × bare ({low:.2f} to {high:.2f}) "
-            f"{line['bytes_per_second'] / 1e6:9.3g} MB/s",
+            f"N = {services:3} {payload:8} B {wire:5} {kind:13}{took * 1e6:9.0f} µs "
+            f"a frame {ratio:7.2f} × bare ({low:.2f} to {high:.2f}) "
+            f"{delivered / took / 1e6:9.3g} MB/s",
             flush=True,
         )
     return lines

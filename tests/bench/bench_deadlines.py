@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import zmq
@@ -58,7 +59,7 @@ def client(name: str, delay_s: float, endpoint: str) -> None:
         socket.send(
             encode_message(m.Hello(version=version, name=name, role=role, inputs=inputs, outputs=(topic,)))
         )
-        who: dict[str, int] = {}
+        who: dict[str, Any] = {}
         while True:
             message = decode_message(socket.recv_multipart()[0])
             match message:
@@ -70,7 +71,7 @@ def client(name: str, delay_s: float, endpoint: str) -> None:
                     socket.send(encode_message(m.ResetDone(episode=message.episode, **who)))
                 case m.Grant():
                     time.sleep(delay_s)
-                    at = {"episode": message.episode, "frame": message.frame}
+                    at: dict[str, Any] = {"episode": message.episode, "frame": message.frame}
                     socket.send_multipart(
                         [encode_message(m.Done(products=products, **at, **who)), header, body]
                     )
@@ -118,7 +119,7 @@ def measure(frames: int, budget_ms: float) -> np.ndarray:
                 process.wait()
         server.statistics.save(Path(folder) / "latency.npz")
         with np.load(Path(folder) / "latency.npz") as saved:
-            lateness = saved["decision_lateness_ns"] / MS
+            lateness: np.ndarray = saved["decision_lateness_ns"] / MS
     if outcome.error:
         raise SystemExit(outcome.error)
     return lateness

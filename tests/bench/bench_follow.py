@@ -133,7 +133,8 @@ def errors(found: Channel, reference: Channel) -> list[tuple[float, float]]:
 
 def nmse_db(parts: list[tuple[float, float]]) -> float:
     """NMSE = E‖H − H_ref‖² / E‖H_ref‖² over frames and receivers, each of which counts the same."""
-    return float(10 * np.log10(max(np.mean([error / power for error, power in parts]), 1e-30)))
+    mean = float(np.mean([error / power for error, power in parts]))
+    return float(10 * np.log10(max(mean, 1e-30)))
 
 
 def main() -> None:

@@ -97,8 +97,15 @@ class World:
     scenes: tuple[Scene, ...]
 
 
-def world(first: int, frames: int, receivers: int) -> World:
-    """Scenes of the scenario, from a frame on, with more vehicles that carry receivers."""
+def world(first: int, frames: int, receivers: int, seed: int | None = None) -> World:
+    """Scenes of the scenario, from a frame on, with more vehicles that carry receivers.
+
+    Args:
+        first: Number of the first frame.
+        frames: Number of scenes.
+        receivers: Number of vehicles that carry a receiver.
+        seed: Of the run; the scenario's, if ``None``.
+    """
     scenario = load_scenario(SCENARIO)
     settings = scenario.services["channel"].settings
     alone = {
@@ -114,6 +121,8 @@ def world(first: int, frames: int, receivers: int) -> World:
         if device.kind == "antenna"
     )
     shorter = msgspec.structs.replace(scenario.run, frames=first + frames, record=("channel",))
+    if seed is not None:
+        shorter = msgspec.structs.replace(shorter, seed=seed)
     _play(msgspec.structs.replace(scenario, run=shorter, services=alone, devices=devices))
     run, preparation, *scenes = Onlooker.seen
     preparation = Preparation(demand={"channel": frozenset({"h"})}, assets=preparation.assets)
@@ -182,10 +191,10 @@ def agreement(at: World, rungs: dict[str, Rung], frames: int, transmit: int, rec
     original = reference.model._matrices
 
     def kept(*arguments: Any) -> Any:
-        tracers.append(original(*arguments))
+        tracers.append(original(*arguments))  # type: ignore[arg-type]
         return tracers[-1]
 
-    reference.model._matrices = kept  # type: ignore[method-assign]
+    reference.model._matrices = kept  # type: ignore[method-assign, assignment]
     errors: dict[str, list[Any]] = {"siso-rt": [], "spherical": []}
     times: dict[str, list[float]] = {name: [] for name in rungs}
     every: list[Any] = []

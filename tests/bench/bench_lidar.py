@@ -77,6 +77,7 @@ def bare(service: LidarSensors, repeats: int) -> float:
         dr.eval(columns)
         ray = mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6]))
         ray.maxt = columns[6]
+        assert service.traced is not None
         parts = [part for part in (service.traced._scenery, service.traced._moving) if part]
         for _ in range(repeats):
             started = time.perf_counter()

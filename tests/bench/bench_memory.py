@@ -47,14 +47,16 @@ class Growth:
         frames = np.searchsorted(finished_ns, np.array(self.instants))
         span = np.floor((frames / total - (1 - TAIL)) / TAIL * SPANS)
         kilobytes = np.array(self.kilobytes)
-        points = [
-            (np.median(frames[span == s]), np.median(kilobytes[span == s]))
-            for s in range(SPANS)
-            if (span == s).any()
-        ]
+        points = np.array(
+            [
+                (np.median(frames[span == s]), np.median(kilobytes[span == s]))
+                for s in range(SPANS)
+                if (span == s).any()
+            ]
+        )
         if len(points) < SPANS // 2:
             raise SystemExit(f"{self.name}: too few samples; run more frames")
-        return float(np.polyfit(*zip(*points, strict=True), 1)[0])
+        return float(np.polyfit(points[:, 0], points[:, 1], 1)[0])
 
 
 @dataclass

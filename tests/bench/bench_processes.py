@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -73,7 +73,7 @@ def sampled(pid: int, folder: Path) -> Sample:
 
 def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float], float, float, int, str]:
     """By process, ms a frame; ms of the busiest thread; frames/s; frames that count; and the digest."""
-    command = [Path(sys.executable).with_name("caviar"), "run", scenario, "--frames", str(frames)]
+    command = [str(Path(sys.executable).with_name("caviar")), "run", scenario, "--frames", str(frames)]
     command += ["--out", str(folder), "--json", str(folder / "summary.json")]
     run = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     samples = []
@@ -87,7 +87,7 @@ def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float]
     last = next(s for s in samples if s.recorded >= whole * (frames - LAST) / frames)
     count = (last.recorded - first.recorded) / whole * frames
     by_thread = {key: (ns - first.used_ns[key]) / 1e6 / count for key, ns in last.used_ns.items()}
-    by_process: Counter[str] = Counter()
+    by_process: defaultdict[str, float] = defaultdict(float)
     for (name, _), ms in by_thread.items():
         by_process[name] += ms
     digest = json.loads((folder / "summary.json").read_text())["digest"]

@@ -63,17 +63,7 @@ Rows = NDArray[Any]
 
 def canyon(seed: int, frames: int) -> tuple[Scene, ...]:
     """Traffic of the scenario street-canyon with another seed."""
-    original = bench_ladder.load_scenario
-
-    def seeded(path: Path) -> Any:
-        scenario = original(path)
-        return msgspec.structs.replace(scenario, run=msgspec.structs.replace(scenario.run, seed=seed))
-
-    bench_ladder.load_scenario = seeded
-    try:
-        return bench_ladder.world(0, frames, 10).scenes
-    finally:
-        bench_ladder.load_scenario = original
+    return bench_ladder.world(0, frames, 10, seed=seed).scenes
 
 
 def munich_street(seed: int, frames: int) -> tuple[Scene, ...]:

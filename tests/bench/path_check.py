@@ -122,7 +122,10 @@ class PathCheck:
         corners = self._every[triangles]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         types = np.full((1, len(triangles)), Interaction.REFLECTION, np.uint8)
-        return image_points(start[None], end[None], types, corners[None, :, 0], normal[None])[0]
+        points: Float64Array = image_points(start[None], end[None], types, corners[None, :, 0], normal[None])[
+            0
+        ]
+        return points
 
     def _sides_at(self, point: Float64Array) -> list[tuple[Float64Array, Float64Array]]:
         """Direction of each side of a triangle that a point is on, and the triangle's normal."""
@@ -153,7 +156,7 @@ class PathCheck:
                 return normal, radius / 2
         return normal, 2 * NEAR
 
-    def _depth(self, point: Float64Array, triangles: Float64Array) -> Float64Array:
+    def _depth(self, point: Float64Array, triangles: Int64Array) -> Float64Array:
         """How far inside of triangles a point of their planes is [m]; negative: outside."""
         towards = point - self._corners[triangles]
         depth: Float64Array = np.einsum("tec,tec->te", towards, self._inward[triangles]).min(1)

@@ -24,7 +24,7 @@ META: Any = {
 }
 
 
-class Peer(mosaik_api_v3.Simulator):
+class Peer(mosaik_api_v3.Simulator):  # type: ignore[misc]
     """A simulator with one entity; the one with frames to measure is the hub."""
 
     def __init__(self) -> None:
