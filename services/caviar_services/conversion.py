@@ -224,7 +224,7 @@ def encoded_done(
     """
     started = time.monotonic_ns()
     headers, parts = [], list[Any]()
-    for topic, payload in _products(use, result):
+    for topic, payload in sorted_products(use, result):
         header, body = encoded(payload)
         fidelity = payload.fidelity if isinstance(payload, Encoded) else result.fidelity
         headers.append(m.ProductHeader(topic=topic, digest=payload_digest(header, body), fidelity=fidelity))
@@ -259,7 +259,7 @@ def plain_done(
     Raises:
         PayloadError: A product is not its topic's.
     """
-    products = _products(use, result)
+    products = sorted_products(use, result)
     # Keyword by keyword: `**identity` makes a dictionary in each frame, and this loop does little else.
     done = m.Done(
         epoch=identity["epoch"],
@@ -273,7 +273,16 @@ def plain_done(
     return done, tuple([decoded(payload) for _, payload in products])
 
 
-def _products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
+def sorted_products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
+    """Products of a frame by topic, each of its topic's class.
+
+    Args:
+        use: What the implementation is called, for the error.
+        result: What the service made of the frame.
+
+    Raises:
+        PayloadError: A product is not its topic's.
+    """
     # Sorted, so that DONE and what follows it are the same bytes whatever order a service makes them in.
     products = sorted(result.products.items()) if len(result.products) > 1 else [*result.products.items()]
     for topic, payload in products:

@@ -194,6 +194,14 @@ class FrameInput:
         self._payload, self._check = payload, None
         return payload
 
+    def under(self, provenance: GrantInput) -> FrameInput:
+        """The same product with another provenance, as a later frame gets it.
+
+        Args:
+            provenance: Its topic and source are those of this one.
+        """
+        return FrameInput(provenance, self.header, self.body, self._payload, self._check)
+
     def look(self) -> None:
         """Check the payload where that is due, for a service that does not use it.
 

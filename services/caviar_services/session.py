@@ -39,6 +39,7 @@ from caviar_services.conversion import (
     is_needed,
     plain_done,
     run_info,
+    sorted_products,
 )
 from caviar_services.service import (
     Frame,
@@ -360,6 +361,32 @@ class ServiceSession:
                 if self._tunes_memory and now >= self._trim_at:
                     trim_memory()
                     self._trim_at = now + TRIM_S
+
+    def compute(self, frame: Frame) -> StepResult | None:
+        """Have the service compute a frame that no GRANT granted: in one process, without a clock.
+
+        Args:
+            frame: Of the episode that the last RESET began.
+
+        Returns:
+            What the service made of it; None: it failed, and FAULT was sent.
+        """
+        phase = "step"
+        try:
+            result = self._running.step(frame)
+            phase = "encode"
+            sorted_products(self.use, result)  # each is of its topic's class
+            phase = "release"
+            if frame.number % TRIM_EVERY == TRIM_EVERY - 1:
+                self._running.release_memory()
+        except Exception as error:
+            self.report(error, phase, frame.episode, frame.number)
+            return None
+        return result
+
+    def answered(self) -> StepResult | None:
+        """The answer from outside to the frame that `compute` was given last; None: there is none."""
+        return None
 
     def _step(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Answer | None:
         """Have the service compute a frame; DONE with its products, or FAULT, as it was sent."""

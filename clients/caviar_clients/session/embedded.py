@@ -25,6 +25,7 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.recordings import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.session.base import Frame, Session, declared
+from caviar_clients.session.direct import DirectFrames, plays_directly
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
@@ -33,7 +34,7 @@ from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
-from caviar_services.conversion import Answer
+from caviar_services.conversion import Answer, sorted_products
 from caviar_services.registry import load
 from caviar_services.service import Service, StepResult
 from caviar_services.session import ServiceSession
@@ -47,6 +48,8 @@ class OutsideSession(ServiceSession):
     frame: Frame | None = None
     """The frame that is granted and not answered."""
     _granted: m.Grant | None = None
+    _direct: bool = False  # whether the frame came without a GRANT
+    _answer: StepResult | None = None
 
     def answer(self, result: StepResult) -> None:
         """Answer `frame`.
@@ -56,21 +59,45 @@ class OutsideSession(ServiceSession):
             PayloadError: A product is not its topic's.
         """
         grant, self._granted, self.frame = self._granted, None, None
+        if self._direct:
+            self._direct = False
+            sorted_products(self.use, result)
+            self._answer = result
+            return
         if grant is None:
             raise RunError(f"{self.name!r} was granted no frame that could be answered")
         self._send(*self._done(grant, result, 0))
+
+    def compute(self, frame: Frame) -> StepResult | None:
+        """Offer a frame to the program outside, which has to `answer` it."""
+        try:
+            _check_inputs(frame)
+        except Exception as error:
+            self.report(error, "step", frame.episode, frame.number)
+            return None
+        self.frame, self._direct, self._answer = frame, True, None
+        return None
+
+    def answered(self) -> StepResult | None:
+        """The answer to the frame that was offered last."""
+        return self._answer
 
     def _step(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Answer | None:
         # Without `_reporting`, as in a service that computes: its context costs 5 µs in each step.
         try:
             frame = self._frame(reset, grant, parts)
-            for item in frame.inputs:
-                if item.present:
-                    item.payload  # noqa: B018 - checked here, where a wrong one ends the run with blame
+            _check_inputs(frame)
             self._granted, self.frame = grant, frame
         except Exception as error:
             self.report(error, "step", grant.episode, grant.frame)
         return None
+
+
+def _check_inputs(frame: Frame) -> None:
+    """Check the products that a program outside gets, here where a wrong one ends the run with blame."""
+    for item in frame.inputs:
+        if item.present:
+            item.payload  # noqa: B018 - checked on first use
 
 
 class EmbeddedRun:
@@ -128,7 +155,7 @@ class EmbeddedRun:
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0
-        self._clock = FrameClock(plan, self._now)
+        self._plan, self._clock = plan, FrameClock(plan, self._now)
         self._journal = (
             JournalFile(RunDirectory(folder).journal, plan.epoch, run=plan.run) if directory else None
         )
@@ -141,7 +168,11 @@ class EmbeddedRun:
         self._events: deque[ev.Event] = deque()
         # Without a recorder nothing needs bytes: products go to their consumers as the objects that they are.
         self._encodes = directory is not None
-        check, seats = ContentCheck(), seats or {}
+        # Seats alone: a run that plays by itself is measured and watched frame by frame, by the clock.
+        self._without_clock = directory is None and bool(seats) and plays_directly(plan)
+        self._reset: m.Reset | None = None  # the last one
+        self._check = check = ContentCheck()
+        seats = seats or {}
 
         def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
             use, send = scenario.services[name].use, partial(self._take, name)
@@ -188,7 +219,11 @@ class EmbeddedRun:
                     reason, self._stop_reason = self._stop_reason, ""
                     self._feed(ev.StopRequested(reason))
                 elif self._orders:
-                    self._obey(self._orders.popleft())
+                    order = self._orders.popleft()
+                    if self._without_clock and type(order.message) is m.Grant:
+                        yield from self._play_directly()
+                    else:
+                        self._obey(order)
                 else:
                     self._skip_time()
                 yield
@@ -200,8 +235,14 @@ class EmbeddedRun:
 
     def _obey(self, order: ev.Send) -> None:
         session = self._sessions[order.service]
+        if type(order.message) is m.Refuse:
+            # Of declarations that contradict each other: the run ends with both names.
+            self._events.append(ev.ByeReceived(order.service))
+            return
         payloads = [product.payload for product in order.products]
         parts = [part for payload in payloads for part in payload] if self._encodes else payloads
+        if type(order.message) is m.Reset:
+            self._reset = order.message
         # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
         try:
@@ -213,6 +254,20 @@ class EmbeddedRun:
             session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
         if self._journal is not None and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+
+    def _play_directly(self) -> Generator[None, None, None]:
+        """Play on without the clock, which granted the first frame of the first episode."""
+        graph, reset = self._clock.graph, self._reset
+        if graph is None or reset is None:
+            raise RunError("a frame was granted before the first episode began")
+        sessions, tell = self._sessions, self._on_notice
+        direct = DirectFrames(self._plan, graph, sessions, self._check, reset, self._events, tell)
+        for _ in direct.play():
+            if self._stop_reason:
+                self.outcome = ev.Finished(self._stop_reason, "", "")
+                return
+            yield
+        self.outcome = direct.outcome
 
     def _take(self, name: str, message: m.Message, parts: Sequence[Any]) -> None:
         """Keep what a service sends as an event, for the clock to receive once the service has returned."""

@@ -113,7 +113,7 @@ def device_pose(scene: Scene, device: Device) -> Pose:
     # Channel, link and agent ask for the same poses: what was composed is kept with the scene.
     known: dict[str, tuple[Device, Pose]] = scene.__dict__.setdefault("_poses", {})
     entry = known.get(device.name)
-    if entry is not None and entry[0] is device:
+    if entry is not None and (entry[0] is device or entry[0] == device):
         return entry[1]
     pose = Pose(device.position, device.orientation)
     if device.parent:
@@ -228,7 +228,8 @@ def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[
     for pair in pairs:
         names = pair.tx.name, pair.rx.name
         entry = known.get(names)
-        if entry is None or entry[0].tx is not pair.tx or entry[0].rx is not pair.rx:
+        # By value: a link keeps its users from frame to frame, as long as the devices are equal.
+        if entry is None or entry[0].tx != pair.tx or entry[0].rx != pair.rx:
             entry = known[names] = (pair, *_straight_directions(scene, pair))
         at_tx.append(entry[1])
         at_rx.append(entry[2])
