@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from link_builders import antenna, frame_of, scene_of
 from msgspec.structs import replace
 
-from caviar_clients.envs.observations import Moment, Users, part
+from caviar_protocol.observations import Moment, Users, part
 from caviar_protocol.scenario import DeviceSpec, Scenario, load_scenario
 from caviar_protocol.topics import (
     Link,
@@ -59,7 +60,8 @@ def read(scenario: Scenario, name: str, scene: Scene, *inputs: FrameInput, link:
     found = part(scenario, users, name)
     value = found.read(moment_of(users, scene, *inputs, link=link))
     if value is not None:
-        assert found.space.contains(np.asarray(value)), f"{name} is {value!r}, not in {found.space}"
+        space = Box(*found.bounds)
+        assert space.contains(np.asarray(value)), f"{name} is {value!r}, not in {space}"
     return value
 
 

@@ -19,8 +19,8 @@ from observation_builders import (
 )
 
 from caviar_clients.envs.base import BeamSelectionEnv
-from caviar_clients.envs.observations import Users, part
 from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.observations import Users, part
 from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import (
@@ -59,7 +59,7 @@ def test_the_shape_of_the_grid_is_that_of_the_settings_and_of_the_grid_itself(
         DeviceSpec(name="top", kind="lidar"),
         sensors={"lidar": {"grid": grid}},
     )
-    space = part(scenario, Users(scenario, ("*",)), "lidar_grid").space
+    space = part(scenario, Users(scenario, ("*",)), "lidar_grid").bounds
     assert space.shape == shape
     assert space.dtype == np.int8
     settings = convert_settings(LidarSettings, {"grid": grid})

@@ -15,8 +15,8 @@ from observation_builders import (
     scenario_of,
 )
 
-from caviar_clients.envs.observations import Users, part
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.observations import Users, part
 from caviar_protocol.scenario import Scenario
 
 

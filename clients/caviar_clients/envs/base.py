@@ -16,18 +16,19 @@ from gymnasium import spaces
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from caviar_clients.envs.observations import Moment, Part, Users, part
 from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
 from caviar_clients.plots.style import GREY
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import agent_of, open_session
 from caviar_clients.session.plausibility import implausible_values
+from caviar_protocol import observations
 from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
+from caviar_protocol.observations import Observer, Users
 from caviar_protocol.space.beams import beam_gain
 from caviar_protocol.space.scene import Pair, device_pose
 from caviar_protocol.topics import Action, BeamChoice, Link, Scene
@@ -171,6 +172,12 @@ A = TypeVar("A")
 Observation = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 
+class Moment(observations.Moment, frozen=True):
+    """What is known at a frame of a session."""
+
+    frame: Frame
+
+
 class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     """A run of CAVIAR as a gymnasium environment (contract, clause 16).
 
@@ -184,7 +191,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             the run takes place in this process.
         agent: Name of the agent whose place is taken; None: the remote one, or the only one.
         users: Receivers served, as names with ``*`` and ``?``.
-        observe: Names of the parts of the observation: `caviar_clients.envs.observations.PARTS`.
+        observe: Names of the parts of the observation: `caviar_protocol.observations.PARTS`.
         reward: What the reward is: `caviar_clients.envs.base.Reward`.
         directory: Where an embedded run records; None: it does not, which is faster.
         render_mode: ``rgb_array``: a map of the scene.
@@ -246,10 +253,9 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
         self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)
-        self._parts: dict[str, Part] = {name: part(self.scenario, self.users, name) for name in observe}
-        self._blank = {name: np.zeros(p.space.shape, p.space.dtype) for name, p in self._parts.items()}
+        self._observer = Observer(self.scenario, self.users, observe)
         self.observation_space: spaces.Dict[Any] = spaces.Dict(  # type: ignore[assignment]  # of arrays
-            {name: p.space for name, p in self._parts.items()}
+            {name: spaces.Box(*bounds) for name, bounds in self._observer.bounds.items()}
         )
         self._reward = Reward(reward)
         self._broker = broker
@@ -369,8 +375,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def _inputs(self) -> tuple[Input, ...]:
         # One input for each topic: two cameras are in one product.
-        further = {i.topic: i for p in self._parts.values() for i in p.inputs}
-        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *further.values())
+        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self._observer.inputs)
 
     def _at(self, frame: Frame) -> Moment:
         link = frame.only("link", Link)
@@ -383,12 +388,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         return Moment(frame, scene, link, self.users.present(scene))
 
     def _observation(self, moment: Moment) -> Observation:
-        found = {}
-        for name, p in self._parts.items():
-            value = p.read(moment)
-            # A copy: learners keep observations, and some write into them.
-            found[name] = self._blank[name].copy() if value is None else value
-        return found
+        return self._observer.read(moment)
 
     def _info(self, moment: Moment) -> dict[str, Any]:
         link = moment.link

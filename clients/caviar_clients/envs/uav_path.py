@@ -14,9 +14,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from caviar_clients.envs.base import Observation, SessionEnv
-from caviar_clients.envs.observations import FAR, Moment
+from caviar_clients.envs.base import Moment, Observation, SessionEnv
 from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.observations import FAR
 from caviar_protocol.scenario.schema import owned_by
 from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.coordinates import Vector

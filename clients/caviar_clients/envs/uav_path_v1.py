@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from caviar_clients.envs.base import Observation
-from caviar_clients.envs.observations import Moment
+from caviar_clients.envs.base import Moment, Observation
 from caviar_clients.envs.uav_path import FlightEnv, point
 from caviar_clients.session.checks import Airspace
 from caviar_protocol.arrays import Float64Array
@@ -99,7 +98,7 @@ class UavPathV1Env(FlightEnv):
         efficiency_bit_s_hz: Spectral efficiency that is a radio part of 0: the best one that counts.
         outage_snr_db: A user with a lower SNR [dB] is in outage.
         weights: Of the parts: `Weights`, by name; what is left out has its default.
-        observe: Further parts: `caviar_clients.envs.observations.PARTS`; their bounds are their own.
+        observe: Further parts: `caviar_protocol.observations.PARTS`; their bounds are their own.
         options: The other arguments of `SessionEnv`, but for ``reward``.
 
     Raises:

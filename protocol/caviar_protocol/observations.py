@@ -1,6 +1,7 @@
-"""Observation parts by name, and the users that observations are about.
+"""What a policy observes: parts by name, and the users that they are about.
 
-To add a part: one subclass of `Part`, one line in `PARTS`.
+Environments, training on recordings and agents that serve a trained policy read observations here, so that a
+policy sees the same numbers wherever it decides. To add a part: one subclass of `Part`, one line in `PARTS`.
 """
 
 from __future__ import annotations
@@ -10,15 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import msgspec
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from caviar_clients.session.base import Frame
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import DeviceSpec, Scenario
@@ -27,6 +26,24 @@ from caviar_protocol.scenario.schema import owned_by
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
 from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Link, Scene
+
+P = TypeVar("P", bound=Payload)
+
+
+class ObservedFrame(Protocol):
+    """What is read of a frame: `caviar_services.service.Frame` in a run, products of one in a recording."""
+
+    def payloads(self, topic: str, cls: type[P]) -> Mapping[str, P]:
+        """Payloads of a topic that are present, by source."""
+
+
+class Bounds(NamedTuple):
+    """Bounds, shape and dtype of the values of a part, as a `gymnasium.spaces.Box` takes them."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: Any
 
 
 @dataclass(frozen=True)
@@ -135,7 +152,7 @@ def _array(device: DeviceSpec) -> AntennaArray:
 class Moment(msgspec.Struct, frozen=True):
     """What is known at a frame, from which observations are read."""
 
-    frame: Frame
+    frame: ObservedFrame
     scene: Scene
     link: Link | None
     """Of the frame before; None in frame 0."""
@@ -166,15 +183,15 @@ class Part(ABC):
 
     @property
     @abstractmethod
-    def space(self) -> spaces.Box:
-        """Shape and bounds of its values."""
+    def bounds(self) -> Bounds:
+        """Bounds, shape and dtype of its values."""
 
     @abstractmethod
     def read(self, moment: Moment) -> NDArray[Any] | None:
         """Read its value at a frame.
 
         Returns:
-            A value of `space`; None where it is not known, and zeros are observed.
+            A value within `bounds`; None where it is not known, and zeros are observed.
         """
 
 
@@ -185,8 +202,8 @@ class _PerUser(Part):
     bound: ClassVar[float] = FAR
 
     @property
-    def space(self) -> spaces.Box:
-        return spaces.Box(-self.bound, self.bound, (len(self.users) * self.width,), np.float32)
+    def bounds(self) -> Bounds:
+        return Bounds(-self.bound, self.bound, (len(self.users) * self.width,), np.float32)
 
     def read(self, moment: Moment) -> NDArray[np.float32]:
         width = self.width
@@ -272,8 +289,8 @@ class LidarGrid(Part):
         self._shape = _grid_shape(scenario)
 
     @property
-    def space(self) -> spaces.Box:
-        return spaces.Box(-2, 1, self._shape, np.int8)
+    def bounds(self) -> Bounds:
+        return Bounds(-2, 1, self._shape, np.int8)
 
     def read(self, moment: Moment) -> NDArray[np.int8] | None:
         for lidar in moment.frame.payloads("lidar", Lidar).values():
@@ -295,8 +312,8 @@ class DepthImage(Part):
         self._shape = (height, width)
 
     @property
-    def space(self) -> spaces.Box:
-        return spaces.Box(0, FAR, self._shape, np.float32)
+    def bounds(self) -> Bounds:
+        return Bounds(0, FAR, self._shape, np.float32)
 
     def read(self, moment: Moment) -> NDArray[np.float32] | None:
         for depth in moment.frame.payloads("depth", Depth).values():
@@ -312,8 +329,8 @@ class CameraImage(DepthImage):
     inputs = (Input(topic="camera"),)
 
     @property
-    def space(self) -> spaces.Box:
-        return spaces.Box(0, 255, (*self._shape, 3), np.uint8)
+    def bounds(self) -> Bounds:
+        return Bounds(0, 255, (*self._shape, 3), np.uint8)
 
     def read(self, moment: Moment) -> NDArray[Any] | None:
         for camera in moment.frame.payloads("camera", Camera).values():
@@ -368,6 +385,50 @@ def part(scenario: Scenario, users: Users, name: str) -> Part:
         )
         raise ScenarioError(f"observation {name!r} names no {device} of the scenario; there are: {there}")
     return cls(scenario, users, sensor)  # type: ignore[no-any-return]  # a subclass of Part
+
+
+class Observer:
+    """Reads some parts of the observation in every frame.
+
+    Args:
+        scenario: Has the devices.
+        users: The places.
+        names: Of the parts, as in `PARTS`.
+
+    Raises:
+        ScenarioError: A part does not exist, or its sensor does not; the text has those there are.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> scenario = load_scenario("geometric")
+        >>> observer = Observer(scenario, Users(scenario, ("*",)), ("aoa", "last_abs_y"))
+        >>> {name: bounds.shape for name, bounds in observer.bounds.items()}
+        {'aoa': (1,), 'last_abs_y': (1,)}
+    """
+
+    def __init__(self, scenario: Scenario, users: Users, names: Iterable[str]) -> None:
+        self._parts: dict[str, Part] = {name: part(scenario, users, name) for name in names}
+        self.bounds: Mapping[str, Bounds] = {name: found.bounds for name, found in self._parts.items()}
+        """Of each part, by name."""
+        self._blank = {name: np.zeros(of.shape, of.dtype) for name, of in self.bounds.items()}
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the parts need beside the scene and the link of the frame before, one input for each topic."""
+        return tuple({i.topic: i for found in self._parts.values() for i in found.inputs}.values())
+
+    def read(self, moment: Moment) -> dict[str, NDArray[Any]]:
+        """Read all parts at a frame; zeros stand for what is not known.
+
+        Args:
+            moment: What is known at the frame.
+        """
+        found = {}
+        for name, of in self._parts.items():
+            value = of.read(moment)
+            # A copy: learners keep observations, and some write into them.
+            found[name] = self._blank[name].copy() if value is None else value
+        return found
 
 
 def _grid_shape(scenario: Scenario) -> tuple[int, int, int]:
