@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.scenario import DeviceSpec, Scenario
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.rules import patterns_overlap
-from caviar_protocol.scenario.schema import owned_by
+from caviar_protocol.scenario.schema import ServiceSpec, owned_by
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
 from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Link, Scene
@@ -35,6 +35,18 @@ class ObservedFrame(Protocol):
 
     def payloads(self, topic: str, cls: type[P]) -> Mapping[str, P]:
         """Payloads of a topic that are present, by source."""
+
+
+class KnownScenario(Protocol):
+    """What is known of a scenario: a `Scenario`, or what a run says to its agents about it."""
+
+    @property
+    def devices(self) -> Sequence[DeviceSpec]:
+        """All devices."""
+
+    @property
+    def services(self) -> Mapping[str, ServiceSpec]:
+        """Services with their settings; empty where they are not known."""
 
 
 class Bounds(NamedTuple):
@@ -69,6 +81,7 @@ class Users:
     Args:
         scenario: Names the devices.
         patterns: Receivers that are served, as names with ``*`` and ``?``.
+        without: Receivers among them that are not, in the same form; their places stay empty.
 
     Raises:
         ScenarioError: The patterns match no receiver; the text has those there are.
@@ -80,8 +93,8 @@ class Users:
         (1, 64)
     """
 
-    def __init__(self, scenario: Scenario, patterns: Sequence[str]) -> None:
-        self._patterns = tuple(patterns)
+    def __init__(self, scenario: KnownScenario, patterns: Sequence[str], without: Sequence[str] = ()) -> None:
+        self._patterns, self._without = tuple(patterns), tuple(without)
         antennas = [d for d in scenario.devices if d.kind == "antenna"]
         self._groups: list[tuple[DeviceSpec, DeviceSpec]] = [
             (tx, rx)
@@ -121,10 +134,13 @@ class Users:
         taken: dict[tuple[str, str], int] = {}
         for pair in pairs_of(scene):
             group = _spec_name(pair.tx.name), _spec_name(pair.rx.name)
-            if group in self._first and owned_by(self._patterns, pair.rx.name):
+            if group in self._first and self._serves(pair.rx.name):
                 place = self._first[group] + taken.get(group, 0)
                 taken[group] = taken.get(group, 0) + 1
                 yield place, pair
+
+    def _serves(self, rx: str) -> bool:
+        return owned_by(self._patterns, rx) and not (self._without and owned_by(self._without, rx))
 
     def _may_serve(self, rx: DeviceSpec) -> bool:
         # Names of objects are known at run time: two patterns are compared with each other here.
@@ -178,7 +194,7 @@ class Part(ABC):
     needs_sensor: ClassVar[str] = ""
     """Kind of the device that it is of; empty: none."""
 
-    def __init__(self, scenario: Scenario, users: Users, sensor: str) -> None:
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         self.users, self.sensor = users, sensor
 
     @property
@@ -284,7 +300,7 @@ class LidarGrid(Part):
     inputs = (Input(topic="lidar", parts=("grid",)),)
     needs_sensor = "lidar"
 
-    def __init__(self, scenario: Scenario, users: Users, sensor: str) -> None:
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         super().__init__(scenario, users, sensor)
         self._shape = _grid_shape(scenario)
 
@@ -306,7 +322,7 @@ class DepthImage(Part):
     inputs = (Input(topic="depth"),)
     needs_sensor = "camera"
 
-    def __init__(self, scenario: Scenario, users: Users, sensor: str) -> None:
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         super().__init__(scenario, users, sensor)
         width, height = next(d.size_px for d in scenario.devices if d.name == sensor)
         self._shape = (height, width)
@@ -340,7 +356,7 @@ class CameraImage(DepthImage):
         return None
 
 
-PARTS: Mapping[str, Callable[[Scenario, Users, str], Part]] = {
+PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "aoa": AngleOfArrival,
     "aod": AngleOfDeparture,
     "position": Position,
@@ -353,7 +369,7 @@ PARTS: Mapping[str, Callable[[Scenario, Users, str], Part]] = {
 """Parts by name. One of a sensor may name it after a colon: ``camera:dash``."""
 
 
-def part(scenario: Scenario, users: Users, name: str) -> Part:
+def part(scenario: KnownScenario, users: Users, name: str) -> Part:
     """Make a part of the observation.
 
     Args:
@@ -406,7 +422,7 @@ class Observer:
         {'aoa': (1,), 'last_abs_y': (1,)}
     """
 
-    def __init__(self, scenario: Scenario, users: Users, names: Iterable[str]) -> None:
+    def __init__(self, scenario: KnownScenario, users: Users, names: Iterable[str]) -> None:
         self._parts: dict[str, Part] = {name: part(scenario, users, name) for name in names}
         self.bounds: Mapping[str, Bounds] = {name: found.bounds for name, found in self._parts.items()}
         """Of each part, by name."""
@@ -431,7 +447,7 @@ class Observer:
         return found
 
 
-def _grid_shape(scenario: Scenario) -> tuple[int, int, int]:
+def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:
     """Shape of the grid as the LIDAR's settings have it, before there is a scan."""
     for spec in scenario.services.values():
         grid = spec.settings.get("grid") if spec.role == "sensors" else None

@@ -34,6 +34,7 @@ BUILT_IN: dict[str, str] = {
     "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
     "agent:random": "caviar_services.agent.baselines:RandomAgent",
     "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
+    "agent:policy": "caviar_services.agent.policy:PolicyAgent",
     "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
 }

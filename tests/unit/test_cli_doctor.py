@@ -159,5 +159,5 @@ def test_a_base_install_is_whole_and_one_command_adds_every_extra(monkeypatch: p
     assert doctor.exit_status(checks) == 0
     text = shown(checks, width=200)
     assert text.count("pip install") == 1
-    assert "install 'caviar-sim[channel,sensors,world,plot,learning]'" in text
+    assert "install 'caviar-sim[channel,sensors,world,plot,policy,learning]'" in text
     assert "Everything that the base install needs is here." in text

@@ -213,7 +213,9 @@ def _notes(run: RecordedRun, timings: Mapping[str, Timing], frames: int) -> list
             notes.append(f"latencies of {name} are not one a frame: they were taken in their order")
     # The first frame has what every frame has: a service decides in all of them, or in none.
     for report in run.recording.entry(0).reports:
-        if report.decisions and report.source in timings:
+        # An agent decides with the policy that it has, whatever its budget.
+        by_budget = run.scenario.services[report.source].role != "agent"
+        if report.decisions and by_budget and report.source in timings:
             notes.append(
                 f"{report.source} decided for its recorded budget ({', '.join(report.decisions)}); with "
                 "another one its latencies become others"

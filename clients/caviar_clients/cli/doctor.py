@@ -34,7 +34,7 @@ from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
 from caviar_services import drjit_setup
 
-EXTRAS = ("channel", "sensors", "world", "plot", "learning")
+EXTRAS = ("channel", "sensors", "world", "plot", "policy", "learning")
 MINIMUM_PYTHON = (3, 11)
 MINIMUM_FREE_GB = 2.0
 MINIMUM_FILES = 1024

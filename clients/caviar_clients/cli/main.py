@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from caviar_clients.cli.keys import app as keys
+from caviar_clients.cli.learning import evaluate_command, export_command
 from caviar_clients.cli.shared import (
     Embedded,
     FiguresFile,
@@ -465,6 +466,10 @@ def tradeoff(
 
     options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part)
     trade(source, frames, options, json, out, _console)
+
+
+app.command("evaluate", rich_help_panel=MEASURE)(evaluate_command)
+app.command("export-policy", rich_help_panel=OPERATE)(export_command)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

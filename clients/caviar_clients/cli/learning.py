@@ -1,0 +1,99 @@
+"""``caviar export-policy`` and ``caviar evaluate``: trained policies as files, and beside their baselines."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from caviar_protocol.errors import ScenarioError, SetupError
+from caviar_protocol.host import install_command
+
+ALGORITHMS = ("dqn", "ppo", "a2c")
+
+
+def export_command(
+    model: Annotated[Path, typer.Argument(help="zip file that Stable-Baselines3 saved", show_default=False)],
+    policy: Annotated[Path, typer.Argument(help="ONNX file to write", show_default=False)],
+    algorithm: Annotated[str, typer.Option(help="that trained it: " + ", ".join(ALGORITHMS))],
+    on: Annotated[str, typer.Option("--on", help="scenario that it was trained on, by name or file")],
+    users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
+    steps: Annotated[int, typer.Option(min=0, help="of training, for the card")] = 0,
+) -> None:
+    """Write a trained model as an ONNX policy, with its card, for the agent `policy`."""
+    from caviar_clients.envs.base import BeamSelectionEnv
+    from caviar_clients.learning.export import export_policy
+
+    if algorithm.lower() not in ALGORITHMS:
+        raise ScenarioError(f"--algorithm {algorithm}: write one of {', '.join(ALGORITHMS)}")
+    try:
+        import stable_baselines3
+    except ImportError as error:
+        raise SetupError(
+            f"the model is read by Stable-Baselines3; run: {install_command('learning')}"
+        ) from error
+    if not model.is_file():
+        raise ScenarioError(f"{model}: there is no such file; give the zip file that model.save() wrote")
+    try:
+        trained = getattr(stable_baselines3, algorithm.upper()).load(model, device="cpu")
+    except Exception as error:  # whatever a file that is no model makes it raise
+        raise ScenarioError(
+            f"{model} cannot be read as a model of {algorithm.upper()}: {error}; is it of another algorithm?"
+        ) from error
+    spaces = getattr(trained.observation_space, "spaces", None)
+    if not spaces:
+        raise ScenarioError(
+            f"{model} observes {trained.observation_space}, no parts by name; train it with the policy "
+            "'MultiInputPolicy' on caviar/BeamSelection-v0"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = BeamSelectionEnv(on, observe=tuple(spaces), users=users)
+    wanted, found = trained.action_space, env.action_space
+    if wanted != found or trained.observation_space != env.observation_space:
+        raise ScenarioError(
+            f"{model} was trained for actions {wanted} and {_spaces(trained.observation_space)}, and {on} "
+            f"has {found} and {_spaces(env.observation_space)}; name scenario and users of its training"
+        )
+    card = export_policy(trained, env, policy, steps=steps or int(trained.num_timesteps))
+    typer.echo(f"{policy}: {card.algorithm}, observes {', '.join(card.observe)}, {policy.stat().st_size:,} B")
+
+
+def _spaces(space: Any) -> str:
+    return ", ".join(f"{name} {box.shape}" for name, box in space.spaces.items())
+
+
+def evaluate_command(
+    policy: Annotated[Path, typer.Argument(help="ONNX file with a card", show_default=False)],
+    on: Annotated[str, typer.Option("--on", help="scenario, by name or file")],
+    seeds: Annotated[int, typer.Option(min=1, help="number of seeds")] = 5,
+    first_seed: Annotated[int, typer.Option(min=0, help="the first; none of training's")] = 1000,
+    episodes: Annotated[int, typer.Option(min=1, help="of each seed")] = 1,
+    users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
+    json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
+) -> None:
+    """Hold a policy against los-beam, random and the optimum, LOS and NLOS apart."""
+    from caviar_clients.cli.shared import progress_bar, write_json
+    from caviar_clients.learning.evaluate import KINDS, METHODS, evaluate
+
+    chosen = range(first_seed, first_seed + seeds)
+    console = Console()
+    with progress_bar(console, "{task.completed}/{task.total} episodes", transient=True) as bar:
+        task = bar.add_task("", total=seeds * episodes)
+        made = evaluate(
+            policy, on, chosen, episodes, lambda done: bar.update(task, completed=done), users=users
+        )
+    table = Table(title=f"mean |y| of {made.policy} on {made.scenario}, {seeds * episodes} episodes")
+    table.add_column("")
+    for kind in KINDS:
+        table.add_column(f"{kind} ({made.frames[kind]:,})", justify="right")
+    for method in METHODS:
+        table.add_row(method, *(str(made.found[method][kind]) for kind in KINDS))
+    console.print(table)
+    if json is not None:
+        figures = {m: {k: vars(made.found[m][k]) for k in KINDS} for m in METHODS}
+        write_json(json, {"frames": dict(made.frames), "abs_y": figures})

@@ -1,0 +1,1 @@
+"""Learning with the environments: policies exported, evaluated beside baselines."""

@@ -1,0 +1,275 @@
+"""``policy``: an agent that serves a trained policy from an ONNX file, and the card that says what it is.
+
+A policy takes parts of the observation (`caviar_protocol.observations`) as inputs of their names, each with
+one row, Shape ``[1, …]``, and gives ``action``: for each place of a user the index ``tx_beam·Nr + rx_beam``
+of a pair of beams, Shape ``[1]`` or ``[1, U]``. What it observes, and the codebooks that it was trained for,
+stand on its card, in the metadata of the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.host import install_command
+from caviar_protocol.observations import Moment, Observer, Users
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.schema import ServiceSpec
+from caviar_protocol.space.scene import Pair
+from caviar_protocol.topics import BeamChoice, Link, Scene
+from caviar_services.agent.base import Agent, AgentSettings
+from caviar_services.service import Frame, Preparation, Prepared, StepResult
+
+CARD_KEY = "caviar.card"
+"""Key of the card in the metadata of an ONNX file."""
+ACTION = "action"
+"""Name of the output with the action."""
+DECISION = "policy"
+"""Name under which the digest of the policy stands in the decisions of every frame."""
+
+
+class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
+    """What a policy observes, what it was trained for, and how it came about.
+
+    Example:
+        >>> card = PolicyCard(observe=("aoa", "last_abs_y"), codebooks=((64, 1),))
+        >>> read_card(write_card(card)) == card
+        True
+    """
+
+    observe: tuple[str, ...]
+    """Parts of the observation, as in `caviar_protocol.observations.PARTS`."""
+    codebooks: tuple[tuple[int, int], ...]
+    """Beams of the transmitter and of the receiver, of each place."""
+    environment: str = ""
+    """Of gymnasium, that it was trained in."""
+    scenario: str = ""
+    algorithm: str = ""
+    """Library and algorithm."""
+    seeds: tuple[int, ...] = ()
+    steps: int = 0
+    """Of training."""
+    figures: Mapping[str, float] = {}
+    """What was measured of it, by name."""
+    versions: Mapping[str, str] = {}
+    """Of the packages that it was trained with."""
+
+
+def write_card(card: PolicyCard) -> str:
+    """Write a card as text, for the metadata of a file.
+
+    Args:
+        card: The card.
+    """
+    return msgspec.json.format(msgspec.json.encode(card)).decode()
+
+
+def read_card(text: str) -> PolicyCard:
+    """Read a card that `write_card` wrote.
+
+    Args:
+        text: The JSON.
+
+    Raises:
+        msgspec.DecodeError: It is no card.
+    """
+    return msgspec.json.decode(text, type=PolicyCard)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Known:
+    """What an agent knows of the scenario."""
+
+    devices: Sequence[DeviceSpec]
+    services: Mapping[str, ServiceSpec]
+
+
+class PolicyModel:
+    """A policy in ONNX Runtime, on one thread: a small network is not worth the waiting of several.
+
+    Args:
+        file: The ONNX file.
+        called: What errors call it.
+
+    Raises:
+        SetupError: ONNX Runtime is not installed; the text has the command.
+        ScenarioError: The file cannot be read, or its card cannot.
+    """
+
+    def __init__(self, file: Path, called: str = "") -> None:
+        called = called or str(file)
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise SetupError(f"policies need ONNX Runtime; run: {install_command('policy')}") from error
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise ScenarioError(f"{called} cannot be read: {error.strerror}; check the path") from error
+        self.digest = hashlib.sha256(content).hexdigest()
+        """SHA-256 of the file."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.use_deterministic_compute = True
+        options.log_severity_level = 4  # what is wrong is said below, and not on standard error
+        try:
+            self._session: Any = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # its exceptions have no common base
+            reason = str(error).partition("\n")[0]
+            raise ScenarioError(f"{called} is no ONNX model ({reason}); export the policy again") from error
+        self.inputs: dict[str, tuple[Any, ...]] = {i.name: tuple(i.shape) for i in self._session.get_inputs()}
+        """Shape of each input, by name; what is not a number may have any size."""
+        self.outputs = tuple(output.name for output in self._session.get_outputs())
+        text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
+        try:
+            self.card = None if text is None else read_card(text)
+            """None: the file has none."""
+        except msgspec.DecodeError as error:
+            raise ScenarioError(
+                f"{called} has a card that cannot be read ({error}); export it again"
+            ) from error
+
+    def act(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """Choose an action.
+
+        Args:
+            observation: Parts by name, without the axis of the batch.
+
+        Returns:
+            Index of a pair of beams for each place, Shape ``[U]``.
+        """
+        # A part that changes no action is no input: exporters leave it out.
+        rows = {name: observation[name][None] for name in self.inputs}
+        (found,) = self._session.run([ACTION], rows)
+        return np.asarray(found).reshape(-1)
+
+
+class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of ``policy``."""
+
+    file: str
+    """``file:`` and the path of the ONNX file, relative to the folder of the scenario."""
+    observe: tuple[str, ...] = ()
+    """Parts of the observation; empty: those of the policy's card. Only for a file without a card."""
+
+
+class PolicyAgent(Agent[PolicySettings]):
+    """Serves a trained policy: `caviar_services.agent.policy` says what its file holds.
+
+    The digest of the file stands in the decisions of every frame. A replay refuses another file.
+
+    Raises:
+        ScenarioError: The file is no policy, or does not fit the scenario; the text has both sides.
+    """
+
+    Settings: ClassVar[type[msgspec.Struct]] = PolicySettings
+    _model: PolicyModel
+    _observer: Observer
+    _places: Users
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Load the policy, hold it against the scenario, and run it once."""
+        prepared = super().prepare(preparation)
+        path = Path(self.settings.file.removeprefix("file:"))
+        model = self._model = PolicyModel(path, f"policy {path.name}")
+        key = self.run.settings_place.at("file").key
+        card = model.card
+        observe = self.settings.observe or (card.observe if card else ())
+        if not observe:
+            raise ScenarioError(
+                f"policy {path.name} has no card that says what it observes; write "
+                f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
+                key=key,
+            )
+        known = _Known(self.run.devices, {})
+        self._places = Users(known, self.settings.users, self.settings.except_users)
+        sizes = tuple((place.tx.size, place.rx.size) for place in self._places.places)
+        if card is not None and card.codebooks != sizes:
+            raise ScenarioError(
+                f"policy {path.name} was trained for {_codebooks(card.codebooks)}, and the scenario has "
+                f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
+                key=key,
+            )
+        self._observer = Observer(known, self._places, observe)
+        if self._observer.inputs:
+            topics = ", ".join(sorted(i.topic for i in self._observer.inputs))
+            raise ScenarioError(
+                f"policy {path.name} observes {', '.join(observe)}, which needs {topics}: this agent "
+                "takes the scene and the link alone; write an agent of your own with these inputs",
+                key=key,
+            )
+        self._check_shapes(path.name, key)
+        # Buffers are made at the first run, which would else be late.
+        model.act({name: np.zeros(b.shape, b.dtype) for name, b in self._observer.bounds.items()})
+        made = f", {card.algorithm} of {card.steps} steps" if card and card.algorithm else ""
+        note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
+        return dataclasses.replace(prepared, notes=(*prepared.notes, note))
+
+    def _check_shapes(self, name: str, key: str) -> None:
+        """Refuse a model that takes other inputs than are observed, or gives no action."""
+        model, bounds = self._model, self._observer.bounds
+        if not model.inputs.keys() <= bounds.keys():
+            raise ScenarioError(
+                f"policy {name} takes {', '.join(sorted(model.inputs))}, and {', '.join(sorted(bounds))} is "
+                "observed; name inputs after the parts of the observation",
+                key=key,
+            )
+        for part, given in model.inputs.items():
+            needed = (1, *bounds[part].shape)
+            # A size that is a name, or none, may be any.
+            sizes = zip(given, needed, strict=True) if len(given) == len(needed) else [(0, 1)]
+            if any(isinstance(size, int) and size != wanted for size, wanted in sizes):
+                raise ScenarioError(
+                    f"policy {name} takes {part!r} of shape {list(given)}, and the scenario's is "
+                    f"{list(needed)}: it was trained for other users",
+                    key=key,
+                )
+        if ACTION not in model.outputs:
+            raise ScenarioError(
+                f"policy {name} gives {', '.join(model.outputs)} and no {ACTION!r}; name its output so",
+                key=key,
+            )
+
+    def step(self, frame: Frame) -> StepResult:
+        """The policy's choice for each user; its digest among the decisions."""
+        imposed = frame.imposed.get(DECISION, "")
+        if imposed and imposed != self._model.digest:
+            raise ScenarioError(
+                f"frame {frame.number} was decided by the policy of SHA-256 {imposed}, and this file has "
+                f"{self._model.digest}; give the replay the same file",
+                key=self.run.settings_place.at("file").key,
+            )
+        made = super().step(frame)
+        return made if frame.final else replace(made, decisions={DECISION: self._model.digest})
+
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
+        """The policy's choice for each user, the same on every carrier."""
+        users = self._places.present(scene)
+        moment = Moment(frame, scene, frame.only("link", Link), users)
+        action = self._model.act(self._observer.read(moment)).tolist()
+        for place, pair in users:
+            size = self._places.places[place].beam_pairs
+            index = action[place] if place < len(action) else -1
+            if not 0 <= index < size:
+                raise PayloadError(
+                    f"the policy chose pair {index} of {size} for {pair.rx.name}; it gives one index for "
+                    f"each of {len(self._places)} places, from 0 on"
+                )
+            tx_beam, rx_beam = divmod(int(index), pair.rx.array.size)
+            yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
+
+
+def _codebooks(sizes: Sequence[tuple[int, int]]) -> str:
+    shown = ", ".join(f"{tx} × {rx}" for tx, rx in sizes[:4]) + (", …" if len(sizes) > 4 else "")
+    return f"{len(sizes)} user(s) with beams {shown}"
