@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions, Interaction
 from caviar_services.channel.assemble import Product, assemble
-from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.paths import Antenna, PathTable, stable_ids
 
 CARRIERS = (Carrier(name="low", frequency_hz=3.5e9), Carrier(name="high", frequency_hz=28e9))
 NAMES = ("wall", "bridge", "car", "unused")
@@ -202,3 +204,22 @@ def test_no_paths_at_all_make_an_empty_product() -> None:
     assert channel.interactions.shape == (0, 0)
     assert channel.offsets.tolist() == [0] * 7
     assert decode_payload("channel", *encode_payload(channel)) == channel
+
+
+def test_one_path_of_each_pair_needs_no_order_and_gets_the_same_bytes() -> None:
+    """Found in the order of the pairs or in another one: lines of sight, as free space has them."""
+    table = random_table(np.random.default_rng(9), paths=6, depth=0)
+    sighted = replace(table, pair=np.arange(6))
+    shuffled = sighted.take(np.array([4, 0, 5, 2, 1, 3]))
+    assert encode_payload(build(sighted, with_h=True)) == encode_payload(build(shuffled, with_h=True))
+
+
+def test_ids_of_paths_of_one_kind_count_within_their_pair() -> None:
+    """The same ids whether all paths are of one kind, or others stand between them."""
+    table = random_table(np.random.default_rng(10), paths=8, depth=1)
+    pair = np.array([0, 0, 0, 1, 3, 3, 3, 3])
+    types = np.array([0, 0, 1, 0, 0, 0, 0, 1], np.uint8)[:, None]
+    mixed = replace(table, pair=pair, types=types, objects=np.where(types, 1, -1).astype(np.int32))
+    alone = stable_ids(mixed.take(types[:, 0] == 0))
+    assert alone.tolist() == stable_ids(mixed)[types[:, 0] == 0].tolist()
+    assert alone[0] == alone[2] != alone[1]

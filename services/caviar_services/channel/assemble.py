@@ -95,12 +95,13 @@ def assemble(
             a = a * amplitude_factor(product.absorption_db_per_km, geometry.tau)
     finite = _finite(table, geometry, a)
     dropped = len(finite) - int(np.count_nonzero(finite))
-    dropped_pairs = frozenset(table.pair[~finite].tolist())
+    dropped_pairs: frozenset[int] = frozenset()
     if dropped:
+        dropped_pairs = frozenset(table.pair[~finite].tolist())
         table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
-    # One path alone, as in free space, needs no order.
-    if len(table.pair) > 1:
+    # Pairs that ascend, with one path each, as in free space, are in order.
+    if np.count_nonzero(table.pair[1:] > table.pair[:-1]) < len(table.pair) - 1:
         order = _order(table, geometry, aod, aoa, a)
         table, geometry, a, row = table.take(order), _select(geometry, order), a[:, order], row[order]
         aod, aoa = aod[order], aoa[order]
@@ -175,6 +176,8 @@ def _located(
 def _canonical_names(table: PathTable) -> PathTable:
     """Names that occur, sorted; points and objects past the last interaction set to their filler."""
     if not table.types.shape[1]:
+        if not table.object_names:
+            return table
         return replace(table, object_names=(), object_velocity=np.zeros((0, 3)), object_turning=None)
     used = table.types != 0
     objects = np.where(used, table.objects, -1)

@@ -204,16 +204,23 @@ def stable_ids(table: PathTable) -> UInt64Array:
     if not len(ids):
         return ids
     base, kind = _kinds(table)
+    place = np.arange(len(ids))
+    # Of one kind alone, as lines of sight, each pair is a run of equals.
+    if len(base) == 1:
+        return _ids(base[kind], place - np.searchsorted(table.pair, table.pair))
     # In a stable order, so the rank follows the sorted paths: distance to the start of the run of equals.
     order = np.lexsort((kind, table.pair))
-    place = np.arange(len(ids))
     first = np.ones(len(ids), np.bool_)
     ranked, pair = kind[order], table.pair[order]
     first[1:] = (ranked[1:] != ranked[:-1]) | (pair[1:] != pair[:-1])
     rank = np.empty(len(ids), np.int64)
     rank[order] = place - np.maximum.accumulate(np.where(first, place, 0))
+    return _ids(base[kind], rank)
+
+
+def _ids(base: UInt64Array, rank: Int64Array) -> UInt64Array:
     # 2⁶⁴ divided by the golden ratio is the increment of SplitMix64: neighbouring ranks differ in all bits.
-    return _mix(base[kind] + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
+    return _mix(base + rank.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
 
 
 def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:

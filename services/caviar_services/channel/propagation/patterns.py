@@ -38,15 +38,30 @@ def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float6
         >>> theta_hat.tolist(), phi_hat.tolist()
         ([0.0, 0.0, -1.0], [-0.0, 1.0, 0.0])
     """
-    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
-    horizontal = np.hypot(x, y)
-    at_pole = horizontal <= pole
-    safe = np.where(at_pole, 1.0, horizontal)
-    cosine, sine = np.where(at_pole, 1.0, x / safe), np.where(at_pole, 0.0, y / safe)
-    theta_hat, phi_hat = np.empty_like(directions), np.zeros_like(directions)
-    theta_hat[..., 0], theta_hat[..., 1], theta_hat[..., 2] = z * cosine, z * sine, -horizontal
+    horizontal, cosine, sine = _azimuth(directions, pole)
+    phi_hat = np.zeros_like(directions)
     phi_hat[..., 0], phi_hat[..., 1] = -sine, cosine
-    return theta_hat, phi_hat
+    return _theta_hat(directions, horizontal, cosine, sine), phi_hat
+
+
+def _azimuth(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Length of the horizontal part, cosine and sine of the azimuth, Shape ``[...]`` each."""
+    x, y = directions[..., 0], directions[..., 1]
+    horizontal: Float64Array = np.hypot(x, y)
+    at_pole = horizontal <= pole
+    # Few directions are at a pole: a look at all of them costs a third of the choices below.
+    if not np.count_nonzero(at_pole):
+        return horizontal, x / horizontal, y / horizontal
+    safe = np.where(at_pole, 1.0, horizontal)
+    return horizontal, np.where(at_pole, 1.0, x / safe), np.where(at_pole, 0.0, y / safe)
+
+
+def _theta_hat(
+    directions: Float64Array, horizontal: Float64Array, cosine: Float64Array, sine: Float64Array
+) -> Float64Array:
+    z, theta_hat = directions[..., 2], np.empty_like(directions)
+    theta_hat[..., 0], theta_hat[..., 1], theta_hat[..., 2] = z * cosine, z * sine, -horizontal
+    return theta_hat
 
 
 class ElementPattern(ABC):
@@ -185,9 +200,13 @@ def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Ar
     Returns:
         Fields in device axes, Shape ``[P, 3]``.
     """
-    theta_hat, phi_hat = spherical_basis(local)
     cosine, sine = jones(polarization)
     along_theta, along_phi = pattern.along_theta_phi(local)
+    # Most elements are vertical, with a field along θ̂ alone.
+    if sine == 0 and along_phi is None:
+        vertical: Field = along_theta[:, None] * _theta_hat(local, *_azimuth(local))
+        return vertical
+    theta_hat, phi_hat = spherical_basis(local)
     co = theta_hat if sine == 0 else phi_hat if cosine == 0 else cosine * theta_hat + sine * phi_hat
     field: Field = along_theta[:, None] * co
     if along_phi is not None:
