@@ -9,7 +9,6 @@ loses nothing under any of them, for every frame is in the hands of the operatin
 from __future__ import annotations
 
 import os
-import sys
 import threading
 import time
 import zlib
@@ -30,6 +29,7 @@ from caviar_protocol.recording import (
     SegmentRecord,
 )
 from caviar_protocol.recording.segment import Channel, Segment, seal
+from caviar_services.recorder.mcap_file import McapFile
 from caviar_services.service import FrameInput
 
 _SCHEMA_ENCODING = "x-caviar-text"
@@ -47,7 +47,7 @@ _FRAME_SCHEMA = (
 
 
 class _ChecksummedStream:
-    """What the MCAP library writes to; nothing reaches the system before `hand_over`."""
+    """What `McapFile` writes to; nothing reaches the system before `hand_over`."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -60,9 +60,6 @@ class _ChecksummedStream:
 
     def tell(self) -> int:
         return self._stream.tell()
-
-    def flush(self) -> None:
-        """Ignored: the library flushes before the seal is written."""
 
     def hand_over(self) -> None:
         """Write what is buffered, so that a killed process does not take it along."""
@@ -79,8 +76,6 @@ class SegmentWriter:
     """
 
     def __init__(self, path: Path, metadata: dict[str, str], compression: str) -> None:
-        from mcap.writer import CompressionType, Writer
-
         self.path = path
         self.frames = 0
         self.first: tuple[int, int] | None = None
@@ -88,19 +83,14 @@ class SegmentWriter:
         """(episode, frame) of the first and the last frame; None: there is none yet."""
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
+        self._encode = msgspec.msgpack.Encoder().encode
         self._file = path.open("xb")
         self._stream = _ChecksummedStream(self._file)
-        # A chunk ends where we flush, after each frame, and never by its size. The seals take the place of
-        # MCAP's CRC of the data section, which can be checked only in a file that was finished.
-        self._writer = Writer(
-            self._stream,
-            chunk_size=sys.maxsize,
-            compression=CompressionType[compression.upper()],
-            enable_data_crcs=False,
-        )
         try:
-            self._writer.start(profile=PROFILE)
-            self._writer.add_metadata(METADATA_NAME, metadata)
+            # The seals take the place of MCAP's CRC of the data section, which can be checked only in a file
+            # that was finished.
+            self._mcap = McapFile(self._stream, PROFILE, compression)
+            self._mcap.add_metadata(METADATA_NAME, metadata)
             self._seal()
         except OSError:
             self.abandon()
@@ -130,17 +120,12 @@ class SegmentWriter:
         # One log time for all that a frame brought, also for what was computed for an earlier one: a reader
         # that seeks by time finds the whole frame.
         log_time = base_ns + entry.t_ns
-
-        def add(channel: int, sequence: int, t_ns: int, data: bytes) -> None:
-            self._writer.add_message(
-                channel, log_time=log_time, data=data, publish_time=base_ns + t_ns, sequence=sequence
-            )
-
-        add(frame_channel, entry.frame, entry.t_ns, msgspec.msgpack.encode(entry))
+        add = self._mcap.add_message
+        add(frame_channel, entry.frame, log_time, log_time, self._encode(entry))
         for channel, product in keyed:
-            length = len(product.header).to_bytes(8, "little")
-            data = b"".join((length, product.header, product.body))
-            add(channel, product.provenance.frame, product.provenance.t_ns, data)
+            length, made = len(product.header).to_bytes(8, "little"), product.provenance
+            add(channel, made.frame, log_time, base_ns + made.t_ns, length, product.header, product.body)
+        self._mcap.end_chunk()
         self._seal()
         self.frames += 1
         self.last = entry.episode, entry.frame
@@ -148,9 +133,9 @@ class SegmentWriter:
 
     def finish(self) -> SegmentRecord:
         """Write index and summary, for `close` to follow; what the manifest says about the segment."""
-        self._writer.finish()
+        self._mcap.finish()
         self._stream.hand_over()
-        del self._writer  # and its index: until the segment is closed it may wait for the disk
+        del self._mcap  # and its index: until the segment is closed it may wait for the disk
         return SegmentRecord(
             name=self.path.name,
             first=self.first,
@@ -175,7 +160,6 @@ class SegmentWriter:
         self._file.raw.close()
 
     def _seal(self) -> None:
-        self._writer.flush()
         self._stream.write(seal(self._stream.crc))
         self._stream.hand_over()
 
@@ -184,18 +168,18 @@ class SegmentWriter:
         channel = self._channels.get((topic, source))
         if channel is None:
             product = bool(source)
-            channel = self._channels[topic, source] = self._writer.register_channel(
-                topic=f"{topic}/{source}" if product else topic,
-                message_encoding="caviar-product" if product else "msgpack",
-                schema_id=self._schema(topic, _PRODUCT_SCHEMA if product else _FRAME_SCHEMA),
-                metadata={"topic": topic, "source": source},
+            channel = self._channels[topic, source] = self._mcap.add_channel(
+                f"{topic}/{source}" if product else topic,
+                "caviar-product" if product else "msgpack",
+                self._schema(topic, _PRODUCT_SCHEMA if product else _FRAME_SCHEMA),
+                {"topic": topic, "source": source},
             )
         return channel
 
     def _schema(self, topic: str, text: str) -> int:
         if topic not in self._schemas:
-            self._schemas[topic] = self._writer.register_schema(
-                name=f"caviar.{topic}/1", encoding=_SCHEMA_ENCODING, data=text.format(topic=topic).encode()
+            self._schemas[topic] = self._mcap.add_schema(
+                f"caviar.{topic}/1", _SCHEMA_ENCODING, text.format(topic=topic).encode()
             )
         return self._schemas[topic]
 
