@@ -21,7 +21,7 @@ from reference_pages import api  # noqa: E402
 from sphinx.domains.python import PythonDomain  # noqa: E402
 from sphinx.ext.napoleon import Config  # noqa: E402
 
-from caviar_services.scenario_schema import scenario_schema  # noqa: E402
+from caviar_services.registry import scenario_schema  # noqa: E402
 
 project = "CAVIAR"
 author = copyright = "The CAVIAR developers"  # noqa: A001 - Sphinx's name

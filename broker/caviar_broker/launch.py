@@ -31,15 +31,18 @@ from caviar_broker.control.socket import locked, refuse_second_broker
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.event_loop import call_with_timeout, raise_priority
 from caviar_broker.journal import CheckpointFiles, JournalFile
-from caviar_broker.recordings import (
+from caviar_broker.resume import ResumeState, read_resumption
+from caviar_broker.run_record import (
+    RunRecord,
+    changes,
     check_run_files,
     has_recording,
+    read_record,
     recorded_frames,
     sync_recording,
+    versions_of,
     with_replay,
 )
-from caviar_broker.resume import ResumeState, read_resumption
-from caviar_broker.run_record import RunRecord, changes, read_record, versions_of
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import PeerLimits
 from caviar_broker.server import BrokerServer

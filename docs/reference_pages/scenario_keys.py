@@ -10,8 +10,7 @@ import msgspec
 
 from caviar_protocol.scenario.schema import Scenario
 from caviar_protocol.spec import markdown, prose, rows, structs_below
-from caviar_services.registry import load
-from caviar_services.scenario_schema import settings_classes
+from caviar_services.registry import load, settings_classes
 
 from .markdown import table, toctree
 

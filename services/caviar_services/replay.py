@@ -41,7 +41,7 @@ class Replayer(Service[ReplaySettings]):
     """One recorded service: its products, decisions and counts, and where an agent, the ends of episodes.
 
     Frames are found by episode and number, so that a run which leaves some out gets the others as they
-    were. The broker reports what was held or absent (`caviar_broker.recordings`), with the recorded cause.
+    were. The broker reports what was held or absent (`caviar_broker.run_record`), with the recorded cause.
 
     Args:
         settings: The recording.

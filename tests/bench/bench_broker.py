@@ -35,8 +35,7 @@ from typing import Any
 
 import zmq
 
-from caviar_broker.bench.client import deliveries
-from caviar_broker.bench.run import WARM_UP, measure
+from caviar_broker.bench import WARM_UP, deliveries, measure
 
 HEADER = bytes(60)
 """Stands for what the broker tells with each product."""

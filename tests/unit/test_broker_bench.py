@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from caviar_broker.bench.client import Topology, deliveries, parts
-from caviar_broker.bench.run import measure
+from caviar_broker.bench import Topology, deliveries, measure, parts
 from caviar_broker.core.graph import build_graph
 from caviar_clients.cli.main import app
 from caviar_protocol import messages as m
@@ -67,7 +66,7 @@ def test_figures_of_a_run_agree(tmp_path: Path, curve: bool) -> None:
 def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("caviar_broker.bench.run.measure", lambda *_, **__: pytest.fail("measured"))
+    monkeypatch.setattr("caviar_broker.bench.measure", lambda *_, **__: pytest.fail("measured"))
     result = CliRunner().invoke(app, ["bench", "broker", "--json", str(tmp_path)])
     assert isinstance(result.exception, RunError)
     assert str(result.exception) == f"cannot write {tmp_path}: Is a directory; choose another file"
@@ -76,16 +75,16 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
 def test_a_client_that_cannot_take_part_ends_the_measurement_with_its_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("caviar_broker.bench.run.CONNECT_NS", 1_000_000_000)
-    monkeypatch.setattr("caviar_broker.bench.run.CLIENT", "caviar_broker.no_such_module")
+    monkeypatch.setattr("caviar_broker.bench.CONNECT_NS", 1_000_000_000)
+    monkeypatch.setattr("caviar_broker.bench.CLIENT", "caviar_broker.no_such_module")
     with pytest.raises(RunError, match="did not connect"):
         measure("hub", 2, 10, 20)
 
 
 def test_with_keys_a_client_without_one_is_not_let_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """What `--curve` measures is a broker that refuses everybody else."""
-    monkeypatch.setattr("caviar_broker.bench.run.CONNECT_NS", 1_000_000_000)
-    monkeypatch.setattr("caviar_broker.bench.run.KEY_VARIABLE", "NOBODY_READS_THIS")
-    monkeypatch.setattr("caviar_broker.bench.run.BROKER_KEY_VARIABLE", "NOR_THIS")
+    monkeypatch.setattr("caviar_broker.bench.CONNECT_NS", 1_000_000_000)
+    monkeypatch.setattr("caviar_broker.bench.KEY_VARIABLE", "NOBODY_READS_THIS")
+    monkeypatch.setattr("caviar_broker.bench.BROKER_KEY_VARIABLE", "NOR_THIS")
     with pytest.raises(RunError, match="did not connect"):
         measure("hub", 2, 10, 20, curve=True)

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from caviar_clients.cli.measure import _other_reference
-from caviar_clients.plots.labels import Box, place_labels, spots
+from caviar_clients.plots.style import Box, place_labels, spots
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.errors import Row, error_fields
 from caviar_clients.tradeoff.ladder import REFERENCES

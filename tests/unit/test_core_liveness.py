@@ -8,7 +8,7 @@ import pytest
 from core_harness import MS, SECOND, Simulation, agent, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.liveness import MAX_LOSSES
+from caviar_broker.core.membership import MAX_LOSSES
 from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m

@@ -10,7 +10,6 @@ import pytest
 from recording_builders import channel, lidar, link, scene
 
 from caviar_clients.cli.plot import beam_amplitude
-from caviar_clients.plots.labels import Labels, common_prefix
 from caviar_clients.plots.map import (
     RECEIVER,
     WITHOUT_LOS,
@@ -26,6 +25,7 @@ from caviar_clients.plots.map import (
 )
 from caviar_clients.plots.rays import rays
 from caviar_clients.plots.sensors import draw_scan, range_image
+from caviar_clients.plots.style import Labels, common_prefix
 from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan

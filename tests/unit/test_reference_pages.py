@@ -12,7 +12,7 @@ import typer
 
 from caviar_clients.cli.main import app
 from caviar_protocol.scenario.schema import DeviceSpec, Limits, Run, ServiceSpec, Timeouts
-from caviar_services.scenario_schema import settings_classes
+from caviar_services.registry import settings_classes
 
 ROOT = Path(__file__).resolve().parents[2]
 

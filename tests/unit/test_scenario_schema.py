@@ -16,7 +16,7 @@ import pytest
 from caviar_clients.cli import main as command
 from caviar_protocol.errors import CaviarError
 from caviar_protocol.scenario import find_scenario, parse_scenario, shipped_scenarios
-from caviar_services.scenario_schema import scenario_schema
+from caviar_services.registry import scenario_schema
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [*sorted((ROOT / "deploy" / "caviar_scenarios").rglob("*.toml")), ROOT / "clients/minimal/world.toml"]

@@ -21,9 +21,8 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.checkpoints import PayloadSize
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
-from caviar_broker.core.liveness import Liveness
+from caviar_broker.core.membership import Liveness, Registration
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.registration import Registration
 from caviar_broker.core.run import Peer, Resumption, Run, Snapshot
 from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.transitions import RunState, ServiceState

@@ -134,7 +134,7 @@ def schema(
     import json
 
     from caviar_clients.files import write_file
-    from caviar_services.scenario_schema import scenario_schema
+    from caviar_services.registry import scenario_schema
 
     text = json.dumps(scenario_schema(), indent=1, ensure_ascii=False)
     if out is None:

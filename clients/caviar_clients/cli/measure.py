@@ -69,7 +69,7 @@ def measure_broker(
         curve: Whether connections have keys and are encrypted.
         json_file: Where the figures are written; None: nowhere.
     """
-    from caviar_broker.bench.run import measure
+    from caviar_broker.bench import measure
 
     require_writable(json_file)  # before minutes of measuring
     measured = measure(topology, services, payload, frames, curve=curve)

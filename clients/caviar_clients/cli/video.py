@@ -15,10 +15,10 @@ from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scener
 from caviar_clients.cli.shared import progress_bar
 from caviar_clients.files import make_folder_of
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
-from caviar_clients.plots.labels import common_prefix
 from caviar_clients.plots.map import Mark, View, chosen_beam, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.rays import rays, scale
+from caviar_clients.plots.style import common_prefix
 from caviar_clients.plots.user_curves import UserSeries, choose_user, series
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import RecordingError, SetupError

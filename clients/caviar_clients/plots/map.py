@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.labels import Labels, name_objects
 from caviar_clients.plots.rays import OUTLINE, Footprints, Rays, from_above, rays, scale
 from caviar_clients.plots.style import (
     BLACK,
@@ -23,9 +22,11 @@ from caviar_clients.plots.style import (
     ORANGE,
     SKY,
     VERMILION,
+    Labels,
     figure,
     legend_below,
     legend_square,
+    name_objects,
 )
 from caviar_protocol.arrays import Float64Array, Int32Array
 from caviar_protocol.space.coordinates import rotation_matrix

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.labels import Labels
 from caviar_clients.plots.map import (
     BEAM_ALPHA,
     RECEIVERS,
@@ -29,7 +28,7 @@ from caviar_clients.plots.map import (
 )
 from caviar_clients.plots.rays import Footprints, rays
 from caviar_clients.plots.sensors import SKY_GREY
-from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, styled
+from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, Labels, styled
 from caviar_clients.plots.user_curves import UserSeries, curves, shade
 from caviar_protocol.arrays import UInt8Array
 

@@ -22,7 +22,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.journal import JournalFile
-from caviar_broker.recordings import with_replay
+from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.session.base import Frame, Session, declared
 from caviar_clients.session.direct import DirectFrames, plays_directly

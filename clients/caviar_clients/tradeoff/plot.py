@@ -8,8 +8,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from caviar_clients.plots.labels import place_labels
-from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure
+from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure, place_labels
 from caviar_clients.tradeoff.errors import Row
 from caviar_clients.tradeoff.report import Point, Report
 
