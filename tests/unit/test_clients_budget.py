@@ -12,9 +12,9 @@ import pytest
 from recording_builders import record_run
 from rich.console import Console
 
-from caviar_clients.budget.forecast import forecast, rounded_up
 from caviar_clients.cli.measure import budget_run, forecast_lines
 from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, outcomes_of, timings_of
+from caviar_clients.session.budget import forecast, rounded_up
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording
@@ -179,7 +179,7 @@ def test_figures_are_written_as_json(smoke: RecordedRun, tmp_path: Path) -> None
 def test_a_file_that_cannot_be_written_is_named_before_anything_is_worked_out(
     smoke: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("caviar_clients.budget.forecast.forecast", lambda _: pytest.fail("worked out"))
+    monkeypatch.setattr("caviar_clients.session.budget.forecast", lambda _: pytest.fail("worked out"))
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
         budget_run(smoke.recording.path, Console(), tmp_path)
 

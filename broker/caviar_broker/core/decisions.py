@@ -1,7 +1,8 @@
 """Tasks of an episode and what is decided about their products: once, in order, entered in the journal.
 
 A *task* is one service's part of one frame. Once it is decided, each of its topics has a `Decision`: what
-consumers get. `DecisionTable` holds both; `Ledger` says which decisions are safe in the journal.
+consumers get: a fresh product, a *held* one (the newest of an earlier frame again), or its absence.
+`DecisionTable` holds both; `Ledger` says which decisions are safe in the journal.
 """
 
 from __future__ import annotations

@@ -37,9 +37,9 @@ from caviar_services.registry import load
 
 # A command loads its own part of the package and not that of the others.
 if TYPE_CHECKING:
-    from caviar_clients.budget.forecast import Forecast, ServiceForecast
     from caviar_clients.conform import Verdict
     from caviar_clients.conform.client import Rules
+    from caviar_clients.session.budget import Forecast, ServiceForecast
     from caviar_clients.tradeoff.campaign import Progress as CampaignProgress
     from caviar_clients.tradeoff.report import Options, Report
     from caviar_services.channel.stability.case import Case
@@ -104,8 +104,8 @@ def budget_run(run: Path, console: Console, json_file: Path | None = None) -> Fo
         RecordingError: There is no recording, or no latencies beside it.
         RunError: The file cannot be written; nothing was worked out then.
     """
-    from caviar_clients.budget.forecast import forecast
     from caviar_clients.replay.recorded import RecordedRun
+    from caviar_clients.session.budget import forecast
     from caviar_protocol.recording import Recording
 
     recording = Recording(run)

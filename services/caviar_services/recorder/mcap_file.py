@@ -58,6 +58,7 @@ class McapFile:
         >>> file.add_message(channel, 7, 100, 100, b"3.5")
         >>> file.end_chunk()
         >>> file.finish()
+        >>> _ = stream.seek(0)
         >>> [message.data for _, _, message in make_reader(stream).iter_messages()]
         [b'3.5']
     """

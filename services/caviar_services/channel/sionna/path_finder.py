@@ -1,8 +1,8 @@
 """How the ray-traced channel finds the paths of a frame: by launches, by enumeration, or by both.
 
 Reflections are launched in every frame, followed from frame to frame (`tracking`), or enumerated
-(`enumeration.path_solver`); paths of other kinds are launched. Diffuse paths may have a launch of their own,
-and transmitters far from every edge one without diffraction. Which of these there are is fixed by the
+(`enumeration.enumerated_paths`); paths of other kinds are launched. Diffuse paths may have a launch of their
+own, and transmitters far from every edge one without diffraction. Which of these there are is fixed by the
 settings, and `PathFinder.compile_kernels` has all of them compiled before the first frame.
 """
 
@@ -20,7 +20,7 @@ from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.arrays.element_visibility import outermost
-from caviar_services.channel.enumeration.path_solver import EnumeratedTracer
+from caviar_services.channel.enumeration.enumerated_paths import EnumeratedTracer
 from caviar_services.channel.enumeration.scenery_chains import (
     ChainCache,
     KnownScenery,

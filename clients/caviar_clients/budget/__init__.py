@@ -1,1 +1,0 @@
-"""What frame rate a recorded run would sustain."""
