@@ -43,6 +43,11 @@ def welded(mesh: Mesh) -> Mesh:
     Returns:
         The mesh with one vertex for each place, faces in their order; faces that lose a side by it, and
         vertices of no face, are gone.
+
+    Example:
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        >>> len(welded(Mesh(corners, np.array([[0, 1, 2], [3, 4, 5]], np.int32))).vertices)
+        4
     """
     vertices, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
     return _used(Mesh(vertices, inverse.reshape(-1)[mesh.faces].astype(np.int32)))

@@ -99,6 +99,12 @@ def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: F
         antennas: All at this end.
         which: Index of the antenna of each path, Shape ``[P]``.
         directions: Unit vectors from the antenna towards the path, Shape ``[P, 3]``.
+
+    Example:
+        >>> element = Patterns().of(AntennaArray())
+        >>> mast = Antenna("bs", AntennaArray(), np.zeros(3), np.eye(3), np.zeros(3), element)
+        >>> antenna_fields([mast], np.array([0]), np.array([[1.0, 0.0, 0.0]])).tolist()
+        [[0.0, 0.0, -1.0]]
     """
     # With one base station, a mask over all paths would only copy them.
     if len(antennas) == 1:

@@ -21,7 +21,12 @@ from caviar_services.channel.paths import Antenna, PathTable
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """N boxes of any orientation."""
+    """N boxes of any orientation.
+
+    Example:
+        >>> Boxes.aligned([((10, -1, 0), (12, 1, 3))]).centre.tolist()
+        [[11.0, 0.0, 1.5]]
+    """
 
     names: tuple[str, ...]
     centre: Float64Array
@@ -230,6 +235,11 @@ def spread_anew(
         specular: Paths of reflections and transmissions, whose field falls as one over the length, ``[P]``.
         traced: Length as traced [m], Shape ``[P]``.
         length: Length of the path [m], Shape ``[P]``.
+
+    Example:
+        >>> dyads = np.ones((1, 1, 3, 3), np.complex128)
+        >>> spread_anew(dyads, np.array([True]), np.array([10.0]), np.array([20.0]))[0, 0, 0, 0]
+        np.complex128(0.5+0j)
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.where(specular & (length > 0), traced / length, 1.0)

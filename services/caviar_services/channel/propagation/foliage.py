@@ -53,6 +53,12 @@ def outward(mesh: Mesh) -> Float64Array:
 
     Raises:
         ValueError: Edges are open, or have both triangles on one side; says how many.
+
+    Example:
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> crown = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
+        >>> outward(crown).shape
+        (4, 3, 3)
     """
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     corners = place.reshape(-1)[mesh.faces]

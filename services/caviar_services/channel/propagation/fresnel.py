@@ -141,6 +141,14 @@ def reflection_fields(
 
     Returns:
         Dyads of `PathTable` with the spreading λ/(4πd) of the paths' lengths, Shape ``[C, P, 3, 3]``.
+
+    Example:
+        >>> nothing = np.zeros((1, 1, 0))
+        >>> free = Media(nothing, nothing, nothing[0], nothing[0])
+        >>> corners, none = np.array([[[0.0, 0, 0], [10.0, 0, 0]]]), np.zeros((1, 0))
+        >>> fields = reflection_fields(corners, np.array([0]), np.zeros((1, 0, 3)), none > 0, free, [0.01])
+        >>> [round(1e6 * abs(x)) for x in np.diag(fields[0, 0])]  # λ/(4πd), across the path alone
+        [0, 80, 80]
     """
     steps = np.diff(corners, axis=1)
     lengths = np.sqrt(np.einsum("pdc,pdc->pd", steps, steps))

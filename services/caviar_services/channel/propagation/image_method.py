@@ -65,6 +65,13 @@ def refined_points(
         triangles: Corners [m] of the triangle at each interaction, Shape ``[P, D, 3, 3]``.
         edges: Both ends [m] of the edge of each path that is diffracted, Shape ``[P, 2, 3]``; None: none is.
         traced_ends: From where and to where the points were traced, where that was not from start to end.
+
+    Example:
+        >>> start, end = np.array([[0.0, 0.0, 3.0]]), np.array([[8.0, 0.0, 1.0]])
+        >>> ground = np.array([[[[0.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 9.0, 0.0]]]])
+        >>> types = np.array([[Interaction.REFLECTION]], np.uint8)
+        >>> refined_points(start, np.array([[[5.9999, 1e-4, 0.0]]]), end, types, ground).round(9).tolist()
+        [[[6.0, 0.0, 0.0]]]
     """
     some = np.flatnonzero((types != 0).any(1))
     if not len(some):
@@ -119,7 +126,14 @@ def path_lengths(
     start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
 ) -> Float64Array:
     """Lengths [m] of the paths start → points → end, Shape ``[P]``; the arguments are those of
-    `refined_points`."""
+    `refined_points`.
+
+    Example:
+        >>> start, end = np.array([[0.0, 0.0, 3.0]]), np.array([[8.0, 0.0, 3.0]])
+        >>> types = np.array([[Interaction.REFLECTION]], np.uint8)
+        >>> path_lengths(start, np.array([[[4.0, 0.0, 0.0]]]), end, types).tolist()
+        [10.0]
+    """
     unused = (types == 0)[..., None]
     corners = np.concatenate([start[:, None], np.where(unused, end[:, None], points), end[:, None]], axis=1)
     length: Float64Array = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1)).sum(-1)
@@ -270,6 +284,11 @@ def distinct(pair: Int64Array, types: UInt8Array, points: Float64Array) -> BoolA
 
     Returns:
         Which paths are kept, Shape ``[P]``.
+
+    Example:
+        >>> types, points = np.full((2, 1), Interaction.REFLECTION, np.uint8), np.full((2, 1, 3), 4.0)
+        >>> distinct(np.array([0, 0]), types, points).tolist()
+        [True, False]
     """
     kept: BoolArray = (types == Interaction.SCATTERING).any(1)
     some = np.flatnonzero(~kept)

@@ -91,7 +91,12 @@ class ElementPattern(ABC):
 
 @dataclass(frozen=True)
 class FormulaPattern(ElementPattern):
-    """A pattern by its name in `AntennaArray`; see `element_amplitude`."""
+    """A pattern by its name in `AntennaArray`; see `element_amplitude`.
+
+    Example:
+        >>> FormulaPattern("iso").amplitude(np.array([[1.0, 0.0, 0.0]])).tolist()
+        [1.0]
+    """
 
     name: str
 
@@ -199,6 +204,11 @@ def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Ar
 
     Returns:
         Fields in device axes, Shape ``[P, 3]``.
+
+    Example:
+        >>> ahead = np.array([[1.0, 0.0, 0.0]])
+        >>> polarized_field(FormulaPattern("iso"), "V", ahead).tolist()
+        [[0.0, 0.0, -1.0]]
     """
     cosine, sine = jones(polarization)
     along_theta, along_phi = pattern.along_theta_phi(local)

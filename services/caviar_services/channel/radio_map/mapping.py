@@ -104,6 +104,10 @@ def decibels(values: Float64Array, reference: float = 1.0) -> Float64Array:
 
     Returns:
         10·log10(values / reference) [dB]; NaN for 0 and for NaN.
+
+    Example:
+        >>> decibels(np.array([1e-9, 0.0])).tolist()
+        [-90.0, nan]
     """
     positive = values > 0
     return np.where(positive, 10 * np.log10(np.where(positive, values, 1.0) / reference), np.nan)
@@ -172,13 +176,23 @@ def draped_surface(area: Area, cell: float, height: float, ground: Float64Array)
         cell: See ``area``.
         height: Of the cells' corners above the highest ground there [m].
         ground: Triangles [m], Shape ``[F, 3, 3]``.
+
+    Example:
+        >>> hill = np.array([[[0.0, 0, 7], [9, 0, 7], [0, 9, 7]]])
+        >>> draped_surface((0.0, 0.0, 4.0, 4.0), 2.0, 1.5, hill).shape
+        (2, 2)
     """
     x, y = _edges(area, cell)
     return MeasurementSurface(x, y, heights(ground, x, y) + height)
 
 
 def cell_counts(area: Area, cell: float) -> tuple[int, int]:
-    """Number of cells ``(ny, nx)`` that an area [m] needs in cells of one side [m]."""
+    """Number of cells ``(ny, nx)`` that an area [m] needs in cells of one side [m].
+
+    Example:
+        >>> cell_counts((0.0, 0.0, 10.0, 5.0), 2.0)
+        (3, 5)
+    """
     x0, y0, x1, y1 = area
     return max(1, math.ceil((y1 - y0) / cell - 1e-9)), max(1, math.ceil((x1 - x0) / cell - 1e-9))
 

@@ -261,5 +261,10 @@ def angles(vector: Vector) -> tuple[float, float]:
 
 
 def dot(a: Vector, b: Vector) -> float:
-    """Inner product."""
+    """Inner product.
+
+    Example:
+        >>> dot((1.0, 2.0, 3.0), (1.0, 0.0, 1.0))
+        4.0
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
