@@ -10,7 +10,7 @@ and a single figure, by table, row and column, within a sentence::
 
     about <!-- figure: keyframes | siso-rt 1e5 d3, keyframes every 2 | NMSE dB -->−7.4<!-- end --> dB
 
-``python docs/figures.py measure [NAME …]`` runs the commands that tables of the channel come from, and takes
+``python docs/figures.py measure [NAME …]`` runs the commands that tables come from, and takes
 these over: in a short form of minutes, or in the long one with ``--full``. ``python docs/figures.py record
 NAME FILE`` takes over a single table from the Markdown that a command wrote (``caviar stability --markdown``,
 ``tests/bench``), and ``python docs/figures.py render`` writes into all pages what the file says. A test
@@ -40,6 +40,8 @@ FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examp
 _BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar tradeoff street-canyon"
 _BASE = "'siso-rt enumerated d3'"
 _STATED = "python tests/bench/bench_stated_errors.py"
+_BROKER = "python tests/bench/bench_broker.py --services 2 4 8 --kinds bare broker --transport tcp ipc"
+_DIFFUSE, _FOLLOW = "python tests/bench/bench_diffuse.py", "python tests/bench/bench_follow.py"
 
 
 class Measurement(NamedTuple):
@@ -55,6 +57,24 @@ class Measurement(NamedTuple):
 
 
 MEASUREMENTS: Mapping[str, Measurement] = {
+    "broker": Measurement(
+        f"{_BROKER} --rounds 3 --markdown {{out}}/broker.md",
+        f"{_BROKER} --markdown {{out}}/broker.md",
+        "broker.md",
+        {"broker-transports": ""},
+    ),
+    "detail": Measurement(
+        "python tests/bench/bench_detail.py --frames 10 --rounds 1 --markdown {out}/detail.md",
+        "python tests/bench/bench_detail.py --markdown {out}/detail.md",
+        "detail.md",
+        {"mesh-detail": ""},
+    ),
+    "diffuse": Measurement(
+        f"{_DIFFUSE} --paths 300 500 0 --scenes 10 --markdown {{out}}/diffuse.md",
+        f"{_DIFFUSE} --paths 300 500 0 --markdown {{out}}/diffuse.md",
+        "diffuse.md",
+        {"diffuse-paths": ""},
+    ),
     "enumerated": Measurement(
         f"{_BENCH} --scene street-canyon uav munich --frames 4 --rays 500000 --launches 2 --own-rays 500000 "
         "--own-launches 2 --markdown {out}/enumerated.md",
@@ -62,11 +82,23 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "enumerated.md",
         {"enumerated": ""},
     ),
+    "follow": Measurement(
+        f"{_FOLLOW} --frames 60 --markdown {{out}}/follow.md",
+        f"{_FOLLOW} --markdown {{out}}/follow.md",
+        "follow.md",
+        {"followed-rays": ""},
+    ),
     "keyframes": Measurement(
         f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 3 --out {{out}}",
         f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 13 --out {{out}}",
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
+    ),
+    "processes": Measurement(
+        "python tests/bench/bench_processes.py street-canyon --markdown {out}/processes.md",
+        "python tests/bench/bench_processes.py street-canyon --frames 400 --markdown {out}/processes.md",
+        "processes.md",
+        {"processes": ""},
     ),
     "stability": Measurement(
         "caviar stability --markdown {out}/stability.md",
@@ -97,8 +129,14 @@ MEASUREMENTS: Mapping[str, Measurement] = {
             "tradeoff-convergence": "Convergence",
         },
     ),
+    "wideband": Measurement(
+        "python tests/bench/bench_wideband.py --sionna --frames 5 --markdown {out}/wideband.md",
+        "python tests/bench/bench_wideband.py --sionna --markdown {out}/wideband.md",
+        "wideband.md",
+        {"wideband-times": "Times", "wideband-sionna": "Sionna RT"},
+    ),
 }
-"""What tables of the channel come from, by the name that ``measure`` takes."""
+"""What tables come from, by the name that ``measure`` takes."""
 
 _TABLE = re.compile(
     r"^(?P<indent> *)(?P<begin><!-- table: (?P<what>.*?) -->\n).*?(?P<end><!-- end -->)$",

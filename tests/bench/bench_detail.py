@@ -1,6 +1,6 @@
 """What mesh detail costs and saves: the ray-traced channel in Munich at several levels.
 
-    python tests/bench/bench_detail.py --json detail.json
+    python tests/bench/bench_detail.py [--json FILE] [--markdown FILE]
 
 Each level traces the same receivers, around one transmitter above the streets, among cars that move in
 every frame; errors are against full detail, in the first frame. NMSE of H is that of all receivers together,
@@ -16,7 +16,9 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import re
 import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +49,8 @@ LEVELS: dict[str, dict[str, Any]] = {
     "near, decimated": {"centre_m": [8.5, 21.0], "radius_m": 250.0, "tolerance_m": 0.5},
     "coarse": {"centre_m": [8.5, 21.0], "radius_m": 150.0, "smallest_m": 25.0, "tolerance_m": 2.0},
 }
+EQUAL_DB = -299.0
+"""[dB] of equal matrices, and less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +185,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--settings", type=json.loads, default={}, help="JSON, as in a scenario")
     parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--markdown", type=Path, help="where the figures go as a table")
     options = parser.parse_args()
 
     rng = np.random.default_rng(3)
@@ -211,6 +216,32 @@ def main() -> None:
         print(json.dumps(row, ensure_ascii=False))
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    if options.markdown:
+        options.markdown.write_text(as_markdown(rows), "utf-8")
+
+
+def as_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A table with a line for each level of `LEVELS`."""
+    lines = [
+        "| detail | what is left | CPU ms | NMSE of H | path gain, worst |",
+        "| --- | --- | ---: | ---: | ---: |",
+    ]
+    for row in rows:
+        errors = ["–", "–"]
+        if row["level"] != "full":
+            is_equal = row["nmse_db"] <= EQUAL_DB
+            errors = [
+                "equal" if is_equal else f"{row['nmse_db']:.1f} dB",
+                f"{row['path_gain_error_db_worst']:.1f} dB",
+            ]
+        cells = [
+            row["level"],
+            row["effect"].removeprefix("mesh detail: "),
+            f"{row['cpu_ms_median']:.0f}",
+            *errors,
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return re.sub(r"(?<![\w-])-(?=\d)", "−", "\n".join(lines)) + "\n"
 
 
 if __name__ == "__main__":

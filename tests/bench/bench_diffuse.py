@@ -1,6 +1,6 @@
 """What diffuse scattering costs in the street canyon, and how far two seeds are apart with it.
 
-    python tests/bench/bench_diffuse.py --samples 10000 30000 --paths 500 0 --json diffuse.json
+    python tests/bench/bench_diffuse.py --samples 10000 30000 --paths 500 0 [--json FILE] [--markdown FILE]
 
 Takes scenes of ``street-canyon``, every material with the scattering coefficient that
 the trade of speed for accuracy takes (0.4), and steps by turns a channel without diffuse paths and two with
@@ -104,6 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--depth", type=int, default=3, help="interactions of a path at most")
     parser.add_argument("--scenes", type=int, default=25, help="with ten users each")
     parser.add_argument("--json", type=Path, help="write the rows here")
+    parser.add_argument("--markdown", type=Path, help="where the figures go as a table")
     options = parser.parse_args(arguments)
     scenes = scenes_of(SCENARIO, options.scenes)
     rows = []
@@ -112,6 +113,36 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(json.dumps(rows[-1], ensure_ascii=False), flush=True)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    if options.markdown:
+        options.markdown.write_text(as_markdown(rows, options.depth, options.scenes), "utf-8")
+
+
+def as_markdown(rows: Sequence[Mapping[str, Any]], depth: int, scenes: int) -> str:
+    """A table with a column for each number of paths of a receiver, `rows` being those of `measured`."""
+    samples = " and ".join(f"{n:,}" for n in sorted({row["samples"] for row in rows}))
+    title = (
+        f"street canyon, S = 0.4, 1e5 rays and {samples} for diffuse paths, depth {depth}, {scenes} scenes"
+    )
+    columns = [
+        f"`scattering_paths = {row['scattering_paths']}`" if row["scattering_paths"] else "absent"
+        for row in rows
+    ]
+    lines: dict[str, list[str]] = {
+        "paths of a scene": [f"{row['paths']:,.0f}" for row in rows],
+        "time of a scene, H included, as a multiple of that without scattering": [
+            f"{row['factor']:.1f}" for row in rows
+        ],
+        "processor time, likewise": [f"{row['processor_factor']:.1f}" for row in rows],
+    }
+    for label, key in (("two seeds", "seeds"), ("other rays", "other_rays")):
+        lines[f"{label}: 95 % of users differ in path gain by less than"] = [
+            f"{row[key]['path_gain_error_db_p95']:.2f} dB" for row in rows
+        ]
+        lines[f"{label}: users with the same best pair of beams"] = [
+            f"{100 * row[key]['beam_top1']:.1f} %" for row in rows
+        ]
+    head = [f"| {title} | {' | '.join(columns)} |", "| --- |" + " ---: |" * len(rows)]
+    return "\n".join([*head, *(f"| {name} | {' | '.join(cells)} |" for name, cells in lines.items())]) + "\n"
 
 
 if __name__ == "__main__":

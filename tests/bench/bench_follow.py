@@ -1,6 +1,7 @@
 """Paths that are followed from frame to frame, beside those that all rays find anew in each frame.
 
     python tests/bench/bench_follow.py [--frames N] [--samples N] [--follow N] [--json FILE]
+                                       [--markdown FILE]
 
 Munich, cars that drive through a street, ten of them with an array of 8 elements, a base station with 64. The
 two take turns frame by frame, with Sionna RT's own path solver in some of the frames. What following
@@ -146,6 +147,7 @@ def main() -> None:
     parser.add_argument("--follow", type=int, default=20, help="frames until all rays were launched")
     parser.add_argument("--every", type=int, default=20, help="frames between those held against more rays")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path, help="where the figures go as a table")
     told = parser.parse_args()
     with TemporaryDirectory() as folder:
         assets = {}
@@ -195,6 +197,33 @@ def main() -> None:
         print(f"{name:32} {value}")
     if told.json:
         told.json.write_text(json.dumps(figures, indent=2) + "\n")
+    if told.markdown:
+        title = (
+            f"Munich, {told.cars} cars, {RECEIVERS} receivers, {told.samples:.0e} rays, depth {DEPTH}, "
+            f"{told.frames} frames, `follow = {told.follow}`"
+        )
+        told.markdown.write_text(as_markdown(title.replace("e+0", "e"), figures), "utf-8")
+
+
+def as_markdown(title: str, figures: Mapping[str, Any]) -> str:
+    """A table: what all rays and what following finds, of what ten times as many rays find."""
+    recall_of, nmse_of = figures["recall_of_ten_times_the_rays"], figures["nmse_to_ten_times_the_rays_db"]
+    sides = ("all rays", "followed")
+    rows = {
+        "recall of reflected power that ten times the rays find, mean": [
+            f"{100 * recall_of[side]:.1f} %" for side in sides
+        ],
+        "NMSE of H against ten times the rays": [
+            f"{nmse_of[side]:.1f} dB".replace("-", "−") for side in sides
+        ],
+        "recall of what all rays find, 5th percentile of receivers and frames": [
+            "–",
+            f"{100 * figures['recall_5th_percentile']:.0f} %",
+        ],
+        "time of a frame to that of all rays": ["1", f"{1 / figures['factor_to_all_rays']:.2f}"],
+    }
+    lines = [f"| {title} | all rays in each frame | followed |", "| --- | ---: | ---: |"]
+    return "\n".join([*lines, *(f"| {name} | {' | '.join(cells)} |" for name, cells in rows.items())]) + "\n"
 
 
 if __name__ == "__main__":
