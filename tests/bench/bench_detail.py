@@ -120,7 +120,7 @@ def done(task: Task) -> Outcome:
     model, ready, notes = prepared(task.detail, **{"bodies": task.cars, **task.settings})
     return Outcome(
         prepare_s=ready,
-        effect=next(note for note in notes if note.startswith("mesh detail")),
+        effect=next((note for note in notes if note.startswith("mesh detail")), "everything"),
         channel=traced(model, scene(task.places, task.cars)),
         times_ms=[taken(model, scene(task.places, task.cars, frame)) for frame in range(task.frames)],
     )

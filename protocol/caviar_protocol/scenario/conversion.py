@@ -1,4 +1,4 @@
-"""Conversion of scenario tables to structs, with errors that say what to write instead."""
+"""Checks of scenario tables against the schema, and their conversion to structs; errors say what to write."""
 
 from __future__ import annotations
 

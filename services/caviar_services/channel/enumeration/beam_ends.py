@@ -16,7 +16,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_services.channel.enumeration.image_beams import (
-    Beams,
+    ImageBeams,
     Targets,
     filtered,
     first_beams,
@@ -53,12 +53,12 @@ class SceneryViews:
     """Face of each, by index into ``faces``, Shape ``[W]``."""
 
 
-def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> Beams:
+def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> ImageBeams:
     """The beam of what a receiver [m] sees in a face of scenery, of Shapes ``[W, 3]`` and ``[W]``."""
     return reflected_beams(targets, faces[:, None], places(receivers), None)
 
 
-def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
+def ends_at(targets: Targets, beams: ImageBeams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
     """Beam and receiver of each pair where the beam lights the receiver; receivers [m] have the Shape
     ``[R, 3]``."""
     place = places(receivers)
@@ -74,7 +74,7 @@ def ends_at(targets: Targets, beams: Beams, receivers: Float64Array) -> tuple[In
 
 
 def ends_by_bodies(
-    targets: Targets, beams: Beams, receivers: Float64Array
+    targets: Targets, beams: ImageBeams, receivers: Float64Array
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
 
@@ -103,7 +103,7 @@ def ends_by_bodies(
 
 
 def ends_by_scenery(
-    targets: Targets, beams: Beams, receivers: Float64Array, scenery: SceneryViews
+    targets: Targets, beams: ImageBeams, receivers: Float64Array, scenery: SceneryViews
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Beam by way of a body, face of scenery and receiver wherever the beam may light the receiver by a
     reflection at the face.
@@ -167,7 +167,9 @@ def ends_by_scenery(
     return beam, scenery.faces[scenery.place[seen]], scenery.receiver[seen]
 
 
-def shown_scenery(targets: Targets, views: Beams, scenery: SceneryViews) -> tuple[Int64Array, Int64Array]:
+def shown_scenery(
+    targets: Targets, views: ImageBeams, scenery: SceneryViews
+) -> tuple[Int64Array, Int64Array]:
     """Which faces of scenery receivers see by a reflection in another one.
 
     Args:
@@ -271,7 +273,7 @@ def chain_pairs(
         return ChainPairs.joined(found, depth)
     length = (scenery >= 0).sum(1)
 
-    def add(beams: Beams) -> None:
+    def add(beams: ImageBeams) -> None:
         if len(beams):
             beam, receiver = ends_at(targets, beams, receivers)
             found.append((beams.chain[beam], receiver))

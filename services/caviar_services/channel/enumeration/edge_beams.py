@@ -23,7 +23,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.beam_ends import SceneryViews, shown_scenery
 from caviar_services.channel.enumeration.image_beams import (
-    Beams,
+    ImageBeams,
     Targets,
     by_scenery,
     columns,
@@ -220,7 +220,7 @@ def edge_chains(
 class _Lit:
     """Pairs of a beam and an edge that the beam may light."""
 
-    beams: Beams
+    beams: ImageBeams
     owner: Int64Array
     """Receiver of each beam, Shape ``[B]``; 0 for beams of the transmitter."""
     beam: Int64Array
@@ -229,7 +229,7 @@ class _Lit:
 
 def _from_transmitter(
     targets: Targets, scenery: Int64Array, views: SceneryViews, transmitter: Float64Array
-) -> Iterator[Beams]:
+) -> Iterator[ImageBeams]:
     """Beams of the transmitter after no reflection, one, and so on, up to one less than the depth."""
     depth, length = scenery.shape[1], (scenery >= 0).sum(1)
     yield _source_beams(transmitter[None])
@@ -250,7 +250,7 @@ def _from_transmitter(
 
 def _from_receivers(
     targets: Targets, views: SceneryViews, receivers: Float64Array, depth: int
-) -> Iterator[tuple[Beams, Int64Array]]:
+) -> Iterator[tuple[ImageBeams, Int64Array]]:
     """Beams of the receivers in the same order, with the receiver of each beam."""
     yield _source_beams(receivers), np.arange(len(receivers))
     if depth == 1:
@@ -279,7 +279,7 @@ def _from_receivers(
         yield beams, owner
 
 
-def _onward(targets: Targets, beams: Beams, views: SceneryViews) -> tuple[Int64Array, Int64Array]:
+def _onward(targets: Targets, beams: ImageBeams, views: SceneryViews) -> tuple[Int64Array, Int64Array]:
     """Pairs of a beam and a face that it lights; beams of scenery alone, those of ``views``, come first."""
     view, place = shown_scenery(targets, beams, views)
     of_body = by_scenery(targets, beams, views.faces)
@@ -288,12 +288,12 @@ def _onward(targets: Targets, beams: Beams, views: SceneryViews) -> tuple[Int64A
     return parent, np.concatenate([views.faces[place], numbers(of_body[1]), numbers(by_body[1])])
 
 
-def _source_beams(points: Float64Array) -> Beams:
+def _source_beams(points: Float64Array) -> ImageBeams:
     """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
     count = len(points)
     none = places(np.zeros((count, 3)))
     cosine, lit_from = columns(np.tile([[-1.0], [_EVERYWHERE]], count))
-    return Beams(
+    return ImageBeams(
         chain=np.zeros((count, 0), np.int64),
         by_body=np.zeros(count, np.bool_),
         image=places(points),
@@ -306,7 +306,7 @@ def _source_beams(points: Float64Array) -> Beams:
     )
 
 
-def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: Beams, owner: Int64Array) -> _Lit:
+def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeams, owner: Int64Array) -> _Lit:
     """Edges that beams may light, except for edges of the face that reflected the beam last."""
     import drjit as dr
 
@@ -355,7 +355,7 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: Beams, ow
     return _Lit(beams, owner, of, at)
 
 
-def _outside(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge: Any) -> Any:
+def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
     """Whether images are in front of at least one face of edges."""
     import drjit as dr
 
@@ -364,7 +364,7 @@ def _outside(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge
     return dr.maximum(one, other) > -targets.slack
 
 
-def _in_beam(targets: Targets, edges: EdgeTargets, beams: Beams, beam: Any, edge: Any) -> Any:
+def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
     """Whether edges may be lit: no side of the beam has both ends beyond it."""
     import drjit as dr
 
@@ -409,7 +409,11 @@ def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> It
 
 
 def _kept(
-    targets: Targets, edges: EdgeTargets, one: tuple[Beams, Any], other: tuple[Beams, Any], edge: Any
+    targets: Targets,
+    edges: EdgeTargets,
+    one: tuple[ImageBeams, Any],
+    other: tuple[ImageBeams, Any],
+    edge: Any,
 ) -> Int64Array:
     """Indices of the pairs of beams that meet at their edge, at the point of Keller's law."""
     import drjit as dr

@@ -198,7 +198,7 @@ def _spheres(faces: FaceRectangles, first: int, sizes: Int64Array) -> tuple[Floa
 
 
 @dataclass(frozen=True, eq=False)
-class Beams:
+class ImageBeams:
     """B beams after n reflections each; attributes of type `Any` are arrays of the ray tracer."""
 
     chain: Int64Array
@@ -257,7 +257,7 @@ class Beams:
         return lit
 
 
-def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> Beams:
+def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> ImageBeams:
     """Beams of a transmitter [m], Shape ``[3]``, after one reflection: at given faces of scenery, then at all
     faces of bodies whose reflecting side the transmitter sees."""
     faces = targets.faces
@@ -267,7 +267,7 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     return reflected_beams(targets, first[:, None], places(np.tile(source, (len(first), 1))), None)
 
 
-def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64Array) -> Beams:
+def next_beams(targets: Targets, beams: ImageBeams, scenery: Int64Array, known: Int64Array) -> ImageBeams:
     """Beams after one more reflection.
 
     Args:
@@ -283,7 +283,7 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
 
     beam, face = by_scenery(targets, beams, scenery)
     of_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
-    # Beams of scenery alone come first, as everywhere: `Beams.first_by_body` divides the list.
+    # Beams of scenery alone come first, as everywhere: `ImageBeams.first_by_body` divides the list.
     chain = np.concatenate(
         [
             known,
@@ -296,18 +296,18 @@ def next_beams(targets: Targets, beams: Beams, scenery: Int64Array, known: Int64
     return longer_beams(targets, beams, parent, chain)
 
 
-def scenery_beams(targets: Targets, beams: Beams, known: Int64Array) -> Beams:
+def scenery_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageBeams:
     """Those of `next_beams` whose chains are of scenery alone."""
     return longer_beams(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
-def longer_beams(targets: Targets, beams: Beams, parent: Int64Array, chain: Int64Array) -> Beams:
+def longer_beams(targets: Targets, beams: ImageBeams, parent: Int64Array, chain: Int64Array) -> ImageBeams:
     """Beams of chains, Shape ``[B, n + 1]``, each one face longer than the chain of its parent beam."""
     index = indices(parent)
     return reflected_beams(targets, chain, gathered(beams.image, index), gathered(beams.last, index))
 
 
-def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any, Any]:
+def by_scenery(targets: Targets, beams: ImageBeams, scenery: Int64Array) -> tuple[Any, Any]:
     """Pairs of a beam by way of a body and a face of scenery that it lights, as `mitsuba.UInt`."""
     import drjit as dr
 
@@ -333,7 +333,7 @@ def by_scenery(targets: Targets, beams: Beams, scenery: Int64Array) -> tuple[Any
     return beam, face
 
 
-def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+def lit_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
     """Pairs of a beam and a face of a body whose sphere it lights, as `mitsuba.UInt`."""
     import drjit as dr
 
@@ -364,7 +364,7 @@ def lit_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     return beam, face
 
 
-def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> Beams:
+def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any | None) -> ImageBeams:
     """Beams after a reflection at the last face of each chain.
 
     Args:
@@ -376,7 +376,7 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
     import drjit as dr
 
     if not len(chain):  # kernels of no lanes do not exist
-        return Beams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
+        return ImageBeams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
     last = indices(chain[:, -1])
     normal, offset = gathered(targets.normal, last), gathered(targets.offset, last)
 
@@ -400,12 +400,12 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
     lit, lit_from = normal * away, offset * away
     dr.eval(image, axis, cosine, sides, lit, lit_from, last)
     by_body = chain >= targets.first_body
-    return Beams(
+    return ImageBeams(
         chain, np.logical_or.reduce(by_body, axis=1), image, sides, axis, cosine, last, lit, lit_from
     )
 
 
-def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
+def near_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
     """Pairs of a beam and a body whose sphere it lights, as `mitsuba.UInt`."""
 
     def near(beam: Any, body: Any) -> Any:
@@ -419,7 +419,7 @@ def near_bodies(targets: Targets, beams: Beams) -> tuple[Any, Any]:
     return filtered(lit, pairs(len(beams), targets.bodies, near))
 
 
-def lights_corner(targets: Targets, beams: Beams, beam: Any, face: Any) -> Any:
+def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> Any:
     """Whether rectangles may be lit: no side of the beam has all four corners beyond it."""
     import drjit as dr
 
