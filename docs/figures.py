@@ -36,6 +36,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures.json"
 FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examples")
 """Where pages are, beside the root."""
+CODE = ("protocol/*.py", "broker/*.py", "services/*.py", "clients/*.py", "deploy/*.toml", "tests/bench/*.py")
+"""What figures depend on."""
 
 _BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar tradeoff street-canyon"
 _BASE = "'siso-rt enumerated d3'"
@@ -293,8 +295,15 @@ def measure(measurement: Measurement, full: bool) -> None:
 
 
 def _commit() -> str:
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=7"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+    """The commit that is checked out, with ``-dirty`` where code differs from it: what another measurement
+    wrote into pages changes no figure."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(ROOT), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", *CODE)
+    return git("rev-parse", "--short=7", "HEAD") + ("-dirty" if changed else "")
 
 
 def _machine() -> str:

@@ -236,7 +236,7 @@ def as_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
             ]
         cells = [
             row["level"],
-            row["effect"].removeprefix("mesh detail: "),
+            row["effect"].removeprefix("mesh detail: ").split(";")[0],
             f"{row['cpu_ms_median']:.0f}",
             *errors,
         ]

@@ -60,7 +60,9 @@ class Model:
 
     def __init__(self, assets: Mapping[str, Path], cars: int, **settings: Any) -> None:
         run = RunInfo(name="channel", carriers=(Carrier(name="mmwave", frequency_hz=28e9),))
-        self.channel = SionnaChannel(SionnaSettings(max_depth=DEPTH, bodies=cars, **settings), run)
+        self.channel = SionnaChannel(
+            SionnaSettings(max_depth=DEPTH, bodies=cars, candidates="launched", **settings), run
+        )
         self.channel.prepare(Preparation(demand={"channel": frozenset({"h"})}, assets=assets))
         self.ms: list[float] = []
 
