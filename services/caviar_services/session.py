@@ -247,12 +247,13 @@ class ServiceSession:
     def _prepare(self, order: m.Prepare, _: Sequence[Any], now: float) -> None:
         with self._reporting("prepare"):
             service = self._running
-            # Worlds are prepared before anything is known about scenes, and a shared check is for all.
-            if self._answers is not None or service.role != "world":
-                self._check.adopt(content_rules(service, order))
+            # Before its rules are adopted: what an idle service would ask for is not in demand.
             if not is_needed(service, order):
                 self._ready(m.Ready(**self._identity))
                 return
+            # Worlds are prepared before anything is known about scenes, and a shared check is for all.
+            if self._answers is not None or service.role != "world":
+                self._check.adopt(content_rules(service, order))
             offered = [self._store.add(name, content) for name, content in sorted(service.scenery().items())]
             if offered:
                 self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())

@@ -16,7 +16,7 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario, parse_scenario
-from caviar_protocol.topics import Action, BeamChoice, Scene
+from caviar_protocol.topics import Action, BeamChoice, Channel, Scene
 from caviar_services.agent.base import Agent
 from caviar_services.service import StepResult
 from caviar_services.world.trajectory import TrajectoryWorld
@@ -120,6 +120,18 @@ def test_an_episode_to_its_end_is_the_clocks() -> None:
     direct = played(scenario, False, [5, None], 20)
     assert direct == played(scenario, True, [5, None], 20)
     assert [frame[4] for frame in direct] == [*[False] * 12, True] * 2
+
+
+@pytest.mark.parametrize("clock", [False, True])
+def test_what_a_service_without_a_consumer_would_ask_for_is_not_in_demand(
+    clock: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link takes the part `h` of a channel; nobody takes the link here."""
+    if clock:
+        monkeypatch.setattr(embedded, "plays_directly", lambda plan: False)
+    inputs = (Input(topic="scene"), Input(topic="channel"))
+    with EmbeddedSession(scenario_of("smoke"), "agent", inputs) as session:
+        assert session.reset(seed=1).only("channel", Channel).h == ()
 
 
 class Failing(TrajectoryWorld):
