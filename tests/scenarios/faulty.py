@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 import threading
@@ -61,6 +62,13 @@ class NeverAnswers(_Faulty):
 
     def go_wrong(self) -> None:
         threading.Event().wait()
+
+
+class Computes(_Faulty):
+    """Computes for minutes in a library of C, where the interpreter handles no signal."""
+
+    def go_wrong(self) -> None:
+        hashlib.pbkdf2_hmac("sha256", b"a", b"b", 2**31 - 1)
 
 
 class Circular(_Faulty):

@@ -143,3 +143,30 @@ def test_ctrl_c_ends_it_cleanly(tmp_path: Path) -> None:
         assert process.returncode == 130
         assert "stopped by Ctrl-C" in output
         assert marked(mark) == []
+
+
+@pytest.mark.parametrize(
+    ("sick", "ended"),
+    [
+        ("faulty:NeverAnswers", "ended at once, without a summary; what was recorded until then is in"),
+        ("faulty:Computes", "ended at once, from within a call that does not return"),
+    ],
+)
+def test_ctrl_c_names_the_service_that_hangs_and_a_second_one_ends_at_once(
+    tmp_path: Path, sick: str, ended: str
+) -> None:
+    changes = [('"action", "link"]', '"action", "link", "lidar"]')]
+    scenario = scenario_file(tmp_path, changes, SICK.replace("faulty:Raises", sick))
+    with running(scenario, tmp_path / "out", "--embedded") as (process, mark):
+        assert process.stdout is not None
+        eventually(lambda: recorded_below(tmp_path / "out") >= 5, 20, "frames before the one that hangs")
+        process.send_signal(signal.SIGINT)
+        assert any(
+            "stopped by Ctrl-C: waiting for sensors 'sick' in frame 5" in line for line in process.stdout
+        )
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=20)
+        assert process.returncode == 130
+        assert ended in output
+        assert marked(mark) == []
+    assert recorded_below(tmp_path / "out") == 5

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import time
 import warnings
 from collections import deque
@@ -12,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from io import StringIO
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -22,6 +20,7 @@ from rich.text import Text
 
 from caviar_broker.run_record import read_record
 from caviar_broker.security.access import check_bind
+from caviar_clients.cli.interruption import Interruption
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
@@ -63,7 +62,8 @@ class EmbeddedLauncher:
         self._pending: deque[dict[str, Any]] = deque()
         self._reported_at = 0.0
         self._log_error = ""
-        self._run = EmbeddedRun(scenario, directory, self._notice, self._frame)
+        self._stopping = ""
+        self._run = EmbeddedRun(scenario, directory, self._notice, self._frame, self._waiting)
 
     def __enter__(self) -> EmbeddedLauncher:
         return self
@@ -102,6 +102,7 @@ class EmbeddedLauncher:
 
     def stop(self, reason: str) -> None:
         """Ask for an orderly end."""
+        self._stopping = reason
         self._run.stop(reason)
 
     def log_of(self, service: str) -> Path | None:
@@ -115,6 +116,17 @@ class EmbeddedLauncher:
                 log.write(json.dumps(event, ensure_ascii=False) + "\n")
         except OSError as error:
             self._log_error = self._log_error or str(error)
+
+    def _waiting(self, text: str) -> None:
+        """Tell, from the watchdog's thread, which service the run waits for, and what ends it."""
+        event = {"event": "notice", "kind": "waiting", "service": "", "episode": 0, "frame": -1, "text": text}
+        self._log(event)
+        if self._stopping:
+            line = f"{self._stopping}: {text}; the run ends once it returns, or at once by another Ctrl-C"
+        else:
+            line = f"{text}; Ctrl-C ends the run once it returns, a second Ctrl-C at once"
+        # Not on the console of the run: `caviar.run` shows nothing there, and this is to be seen.
+        print_line(Console(stderr=True), printable(line), "yellow")
 
     def _notice(self, notice: ev.Notice) -> None:
         fields = ("kind", "service", "episode", "frame", "text")
@@ -291,13 +303,18 @@ def _follow(
     from caviar_clients.cli.summary import recorded_figures, summary_of
 
     outcome: Mapping[str, Any] = {}
-    interrupted = _Interruption(launcher)
-    with launcher, interrupted, _bar(console) as bar:
-        watcher = _Watcher(bar, console, scenario, keys)
-        for event in launcher.events():
-            watcher.show(event)
-            if event["event"] == "finished":
-                outcome = event
+    interrupted = Interruption(launcher.stop, in_process=isinstance(launcher, EmbeddedLauncher))
+    try:
+        with launcher, interrupted, _bar(console) as bar:
+            watcher = _Watcher(bar, console, scenario, keys)
+            for event in launcher.events():
+                watcher.show(event)
+                if event["event"] == "finished":
+                    outcome = event
+    except KeyboardInterrupt:
+        text = "ended at once, without a summary; what was recorded until then is in"
+        print_line(console, f"{text} {directory}", "red")
+        raise
     if outcome.get("disk"):  # the disk does not answer: whatever is read or written there would wait, too
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
@@ -332,29 +349,6 @@ def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path 
         table = StringIO()
         _show(Console(file=table, width=100), summary)
         write_file(RunDirectory(directory).summary_table, table.getvalue())
-
-
-class _Interruption:
-    """Turns Ctrl-C, SIGTERM and SIGHUP into an order to end the run; a second one ends without waiting."""
-
-    def __init__(self, launcher: Launcher | EmbeddedLauncher) -> None:
-        self._launcher = launcher
-        self.came = False
-
-    def __enter__(self) -> None:
-        orders = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        self._before = {order: signal.signal(order, self._handle) for order in orders}
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, _: FrameType | None) -> None:
-        if self.came:
-            raise KeyboardInterrupt  # through the launcher's block, which ends all processes
-        self.came = True
-        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
-        self._launcher.stop(f"stopped by {name}")
 
 
 class _Watcher:

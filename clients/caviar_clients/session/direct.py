@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from caviar_broker.core import events as ev
 from caviar_broker.core.graph import Edge, Graph
 from caviar_broker.core.plan import RunPlan
+from caviar_clients.session.watchdog import Work
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import GrantInput, Status
@@ -110,6 +111,8 @@ class DirectFrames:
         self._wished: tuple[int, _Part] | None = None
         self.outcome: ev.Finished | None = None
         """How the run ended; None while it goes on."""
+        self.at_work: Work | None = None
+        """What a service handles just now, for the watchdog; None between services."""
 
     def play(self) -> Generator[None, None, None]:
         """Play episodes until one fails; yield when a service outside has a frame, and after each episode.
@@ -215,12 +218,14 @@ class DirectFrames:
 
     def _computed(self, part: _Part, frame: Frame) -> StepResult | None:
         """What a service makes of a frame; None: it failed, or answers from outside."""
+        self.at_work = part.name, frame
         try:
             result = part.session.compute(frame)
         except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
             reason = RuntimeError(f"it called sys.exit({error.code!r})")
             part.session.report(reason, "step", frame.episode, frame.number)
             result = None
+        self.at_work = None
         while self._sent:
             event = self._sent.popleft()
             if isinstance(event, ev.FaultReceived):
@@ -273,7 +278,7 @@ class DirectFrames:
         """End the episode and reset all services to the next one."""
         ids = {"epoch": self._plan.epoch, "episode": self._episode}
         for part in self._parts:
-            part.session.handle(m.EpisodeEnd(**ids, attempt=part.session.attempt, frames=frames))
+            self._order(part, m.EpisodeEnd(**ids, attempt=part.session.attempt, frames=frames))
         if self._episode + 1 == self._plan.episodes:
             self._end("", "")
             return
@@ -287,13 +292,18 @@ class DirectFrames:
             part.completed, part.before = -1, {}
             attempt = part.session.attempt
             seeds = {"seed": self._seed, "seed_episode": self._seed_episode}
-            part.session.handle(m.Reset(**ids, attempt=attempt, t0_ns=0, **seeds))
+            self._order(part, m.Reset(**ids, attempt=attempt, t0_ns=0, **seeds))
         while self._sent:
             event = self._sent.popleft()
             if isinstance(event, ev.FaultReceived):
                 self._fail(event, ())
             elif not isinstance(event, ev.ResetDoneReceived):
                 raise RunError(f"a service sent {event} between episodes")
+
+    def _order(self, part: _Part, message: m.Message) -> None:
+        self.at_work = part.name, message
+        part.session.handle(message)
+        self.at_work = None
 
     # --- blame ---------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ Time stands still here: the run waits for each service it grants a frame, and no
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -26,6 +27,7 @@ from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.session.base import Frame, Session, declared
 from caviar_clients.session.direct import DirectFrames, plays_directly
+from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
@@ -40,6 +42,9 @@ from caviar_services.service import Service, StepResult
 from caviar_services.session import ServiceSession
 
 S = TypeVar("S", bound=ServiceSession)
+
+# Without a handler of the program, its warnings go to standard error.
+_log = logging.getLogger("caviar.session")
 
 
 class OutsideSession(ServiceSession):
@@ -109,6 +114,8 @@ class EmbeddedRun:
             out, and products go from service to service as they are, so that the outcome has no digest and
             `statistics` stay empty.
         on_notice, on_frame: Called with each notice to the user, and with each finished frame.
+        on_wait: Called with what the run waits for, where that takes seconds: from another thread, since the
+            service has this one. By default a warning of the logger ``caviar.session``.
         seats: By name, services that decide outside of the run (`OutsideSession`), and classes that declare
             them.
         imposed: Decisions that services take over in place of their own, as
@@ -127,6 +134,7 @@ class EmbeddedRun:
         directory: Path | None,
         on_notice: Callable[[ev.Notice], None] = lambda notice: None,
         on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
+        on_wait: Callable[[str], None] = _log.warning,
         seats: Mapping[str, type[Service[Any]]] | None = None,
         imposed: Imposed | None = None,
     ) -> None:
@@ -176,7 +184,8 @@ class EmbeddedRun:
 
         def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
             use, send = scenario.services[name].use, partial(self._take, name)
-            return kind(name, use, cls, send, store, check=check, encodes=self._encodes)
+            progress = partial(self._progressed, name)
+            return kind(name, use, cls, send, store, progress=progress, check=check, encodes=self._encodes)
 
         self.seats = {name: session(OutsideSession, name, cls) for name, cls in seats.items()}
         """Services that decide outside of the run."""
@@ -184,6 +193,10 @@ class EmbeddedRun:
             name: self.seats.get(name) or session(ServiceSession, name, load(spec.role, spec.use))
             for name, spec in scenario.services.items()
         }
+        self._at_work: Work | None = None  # what a service handles just now
+        self._direct: DirectFrames | None = None
+        classes = {name: session.cls for name, session in self._sessions.items()}
+        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait)
 
     def run(self) -> ev.Finished:
         """Run to the end.
@@ -204,11 +217,11 @@ class EmbeddedRun:
         A frame of a seat has to be answered before the next step. However the loop is left, every service is
         closed.
         """
-        with ExitStack() as stack:
+        with self._watchdog, ExitStack() as stack:
             if self._journal is not None:
                 stack.callback(self._journal.close)
             for session in self._sessions.values():
-                stack.callback(session.close)
+                stack.callback(self._close, session)
             for session in self._sessions.values():
                 self._feed(ev.Joined(session.hello()))
             while self.outcome is None:
@@ -232,6 +245,7 @@ class EmbeddedRun:
         """End the run after the present step, for a reason that its outcome gets. May be called from a signal
         handler."""
         self._stop_reason = reason
+        self._watchdog.stop()
 
     def _obey(self, order: ev.Send) -> None:
         session = self._sessions[order.service]
@@ -245,6 +259,7 @@ class EmbeddedRun:
             self._reset = order.message
         # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
+        self._at_work = order.service, order.message
         try:
             session.handle(order.message, parts)
         except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
@@ -252,8 +267,21 @@ class EmbeddedRun:
             if isinstance(order.message, m.Grant):
                 phase, episode, frame = "step", order.message.episode, order.message.frame
             session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
+        self._at_work = None
         if self._journal is not None and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+
+    def _close(self, session: ServiceSession) -> None:
+        self._direct, self._at_work = None, (session.name, None)
+        session.close()
+        self._at_work = None
+
+    def _present_work(self) -> Work | None:
+        direct = self._direct
+        return self._at_work if direct is None else direct.at_work
+
+    def _progressed(self, name: str, phase: str, grace_s: float = 0.0) -> None:
+        self._watchdog.progress(name, phase)
 
     def _play_directly(self) -> Generator[None, None, None]:
         """Play on without the clock, which granted the first frame of the first episode."""
@@ -262,6 +290,7 @@ class EmbeddedRun:
             raise RunError("a frame was granted before the first episode began")
         sessions, tell = self._sessions, self._on_notice
         direct = DirectFrames(self._plan, graph, sessions, self._check, reset, self._events, tell)
+        self._direct = direct
         for _ in direct.play():
             if self._stop_reason:
                 self.outcome = ev.Finished(self._stop_reason, "", "")

@@ -1,0 +1,99 @@
+"""Ctrl-C during ``caviar run``: the first one ends the run in order, a second one at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+
+ORDERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a run: of the terminal, of a supervisor, of a terminal that is closed."""
+PYTHON_S = 0.5
+"""[s] that the interpreter has to handle a signal: while a service computes in a library of C, it handles
+none."""
+
+
+class Interruption:
+    """Turns signals into an order to end the run, for as long as a ``with`` block lasts in the main thread.
+
+    Args:
+        stop: Orders an orderly end, for a reason. Called from a signal handler; with ``in_process`` from a
+            thread, too.
+        in_process: Whether services run in this process. Python handles no signal while one of them computes
+            in a library of C: a thread then takes the signals, and ends the process with status 130.
+
+    Example:
+        >>> reasons = []
+        >>> with Interruption(reasons.append) as interruption:
+        ...     os.kill(os.getpid(), signal.SIGTERM)
+        >>> interruption.came, reasons
+        (True, ['stopped by SIGTERM'])
+    """
+
+    def __init__(self, stop: Callable[[str], None], *, in_process: bool = False) -> None:
+        self._stop, self._in_process = stop, in_process
+        self.came = False
+        """Whether a signal came."""
+        self._is_ordered = False  # by the handler
+        self._handled_at = 0.0
+        self._thread: threading.Thread | None = None
+        self._is_over = threading.Event()
+
+    def __enter__(self) -> Interruption:
+        self._before = {order: signal.signal(order, self._handle) for order in ORDERS}
+        if self._in_process:
+            self._read, self._write = os.pipe()
+            os.set_blocking(self._write, False)  # as `set_wakeup_fd` has to have it
+            self._fd_before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+            self._thread = threading.Thread(target=self._take, name="caviar-signals", daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        if self._thread is not None:
+            signal.set_wakeup_fd(self._fd_before)
+            os.close(self._write)  # the end of what the thread reads
+            self._thread.join()
+            os.close(self._read)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        self._handled_at = time.monotonic()
+        if self._is_ordered:
+            raise KeyboardInterrupt  # through the launcher's block, which ends all processes
+        self._is_ordered = True
+        self._order(number)
+
+    def _order(self, number: int) -> None:
+        self.came = True
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        self._stop(f"stopped by {name}")
+
+    def _take(self) -> None:
+        """Take the numbers of the signals as they arrive, and act on those that are not handled."""
+        while numbers := os.read(self._read, 64):
+            arrived = time.monotonic()
+            if not set(numbers) & set(ORDERS) or self._is_over.wait(PYTHON_S):
+                continue
+            # One that was handled just before it is read here counts, too: Python merges signals that come
+            # together.
+            if self._handled_at > arrived - PYTHON_S:
+                continue
+            if self.came:
+                _end_at_once()
+            self._order(next(number for number in numbers if number in ORDERS))
+
+
+def _end_at_once() -> None:
+    """End this process from a thread, whatever the others do."""
+    if sys.stderr.isatty():
+        sys.stderr.write("\x1b[?25h")  # the cursor, which the bar hides
+    sys.stderr.write("caviar: ended at once, from within a call that does not return: nothing was closed\n")
+    sys.stderr.flush()
+    os._exit(128 + signal.SIGINT)
