@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
+import numpy as np
 import pytest
 from link_builders import antenna, frame_of, given, scene_of
 
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.codec import decode_payload, encode_payload
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.space.scene import Pair
-from caviar_protocol.topics import Action, BeamChoice, Scene, VelocityCommand
+from caviar_protocol.topics import Action, BeamChoice, Carrier, Scene, VelocityCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, RunInfo
@@ -18,6 +20,14 @@ from caviar_services.service import Frame, Preparation, RunInfo
 SCENE = scene_of(
     antenna("bs1", "tx"),
     antenna("bs2", "tx"),
+    antenna("car.1/rx", "rx", position=(9.0, 0.0, 0.0)),
+    antenna("car.2/rx", "rx", position=(0.0, 9.0, 0.0)),
+    antenna("uav/rx", "rx", position=(0.0, 0.0, 9.0)),
+)
+
+
+WIDE = scene_of(
+    antenna("bs1", "tx", (2, 4)),
     antenna("car.1/rx", "rx", position=(9.0, 0.0, 0.0)),
     antenna("car.2/rx", "rx", position=(0.0, 9.0, 0.0)),
     antenna("uav/rx", "rx", position=(0.0, 0.0, 9.0)),
@@ -104,6 +114,66 @@ class DriverAgent(FirstBeamAgent):
 
 def driver(users: tuple[str, ...], except_users: tuple[str, ...] = ()) -> DriverAgent:
     return DriverAgent(AgentSettings(users=users, except_users=except_users), RunInfo(name="pilot"))
+
+
+class Odd(Agent[AgentSettings]):
+    """Returns what it is told to, of the pairs that it is given."""
+
+    def __init__(self, make: Callable[[Sequence[Pair]], Any], carriers: tuple[Carrier, ...] = ()) -> None:
+        super().__init__(AgentSettings(users=("car.*",)), RunInfo(name="pilot", carriers=carriers))
+        self._make = make
+
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Any:
+        return self._make(pairs)
+
+
+def beams(tx: object = "bs1", rx: object = "car.1/rx", **fields: Any) -> BeamChoice:
+    return BeamChoice(**{"tx": tx, "rx": rx, "tx_beam": 0, **fields})
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (None, "Odd.choose returned None; return a list of BeamChoice"),
+        (5, "Odd.choose returned 5; return a list of BeamChoice"),
+        (beams(), r"Odd.choose returned BeamChoice\(.*; return a list"),
+        ([None], r"Odd.choose chose None, which is no BeamChoice; write BeamChoice\(tx=pair.tx.name"),
+        ([(0, 0)], r"Odd.choose chose \(0, 0\), which is no BeamChoice"),
+        (np.zeros(2), r"Odd.choose chose np.float64\(0.0\), which is no BeamChoice"),
+        ({"car.1/rx": 0}, "Odd.choose chose 'car.1/rx', which is no BeamChoice"),
+        ([beams(tx_beam=-1)], "tx_beam=-1 for bs1 → car.1/rx; write an int from 0 to 7, the beams of 'bs1'"),
+        ([beams(tx_beam=8)], "tx_beam=8 for bs1 → car.1/rx; write an int from 0 to 7, the beams of 'bs1'"),
+        ([beams(rx_beam=1)], "rx_beam=1 for bs1 → car.1/rx; write 0, the only beam of 'car.1/rx'"),
+        ([beams(tx_beam=2.0)], "tx_beam=2.0 for bs1 → car.1/rx; write an int from 0 to 7"),
+        ([beams(tx_beam=None)], "tx_beam=None for bs1 → car.1/rx; write an int from 0 to 7"),
+        ([beams(tx_beam=np.array([1, 2]))], r"tx_beam=array\(\[1, 2\]\) for bs1 → car.1/rx; write an int"),
+        ([beams(tx_beam=np.zeros(9))], r"tx_beam=array\(\[0., 0., 0., 0., 0., 0., 0., 0., 0.\]\) for"),
+        ([beams(tx=7)], "tx=7 is no name; write tx=pair.tx.name"),
+        ([beams(rx=["car.1/rx"])], r"rx=\['car.1/rx'\] is no name; write rx=pair.rx.name"),
+        ([beams(carrier=0)], "carrier=0 is no name; write the carrier's name"),
+        ([beams(carrier="sub6")], "carrier='sub6' for bs1 → car.1/rx; the run has: mmwave"),
+        (
+            [beams(rx="uav/rx")],
+            "for bs1 → uav/rx, which it does not serve in this frame; .*: bs1 → car.1/rx, bs1 → car.2/rx",
+        ),
+        ([beams(), beams(tx_beam=3)], r"for bs1 → car.1/rx twice, \(0, 0\) and \(3, 0\); write one"),
+    ],
+)
+def test_a_choice_that_is_none_is_refused_with_class_value_user_and_range(made: Any, words: str) -> None:
+    carriers = (Carrier(name="mmwave", frequency_hz=28e9),)
+    with pytest.raises(PayloadError, match=f"^Odd.choose.*{words.removeprefix('Odd.choose')}"):
+        Odd(lambda pairs: made, carriers).step(frame_of(given("scene", WIDE)))
+
+
+def test_whole_numbers_of_numpy_and_a_choice_of_its_own_for_a_carrier_are_right() -> None:
+    chosen = [beams(tx_beam=np.argmax([0, 1])), beams(tx_beam=np.int64(3), carrier="mmwave")]
+    result = Odd(lambda pairs: iter(chosen)).step(frame_of(given("scene", WIDE)))
+    action = decode_payload("action", *encode_payload(result.products["action"]))
+    assert isinstance(action, Action)
+    assert [(c.carrier, c.tx_beam) for c in action.commands if isinstance(c, BeamChoice)] == [
+        ("", 1),
+        ("mmwave", 3),
+    ]
 
 
 def test_other_commands_stand_after_the_beams() -> None:

@@ -93,6 +93,10 @@ def test_a_held_action_may_name_a_user_that_left_and_is_counted() -> None:
             r"of 'dqn', frame .*: it chose TX beam 4 for bs → a/rx; the codebook of 'bs' has beams 0 to 3",
         ),
         (
+            (choices("dqn", ("bs", "a/rx", -1, 0)),),  # within one process nothing decodes it
+            r"of 'dqn', frame .*: it chose TX beam -1 for bs → a/rx; the codebook of 'bs' has beams 0 to 3",
+        ),
+        (
             (choices("dqn", ("bs", "b/rx", 0, 2)),),
             r"of 'dqn', frame .*: it chose RX beam 2 for bs → b/rx; the codebook of 'b/rx' has beams 0 to 1",
         ),

@@ -18,6 +18,7 @@ from caviar_protocol.scenario.rules import BEAM
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, BeamChoice, Scene
 from caviar_protocol.topics.link import Command
+from caviar_services.agent.choices import checked_choices
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 # What actuators other than beams begin with; a name without any of these is that of a receiver.
@@ -118,8 +119,8 @@ class Agent(Service[S]):
             return StepResult()
         scene = frame.scene()
         pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
-        # Sorted, so that equal decisions are equal bytes whatever order an agent makes them in.
-        choices = sorted(self.choose(frame, scene, pairs), key=lambda c: (c.rx, c.tx, c.carrier))
+        author = f"{type(self).__name__}.choose"
+        choices = checked_choices(author, self.choose(frame, scene, pairs), pairs, self.run.carriers)
         commands = (*choices, *self.other_commands(frame, scene))
         return StepResult(
             products={"action": Action(commands=commands)}, counts={} if pairs else {WITHOUT_USERS: 1}
@@ -143,8 +144,9 @@ class Agent(Service[S]):
             pairs: Transmitter and receiver of each user.
 
         Returns:
-            Choices in any order. A pair without one is not served; a choice without a carrier holds for all
-            carriers.
+            Choices in any order, one for each pair and carrier at most, of beams from 0 to the size of the
+            device's array − 1. A pair without one is not served; a choice without a carrier holds for all
+            carriers. `caviar_services.agent.choices` refuses anything else.
         """
 
 

@@ -374,7 +374,7 @@ class _FrameCommands:
 
     def _require_in_codebook(self, action: GrantInput, user: User, command: BeamChoice) -> None:
         for side, beam, device in (("TX", command.tx_beam, user.tx), ("RX", command.rx_beam, user.rx)):
-            if beam >= device.array.size:
+            if not 0 <= beam < device.array.size:
                 raise _wrong(
                     action,
                     f"it chose {side} beam {beam} for {_user(user.tx.name, user.rx.name)}; "
