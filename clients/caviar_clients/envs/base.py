@@ -292,15 +292,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"no options of reset are called {unknown}; {there}, set it in the scenario")
         # With the first reset, and not before: a program that only looks at the spaces starts no run.
         if self._session is None:
-            self._session = open_session(
-                self.scenario,
-                self.agent,
-                self._inputs(),
-                self._broker,
-                self._directory,
-                self._credentials,
-                with_scenery=self.uses_scenery,
-            )
+            self._session = self._open()
         self._moment = self._at(self._session.reset(seed))
         self._begin(options or {})
         return self._observation(self._moment), self._info(self._moment)
@@ -320,12 +312,36 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             PayloadError: The action is none of `action_space`.
             RunError: No episode has begun, or the run has ended.
         """
+        decided = self.decided(action)
+        if self._session is None:
+            raise RunError("the environment is closed; call reset()")
+        return self.moved(self._session.step({"action": decided}))
+
+    # For environments of several agents, which step one session for all of them.
+
+    def entered(self, frame: Frame) -> tuple[Observation, dict[str, Any]]:
+        """Take the frame that an episode begins with: what `reset` returns."""
+        self._moment = self._at(frame)
+        return self._observation(self._moment), self._info(self._moment)
+
+    def decided(self, action: A) -> Action:
+        """Make of an action what the agent answers the present frame with.
+
+        Raises:
+            PayloadError: The action is none of `action_space`.
+            RunError: No episode has begun.
+        """
         # A learner's mistake, which would otherwise wait for a grant that never comes.
-        before = self._moment
-        if self._session is None or before is None or before.frame.final:
+        if self._moment is None or self._moment.frame.final:
             raise RunError("the episode is over, or none has begun; call reset()")
-        commands = tuple(self._commands(action, before))
-        self._moment = now = self._at(self._session.step({"action": Action(commands=commands)}))
+        return Action(commands=tuple(self._commands(action, self._moment)))
+
+    def moved(self, frame: Frame) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take the frame that follows on a decision: what `step` returns."""
+        before = self._moment
+        if before is None:
+            raise RunError("no episode has begun; call reset()")
+        self._moment = now = self._at(frame)
         if now.link is None:
             raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
         reward = self._rewarded(before, now, now.link)
@@ -348,6 +364,18 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         pair = moment.users[0][1] if moment.users else None
         title = f"frame {moment.frame.number}, t = {moment.frame.t_ns / 1e9:.2f} s"
         return self._renderer.draw(moment.scene, moment.link, pair, title)
+
+    def _open(self) -> Session:
+        """Open the session of the environment's agent."""
+        return open_session(
+            self.scenario,
+            self.agent,
+            self.inputs(),
+            self._broker,
+            self._directory,
+            self._credentials,
+            with_scenery=self.uses_scenery,
+        )
 
     # --- what a kind of environment defines -----------------------------------------------------------
 
@@ -373,8 +401,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     # --- from frames to observations ------------------------------------------------------------------
 
-    def _inputs(self) -> tuple[Input, ...]:
-        # One input for each topic: two cameras are in one product.
+    def inputs(self) -> tuple[Input, ...]:
+        """Give what the agent consumes: one input for each topic, since two cameras are in one product."""
         return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self._observer.inputs)
 
     def _at(self, frame: Frame) -> Moment:

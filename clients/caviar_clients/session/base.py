@@ -1,9 +1,9 @@
-"""The contract of sessions: a run whose agent decides outside of it, and the agent's part in that run."""
+"""The contract of sessions: a run whose agents decide outside of it, and the agents' part in that run."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar
@@ -23,10 +23,14 @@ _HIGHEST_SEED = 2**63 - 1
 
 
 class Session(ABC):
-    """A run that a program steps, in place of one of its agents (contract, clause 16).
+    """A run that a program steps, in place of one of its agents (contract, clause 16), or of several.
 
     Call `reset`, then `step` until a frame is ``final``, then `reset` again; `close` at the end, or use it as
     a context manager. All of them raise `RunError` with the broker's blame where the run has ended.
+
+    Args:
+        beside: Further agents whose places are taken. They consume what the first one does, and the program
+            decides for all of them at once: frames are those of the first one.
 
     Example:
         >>> from caviar_clients.session.checks import checked_scenario
@@ -41,8 +45,10 @@ class Session(ABC):
         3
     """
 
-    def __init__(self) -> None:
+    def __init__(self, beside: Sequence[str] = ()) -> None:
         self._frame: Frame | None = None
+        self.beside = tuple(beside)
+        """Agents that answer with the first one."""
         self.scenery: Mapping[str, Path] = {}
         """Files of the run's scenery by asset name, after the first `reset`; empty unless asked for."""
 
@@ -73,31 +79,41 @@ class Session(ABC):
                 return self._frame
             # An agent that had the place before left the run in the middle of an episode.
         if self._frame.final:
-            self._answer(StepResult(seed=chosen))
+            self._answer_alike(StepResult(seed=chosen))
         else:
-            self._answer(StepResult(end_episode=True, seed=chosen))
+            self._answer_alike(StepResult(end_episode=True, seed=chosen))
             # Frames of the old episode may have been granted before the broker knew that it ends.
             while not self._granted().final:
-                self._answer(StepResult(end_episode=True, seed=chosen))
-            self._answer(StepResult())
+                self._answer_alike(StepResult(end_episode=True, seed=chosen))
+            self._answer_alike(StepResult())
         self._frame = self._granted()
         return self._frame
 
-    def step(self, products: Mapping[str, Payload]) -> Frame:
+    def step(
+        self, products: Mapping[str, Payload], beside: Mapping[str, Mapping[str, Payload]] | None = None
+    ) -> Frame:
         """Answer the frame that is granted, and wait for the next one.
 
         Args:
             products: By topic, what the agent decided: ``{"action": Action(…)}``.
+            beside: The same of the agents beside it, by name; one that is left out decides nothing.
 
         Returns:
             The next frame, with the link of the answered one; after the last frame of an episode one that
             is ``final`` and needs no answer.
 
         Raises:
-            PayloadError: A product is not its topic's.
+            PayloadError: A product is not its topic's, or there is no such agent beside the first one.
             RunError: The run has ended, or no frame is granted.
         """
-        self._answer(StepResult(products=products))
+        given = beside or {}
+        if not given.keys() <= set(self.beside):
+            there = ", ".join(self.beside) or "none"
+            raise PayloadError(f"no agent beside this one is {sorted(given)[0]!r}; there are: {there}")
+        self._answer(
+            StepResult(products=products),
+            {name: StepResult(products=given.get(name, {})) for name in self.beside},
+        )
         self._frame = self._granted()
         return self._frame
 
@@ -109,13 +125,17 @@ class Session(ABC):
     def _begin(self, seed: int) -> None:
         """Start or join the run, with the seed of its first episode; −1: none is chosen."""
 
+    def _answer_alike(self, result: StepResult) -> None:
+        """Answer the frame that is granted, all agents with the same."""
+        self._answer(result, dict.fromkeys(self.beside, result))
+
     @abstractmethod
-    def _answer(self, result: StepResult) -> None:
-        """Answer the frame that is granted."""
+    def _answer(self, result: StepResult, beside: Mapping[str, StepResult]) -> None:
+        """Answer the frame that is granted; ``beside`` has an answer of each agent beside the first one."""
 
     @abstractmethod
     def _granted(self) -> Frame:
-        """Wait for the next grant."""
+        """Wait for the next grant, of all agents."""
 
     def __enter__(self) -> Session:
         return self

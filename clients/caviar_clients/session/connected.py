@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -38,6 +39,7 @@ class ConnectedSession(Session):
         connect_timeout_s: Time in which the broker has to answer [s].
         credentials: For a broker with keys; None: what the environment says.
         with_scenery: Whether `Session.scenery` is fetched.
+        beside: Further services of that kind; with keys, those of ``credentials`` are all of theirs.
     """
 
     def __init__(
@@ -48,8 +50,9 @@ class ConnectedSession(Session):
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
         credentials: Credentials | None = None,
         with_scenery: bool = False,
+        beside: Sequence[str] = (),
     ) -> None:
-        super().__init__()
+        super().__init__(beside)
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
         self._results: SimpleQueue[StepResult | None] = SimpleQueue()
         self._seeds: SimpleQueue[int | None] = SimpleQueue()
@@ -73,14 +76,19 @@ class ConnectedSession(Session):
         # A daemon: a program that forgets to close its session ends all the same.
         self._thread = threading.Thread(target=self._serve, args=(runner,), name="session", daemon=True)
         self._thread.start()
+        self._others = {
+            name: ConnectedSession(broker, name, inputs, connect_timeout_s, credentials) for name in beside
+        }
 
     def close(self) -> None:
         """Leave the run; after the last frame of its last episode the run ends in order."""
         if self._frame is not None and self._frame.final and self._thread.is_alive():
-            self._answer(StepResult())
+            self._answer_alike(StepResult())
             self._drained()
         self._frame = None
         self.leave()
+        for other in self._others.values():
+            other.close()
         self._thread.join(LEAVE_S)
 
     def leave(self, error: CaviarError | None = None) -> None:
@@ -97,11 +105,28 @@ class ConnectedSession(Session):
 
     def _begin(self, seed: int) -> None:
         self._seeds.put(seed)
+        for other in self._others.values():
+            other._begin(seed)
 
-    def _answer(self, result: StepResult) -> None:
+    def _answer(self, result: StepResult, beside: Mapping[str, StepResult]) -> None:
         self._results.put(result)
+        for name, other in self._others.items():
+            other._answer(beside[name], {})
 
     def _granted(self) -> Frame:
+        frame = self._own_granted()
+        for other in self._others.values():
+            its = other._own_granted()
+            # Of a late policy one of them may have missed frames that the other was granted.
+            while (its.episode, its.number) < (frame.episode, frame.number):
+                other._answer(StepResult(), {})
+                its = other._own_granted()
+            while (frame.episode, frame.number) < (its.episode, its.number):
+                self._results.put(StepResult())
+                frame = self._own_granted()
+        return frame
+
+    def _own_granted(self) -> Frame:
         while True:
             # Without a timeout, Ctrl-C would wait until the next grant, and a thread that died be waited for.
             try:
@@ -199,8 +224,9 @@ def open_session(
     directory: Path | None = None,
     credentials: Credentials | None = None,
     with_scenery: bool = False,
+    beside: Sequence[str] = (),
 ) -> Session:
-    """Open a session of one agent of a scenario.
+    """Open a session of one agent of a scenario, or of several.
 
     Args:
         scenario: Checked, as `checked_scenario` returns it.
@@ -210,6 +236,7 @@ def open_session(
         directory: Where a run in this process records; None: nowhere, which is a lot faster.
         credentials: For a broker with keys; None: what the environment says.
         with_scenery: Whether `Session.scenery` is fetched.
+        beside: Further agents whose places are taken.
 
     Raises:
         ScenarioError: A broker and a directory are given; a broker records where it was started.
@@ -219,7 +246,9 @@ def open_session(
         >>> open_session(load_scenario("smoke"), "agent", (Input(topic="scene"),)).close()
     """
     if broker is None:
-        return EmbeddedSession(scenario, agent, inputs, directory, with_scenery)
+        return EmbeddedSession(scenario, agent, inputs, directory, with_scenery, beside)
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
-    return ConnectedSession(broker, agent, inputs, credentials=credentials, with_scenery=with_scenery)
+    return ConnectedSession(
+        broker, agent, inputs, credentials=credentials, with_scenery=with_scenery, beside=beside
+    )

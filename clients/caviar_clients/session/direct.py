@@ -57,6 +57,8 @@ class _Part:
     outputs: tuple[str, ...]
     """Topics in demand."""
     inputs: tuple[tuple[Edge, _Part], ...] = ()
+    sources: frozenset[str] = frozenset()
+    """Services of whose products of the same frame it takes some."""
     lagged: tuple[tuple[Edge, _Part], ...] = ()
     completed: int = -1
     """Frame that it has computed last in the episode; −1: none."""
@@ -105,8 +107,11 @@ class DirectFrames:
         }
         for name, part in parts.items():
             part.inputs = tuple((edge, parts[edge.source]) for edge in graph.inputs[name])
+            part.sources = frozenset(edge.source for edge, _ in part.inputs if not edge.lag)
             part.lagged = tuple(pair for pair in part.inputs if pair[0].lag)
         self._parts = tuple(parts.values())
+        # Frames of the episode; becomes less when an agent ends it early.
+        self._frames = plan.frames
         # Seed that an agent chose for the next episode, and which one did.
         self._wished: tuple[int, _Part] | None = None
         self.outcome: ev.Finished | None = None
@@ -115,52 +120,70 @@ class DirectFrames:
         """What a service handles just now, for the watchdog; None between services."""
 
     def play(self) -> Generator[None, None, None]:
-        """Play episodes until one fails; yield when a service outside has a frame, and after each episode.
+        """Play episodes until one fails; yield when services outside have a frame, and after each episode.
 
-        A service outside answers its frame before the next step.
+        They answer it before the next step.
         """
         while self.outcome is None:
             yield from self._play_episode()
             yield
 
     def _play_episode(self) -> Generator[None, None, None]:
-        frames, number = self._plan.frames, 0
-        while number < frames:
+        self._frames, number = self._plan.frames, 0
+        # Frames that services outside have not answered: one of each is offered before the first is waited
+        # for, since agents that are asked at once decide together.
+        offered: dict[str, tuple[_Part, Frame]] = {}
+        while number <= self._frames:
+            final = number == self._frames
             for part in self._parts:
-                frame = self._granted(part, number, final=False)
+                if offered and not part.sources.isdisjoint(offered):
+                    yield
+                    if not self._take_answers(offered):
+                        return
+                if final and not part.is_agent:
+                    continue
+                frame = self._granted(part, number, final=final)
                 if frame is None:
                     continue
                 result = self._computed(part, frame)
-                if result is None and self.outcome is None:
-                    yield
-                    result = part.session.answered()
-                if result is None:
-                    return
-                if part.is_agent:
-                    if result.end_episode:
-                        frames = number + 1
-                    self._choose_seed(part, number, result, ends=number + 1 == frames)
-                self._decide(part, frame, result)
+                if result is not None:
+                    self._take(part, frame, result)
+                elif self.outcome is None:
+                    offered[part.name] = part, frame
                 if self.outcome is not None:
+                    return
+            if offered:
+                yield
+                if not self._take_answers(offered):
                     return
             for part in self._parts:
                 part.decided, part.before = {}, part.decided
             number += 1
-        for part in self._parts:
-            if not part.is_agent or (frame := self._granted(part, frames, final=True)) is None:
-                continue
-            result = self._computed(part, frame)
-            if result is None and self.outcome is None:
-                yield
-                result = part.session.answered()
+        self._begin_next(self._frames)
+
+    def _take_answers(self, offered: dict[str, tuple[_Part, Frame]]) -> bool:
+        """Take what services outside answered; whether the run goes on."""
+        for part, frame in offered.values():
+            result = part.session.answered()
             if result is None:
-                return
+                return False
+            self._take(part, frame, result)
+        offered.clear()
+        return self.outcome is None
+
+    def _take(self, part: _Part, frame: Frame, result: StepResult) -> None:
+        """Take what a service makes of a frame."""
+        if frame.final:
             if result.products:
                 topics = ", ".join(sorted(result.products))
-                self._tell("discarded", part, f"answered its final grant with {topics}", frames)
-            self._choose_seed(part, frames, result, ends=True)
-        if self.outcome is None:
-            self._begin_next(frames)
+                self._tell("discarded", part, f"answered its final grant with {topics}", frame.number)
+            self._choose_seed(part, frame.number, result, ends=True)
+            return
+        if part.is_agent:
+            if result.end_episode:
+                self._frames = frame.number + 1
+            self._choose_seed(part, frame.number, result, ends=frame.number + 1 == self._frames)
+        self._decide(part, frame, result)
 
     # --- one service's part ------------------------------------------------------------------------
 

@@ -386,6 +386,7 @@ class EmbeddedSession(Session):
         inputs: What it consumes.
         directory: Where recorder and journal write; None: nothing is written, which is a lot faster.
         with_scenery: Whether `Session.scenery` is looked up.
+        beside: Further agents whose places are taken.
 
     Raises:
         DeclarationError: What services declare does not make a run.
@@ -398,8 +399,9 @@ class EmbeddedSession(Session):
         inputs: tuple[Input, ...],
         directory: Path | None = None,
         with_scenery: bool = False,
+        beside: Sequence[str] = (),
     ) -> None:
-        super().__init__()
+        super().__init__(beside)
         self.notices: deque[str] = deque(maxlen=KEPT_NOTICES)
         """Notices of the run, the newest last."""
         if directory is not None:
@@ -408,8 +410,11 @@ class EmbeddedSession(Session):
         self._seed = -1
         scenery_here = self._take_scenery if with_scenery else None
         cls = declared(inputs, lambda: self._seed, _decided_outside, scenery_here)
-        self._run = EmbeddedRun(endless, directory, self._notice, seats={agent: cls})
+        others = declared(inputs, lambda: self._seed, _decided_outside)
+        seats = {agent: cls, **dict.fromkeys(beside, others)}
+        self._run = EmbeddedRun(endless, directory, self._notice, seats=seats)
         self._seat = self._run.seats[agent]
+        self._seats_beside = {name: self._run.seats[name] for name in beside}
         self._steps = self._run.steps()
 
     def close(self) -> None:
@@ -419,14 +424,18 @@ class EmbeddedSession(Session):
     def _begin(self, seed: int) -> None:
         self._seed = seed
 
-    def _answer(self, result: StepResult) -> None:
+    def _answer(self, result: StepResult, beside: Mapping[str, StepResult]) -> None:
         if self._run.outcome is not None:
             raise self._over()
         self._seat.answer(result)
+        for name, seat in self._seats_beside.items():
+            seat.answer(beside[name])
 
     def _granted(self) -> Frame:
         for _ in self._steps:
-            if self._seat.frame is not None:
+            if self._seat.frame is None:
+                continue
+            if all(seat.frame is not None for seat in self._seats_beside.values()):
                 return self._seat.frame
         raise self._over()
 

@@ -122,9 +122,9 @@ class Agent(Service[S]):
         author = f"{type(self).__name__}.choose"
         choices = checked_choices(author, self.choose(frame, scene, pairs), pairs, self.run.carriers)
         commands = (*choices, *self.other_commands(frame, scene))
-        return StepResult(
-            products={"action": Action(commands=commands)}, counts={} if pairs else {WITHOUT_USERS: 1}
-        )
+        # One that flies alone has no beams to miss users for.
+        counts = {WITHOUT_USERS: 1} if self._owned and not pairs else {}
+        return StepResult(products={"action": Action(commands=commands)}, counts=counts)
 
     def serves(self, rx: str) -> bool:
         """Whether this agent serves a receiver.
