@@ -330,8 +330,11 @@ def test_an_action_that_is_no_pair_is_refused_by_value_and_the_episode_goes_on(a
     with environment() as env, environment() as other:
         env.reset(seed=1)
         other.reset(seed=1)
-        with pytest.raises(PayloadError, match=r"the action is .*; write 1 whole number.*63"):
+        with pytest.raises(
+            PayloadError, match=r"the action is .* for bs → uav/rx; write an int from 0 to 63"
+        ) as error:
             env.step(action)
+        assert " ".join(repr(action).split()) in str(error.value)
         assert env.step(np.int64(3))[1] == other.step(np.int64(3))[1]
 
 
@@ -339,8 +342,13 @@ def test_an_action_that_is_no_pair_is_refused_by_value_and_the_episode_goes_on(a
 def test_an_action_of_several_users_has_an_index_for_each(action: Any) -> None:
     with environment(SMOKE) as env:
         env.reset(seed=1)
-        with pytest.raises(PayloadError, match=r"write 2 whole number.*127, 31"):
+        with pytest.raises(PayloadError, match=r"write 2 ints, .* from 0 to 127 and from 0 to 31") as error:
             env.step(action)
+        text = str(error.value)
+        if np.size(action) == 2:
+            assert any(
+                place in text for place in ("at place 0 (bs → car/rx)", "at place 1 (bs → uav/rx-uav)")
+            )
 
 
 # --- mistakes --------------------------------------------------------------------------------------------

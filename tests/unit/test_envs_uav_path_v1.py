@@ -17,7 +17,7 @@ from test_envs_uav_path import scenario
 
 import caviar_clients.envs
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_services.mesh.shapes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow
@@ -65,6 +65,22 @@ def towards(env: UavPathV1Env, target: Sequence[float], position: np.ndarray) ->
 def test_it_keeps_the_rules_that_gymnasium_checks(tmp_path: Path) -> None:
     with flight(tmp_path, town(tmp_path), ("[-2.0, 140.0, 18.0]", "[-90.0, 10.0, 18.0]")) as env:
         check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("action", [[2.0, 0, 0], [0, 0, -1.01], [1e9, 0, 0], [math.nan, 0, 0], -1])
+def test_an_action_outside_its_space_is_refused_and_the_flight_goes_on(tmp_path: Path, action: Any) -> None:
+    """Shortened without a word, it would be another action than the one that is learned from."""
+    with flight(tmp_path) as env:
+        env.reset(seed=1)
+        words = r"the action is .*; write three numbers within -1 and 1: the velocity .* over 15 m/s"
+        with pytest.raises(PayloadError, match=words) as error:
+            env.step(np.array(action))
+        assert " ".join(repr(np.array(action)).split()) in str(error.value)
+        for fits in (
+            np.ones(3, np.float32),
+            np.array([0, -1.0000001, 0]),
+        ):  # corners, and what rounding makes
+            env.step(fits)
 
 
 def test_it_keeps_the_rules_that_stable_baselines3_checks(tmp_path: Path) -> None:

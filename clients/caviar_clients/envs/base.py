@@ -455,13 +455,30 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
         if len(chosen) != len(sizes) or not all(
             isinstance(index, int) and 0 <= index < size for index, size in zip(chosen, sizes, strict=True)
         ):
-            highest = ", ".join(str(size - 1) for size in sizes)
-            raise PayloadError(
-                f"the action is {action!r}; write {len(sizes)} whole number(s), one a place, "
-                f"from 0 to at most {highest}"
-            )
+            raise PayloadError(self._refusal(action, chosen, moment))
         commands = []
         for place, pair in moment.users:
             tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
             commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
         return sorted(commands, key=lambda choice: (choice.rx, choice.tx))
+
+    def _refusal(self, action: object, chosen: Sequence[object], moment: Moment) -> str:
+        """Say what is wrong with an action, and what to write."""
+        sizes = self._sizes
+        users = {place: f"{pair.tx.name} → {pair.rx.name}" for place, pair in moment.users}
+        if len(sizes) == 1:
+            form = f"an int from 0 to {sizes[0] - 1}"
+        elif len(set(sizes)) == 1:
+            form = f"{len(sizes)} ints, one for each place, from 0 to {sizes[0] - 1} each"
+        else:
+            ranges = " and ".join(f"from 0 to {size - 1}" for size in sizes)
+            form = f"{len(sizes)} ints, one for each place, {ranges}"
+        wrong = ""
+        if len(chosen) == len(sizes) > 1:
+            ok = (isinstance(v, int) and 0 <= v < size for v, size in zip(chosen, sizes, strict=True))
+            place = [*ok].index(False)
+            wrong = f", with {chosen[place]!r} at place {place} ({users.get(place, 'without a user now')})"
+        elif users and len(sizes) == 1:
+            wrong = f" for {users[0]}"
+        text = " ".join(repr(action).split())
+        return f"the action is {text}{wrong}; write {form}: tx_beam·Nr + rx_beam, a pair of the codebooks"

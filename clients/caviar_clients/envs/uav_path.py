@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -25,14 +25,17 @@ from caviar_protocol.topics import BeamChoice, VelocityCommand
 from caviar_protocol.topics.link import Command
 
 MOTION = "motion:"
+ROUNDING = 1e-6
+"""Beyond ±1 an action is taken so far: float32 rounds."""
 
 
 class FlightEnv(SessionEnv[NDArray[np.float32]]):
     """Trajectory control in the loop (contract, clause 3; world ``flight``).
 
     The action is a velocity over the object's greatest speed, in world axes, Shape ``[3]``, each within
-    ±1; one longer than 1 is shortened to 1. The world bounds acceleration too, and keeps the object clear of
-    buildings. Beams of receivers that the agent owns beside the motion point along the straight line.
+    ±1; one longer than 1, as the corners of that box are, is shortened to 1. The world bounds acceleration
+    too, and keeps the object clear of buildings. Beams of receivers that the agent owns beside the motion
+    point along the straight line.
 
     Args:
         scenario: Scenario file, or the name of a scenario that ships.
@@ -42,6 +45,9 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
     Raises:
         ScenarioError: The scenario has no such object, or the agent does not own its motion.
     """
+
+    refuses_outside: ClassVar[bool] = True
+    """Whether an action beyond ±1 is refused, or shortened like one within."""
 
     def __init__(self, scenario: str | Path, vehicle: str | None, **options: Any) -> None:
         super().__init__(scenario, **options)
@@ -80,8 +86,12 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
 
     def _commands(self, action: NDArray[np.float32], moment: Moment) -> Sequence[Command]:
         share = point(action)
-        if share is None:
-            raise PayloadError(f"the action is {action}; write three numbers within -1 and 1")
+        if share is None or (self.refuses_outside and max(map(abs, share)) > 1.0 + ROUNDING):
+            text = " ".join(repr(action).split())
+            raise PayloadError(
+                f"the action is {text}; write three numbers within -1 and 1: the velocity east, north and up "
+                f"over {self._max_speed:g} m/s"
+            )
         x, y, z = share
         # The corners of the box of actions are √3 long; the object flies at its greatest speed there.
         speed = self._max_speed / max(1.0, math.hypot(x, y, z))
@@ -128,7 +138,8 @@ class UavPathEnv(FlightEnv):
     """Fly to a goal, rewarded by |y| and by metres: ``caviar/UavPath-v0``.
 
     The radio is 5·10⁻⁵ of the reward beside 0.75 for the way, so that hardly any learner hears it.
-    `uav_path_v1.UavPathV1Env` has parts of comparable size. This one is kept for what was learned in it.
+    `uav_path_v1.UavPathV1Env` has parts of comparable size. This one is kept for what was learned in it, so
+    that an action beyond ±1 is shortened here, too.
 
     Args:
         scenario, vehicle, options: As of `FlightEnv`.
@@ -146,6 +157,8 @@ class UavPathEnv(FlightEnv):
         >>> sorted(env.observation_space.spaces)
         ['goal', 'last_abs_y', 'position', 'velocity']
     """
+
+    refuses_outside = False
 
     def __init__(
         self,
