@@ -9,6 +9,8 @@ command line.
 from __future__ import annotations
 
 import argparse
+import faulthandler
+import io
 import logging
 import os
 import select
@@ -330,6 +332,7 @@ def serve(
         The exit status of the process; what is wrong is written to standard error.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+    _keep_last_words()
     role, separator, implementation = use.partition(":")
     if not separator:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
@@ -348,6 +351,18 @@ def serve(
         sys.stderr.write(f"caviar service {name}: {error}\n")
         return 1
     return restart_status(status, runner.ended) if restarted else status
+
+
+def _keep_last_words() -> None:
+    """See to it that what a process says before it dies stands in its log.
+
+    Into a file Python writes by the block, and what `print` was given last is lost with a process that is
+    killed. Of a crash in a library of C it says nothing at all unless told to.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a test, or a notebook, may have put something else there
+        sys.stdout.reconfigure(line_buffering=True)
+    if sys.stderr is sys.__stderr__:
+        faulthandler.enable()
 
 
 def main() -> int:

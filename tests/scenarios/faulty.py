@@ -57,6 +57,21 @@ class Exits(_Faulty):
         os._exit(3)
 
 
+class Crashes(_Faulty):
+    """Dies in a library, after a word to its user."""
+
+    def go_wrong(self) -> None:
+        print("the focal length is 0")  # noqa: T201 - as a user's own service does
+        os.abort()
+
+
+class DiesInSilence(_Faulty):
+    """Ends its process without any word."""
+
+    def go_wrong(self) -> None:
+        os._exit(3)
+
+
 class NeverAnswers(_Faulty):
     """Waits for something that never comes; its heartbeats go on."""
 

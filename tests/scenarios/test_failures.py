@@ -85,6 +85,22 @@ def test_a_service_that_exits_is_named_with_its_status_and_last_line(tmp_path: P
     assert_readable(finished, 5)
 
 
+def test_a_service_that_crashes_is_named_with_the_line_and_keeps_what_it_printed(tmp_path: Path) -> None:
+    """What Python had not written to the file yet would be lost, and a crash leaves no word by itself."""
+    finished = run(faulty(tmp_path, "Crashes"), tmp_path / "out")
+    assert_blamed(
+        finished, "sensors 'sick'", "SIGABRT", "Fatal Python error: Aborted", "faulty.py", "go_wrong"
+    )
+    assert f"its log: {finished.directory / 'logs' / 'sick.log'}" in finished.output
+    assert "the focal length is 0\n" in (finished.directory / "logs" / "sick.log").read_text()
+
+
+def test_a_log_without_a_word_is_not_pointed_at(tmp_path: Path) -> None:
+    finished = run(faulty(tmp_path, "DiesInSilence"), tmp_path / "out")
+    assert_blamed(finished, "sensors 'sick'", "frame 5", "status 3")
+    assert "its log" not in finished.output
+
+
 def test_a_service_that_never_answers_is_blamed_after_the_stall_time(tmp_path: Path) -> None:
     finished = run(faulty(tmp_path, "NeverAnswers"), tmp_path / "out")
     assert_blamed(finished, "sensors 'sick'", "makes no progress", "frame 5", "budget", "last heartbeat")

@@ -252,6 +252,32 @@ def test_the_last_line_of_a_long_log_is_found_at_its_end(tmp_path: Path) -> None
     assert child.last_line() == "segmentation � fault"
 
 
+CRASH = b"""reading the map
+Fatal Python error: Segmentation fault
+
+Thread 0x00007f01 (most recent call first):
+  File "/lib/threading.py", line 982 in run
+
+Current thread 0x00007f02 (most recent call first):
+  File "/home/ana/tracer.py", line 12 in trace
+  File "/lib/runner.py", line 3 in serve
+
+Extension modules: numpy.linalg._umath_linalg (total: 1)
+"""
+
+
+def test_of_a_crash_the_line_that_crashed_is_found(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    child = Child("world", None, log, -1)  # type: ignore[arg-type]
+    log.write_bytes(CRASH)
+    crash = 'Fatal Python error: Segmentation fault, File "/home/ana/tracer.py", line 12 in trace'
+    assert child.last_line() == crash
+    log.write_bytes(
+        CRASH + b"caviar service world: no map\n"
+    )  # another process, after the crash of the first
+    assert child.last_line() == "caviar service world: no map"
+
+
 def test_what_the_broker_says_in_pieces_is_put_together(tmp_path: Path) -> None:
     """Lines are split wherever a read ends."""
     with launcher(tmp_path) as started:

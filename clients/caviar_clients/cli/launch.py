@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ KILLED_S = 2.0
 """[s] within which a process ends that is killed, unless it waits for a disk."""
 TAIL = 1 << 16
 """[B] of a log that are looked at for its last line."""
+_CRASH = "Fatal Python error: "
+_AFTER_A_CRASH = ("Extension modules: ", "  File ", "  Binary file ")
 
 
 @dataclass
@@ -77,11 +80,21 @@ class Child:
         return cls(name, process, log, os.pidfd_open(process.pid))
 
     def last_line(self) -> str:
-        """The last line that the process printed; empty if it printed nothing."""
+        """The last line that the process printed, or what it died of in a library; empty if it printed
+        nothing."""
         with self.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             lines = file.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+        if not lines:
+            return ""
+        # After a crash faulthandler lists all threads and libraries; what counts stands above them.
+        if lines[-1].startswith(_AFTER_A_CRASH):
+            crashes = (number for number in reversed(range(len(lines))) if lines[number].startswith(_CRASH))
+            if (number := next(crashes, None)) is not None:
+                trace = dropwhile(lambda line: not line.startswith("Current thread "), lines[number:])
+                place = next((line.strip() for line in trace if line.startswith("  File ")), "no Python code")
+                return f"{lines[number]}, {place}"
+        return lines[-1]
 
 
 def _describe_exit(status: int) -> str:
@@ -249,9 +262,10 @@ class Launcher:
         self._order({"stop": reason})
 
     def log_of(self, service: str) -> Path | None:
-        """Find the file to which a service prints; None for a service that has no process here."""
+        """Find the file to which a service printed something; None for one that printed nothing, or that has
+        no process here."""
         child = self._children.get(service)
-        return child.log if child else None
+        return child.log if child and child.log.stat().st_size else None
 
     @property
     def _local(self) -> dict[str, ServiceSpec]:
