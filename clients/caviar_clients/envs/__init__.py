@@ -1,9 +1,11 @@
 """Environments of gymnasium: importing this registers them.
 
 * ``caviar/BeamSelection-v0``: a beam pair for each user (`base.BeamSelectionEnv`);
-* ``caviar/UavPath-v1``: a flight to a goal in reach of the radio, with a reward of comparable parts
-  (`uav_path_v1`);
+* ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
+  reward of comparable parts (`uav_path_v1`);
 * ``caviar/UavPath-v0``: the same with a reward of |y| and metres (`uav_path`), replaced by version 1.
+
+`pair.UavPairEnv` is one of PettingZoo: one agent flies, another one chooses the beams.
 
 >>> env = gymnasium.make("caviar/BeamSelection-v0", scenario="geometric")
 """

@@ -313,11 +313,31 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             RunError: No episode has begun, or the run has ended.
         """
         decided = self.decided(action)
-        if self._session is None:
-            raise RunError("the environment is closed; call reset()")
-        return self.moved(self._session.step({"action": decided}))
+        return self.moved(self.session.step({"action": decided}))
 
     # For environments of several agents, which step one session for all of them.
+
+    @property
+    def frame(self) -> Frame:
+        """The frame that is to be decided, or the final one.
+
+        Raises:
+            RunError: No episode has begun.
+        """
+        if self._moment is None:
+            raise RunError("no episode has begun; call reset()")
+        return self._moment.frame
+
+    @property
+    def session(self) -> Session:
+        """The session that is open.
+
+        Raises:
+            RunError: None is: no episode has begun, or the environment is closed.
+        """
+        if self._session is None:
+            raise RunError("no session is open; call reset()")
+        return self._session
 
     def entered(self, frame: Frame) -> tuple[Observation, dict[str, Any]]:
         """Take the frame that an episode begins with: what `reset` returns."""

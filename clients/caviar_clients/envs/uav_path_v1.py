@@ -1,4 +1,4 @@
-"""``caviar/UavPath-v1``: fly an object to a goal, and stay in reach of the radio on the way."""
+"""``caviar/UavPath-v1``: fly an object to a goal or to addresses, in reach of the radio on the way."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.envs.base import Moment, Observation
+from caviar_clients.envs.deliveries import MOST_ADDRESSES, Box, Deliveries, greatest_power, rotary_wing_power
 from caviar_clients.envs.uav_path import FlightEnv, point
-from caviar_clients.session.checks import Airspace
+from caviar_clients.session.checks import TRIES, Airspace
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import generator
@@ -41,6 +42,8 @@ class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     radio: float = 1.0
     outage: float = 1.0
     arrival: float = 10.0
+    intrusion: float = 1.0
+    energy: float = 0.0
 
 
 class RewardParts(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,7 +56,11 @@ class RewardParts(msgspec.Struct, frozen=True, kw_only=True):
     outage: float
     """−1…0: minus the share of users without a path, or with an SNR below ``outage_snr_db``."""
     arrival: float
-    """1 in the step that reaches the goal, else 0."""
+    """1 in the step that reaches the goal, else 0; with addresses, how many of them the step delivers to."""
+    intrusion: float
+    """−1 where the way of the step meets a box of ``no_fly_m``, else 0."""
+    energy: float
+    """−1…0: minus the propulsion power (`deliveries.rotary_wing_power`) over the greatest one."""
 
     def weighted(self, weights: Weights) -> float:
         """Sum up the parts, each times its weight."""
@@ -62,31 +69,42 @@ class RewardParts(msgspec.Struct, frozen=True, kw_only=True):
             + weights.radio * self.radio
             + weights.outage * self.outage
             + weights.arrival * self.arrival
+            + weights.intrusion * self.intrusion
+            + weights.energy * self.energy
         )
 
 
 class UavPathV1Env(FlightEnv):
-    """Fly to a goal, and stay in reach of the radio on the way. The action is that of `FlightEnv`.
+    """Fly to a goal, or deliver to addresses, and stay in reach of the radio on the way. The action is that
+    of `FlightEnv`.
 
     **Episode.** Start and goal are drawn by the seed, free of scenery, within the object's bounds; the
     ``options`` of `reset` set them: ``{"start": (x, y, z), "goal": (x, y, z)}`` [m], either or both. Frame 0
     puts the object at the start, so that an episode of S frames has S − 1 steps. It terminates where the goal
     is reached and is truncated after the last frame.
 
+    With ``deliveries`` there are so many addresses in place of the goal, drawn likewise or set by
+    ``{"addresses": [(x, y, z), …]}``, to be flown to in any order; the episode terminates after the last one.
+
     **Observation**, float32:
 
     * ``position``: in the box of the bounds, −1…1 on each axis, Shape ``[3]``;
     * ``velocity``: over the greatest speed, −1…1, Shape ``[3]``;
-    * ``goal``: the way that is left, over the size of the box, −1…1 on each axis, Shape ``[3]``;
+    * ``goal``: the way that is left, over the size of the box, −1…1 on each axis, Shape ``[3]``; with
+      ``deliveries`` that to the first address of the shortest tour over those left;
     * ``rate``: spectral efficiency of the frame before over ``efficiency_bit_s_hz``, mean over users, 0…1,
       Shape ``[1]``; 0 at the start;
     * ``outage``: share of users in outage in the frame before, 0…1, Shape ``[1]``; 0 at the start;
+    * with ``deliveries``, ``addresses``: the way to each, as ``goal``, 0 once delivered, Shape ``[N, 3]``,
+      and ``delivered``: 0 or 1, Shape ``[N]``;
     * and the parts of ``observe``.
 
     **Reward** of a step: ``Σ weight·part`` with the parts of `RewardParts`, which ``info["reward_parts"]``
-    has: progress −1…1, radio −1…0, outage −1…0, arrival 0 or 1. With the weights' defaults it lies within
-    −3…11. Radio and outage are never above 0, so that nothing is gained by staying on the way; progress sums
-    up to the same on every way to the goal.
+    has: progress −1…1, radio −1…0, outage −1…0, arrival, intrusion −1 or 0, energy −1…0 (weight 0 unless
+    given). With one goal and the weights' defaults it lies within −3…11. Radio and outage are never above 0,
+    so that nothing is gained by staying on the way; progress sums up to the same on every way to the goal.
+    With addresses the way that is left is the shortest tour over them, so that any order can be flown, and
+    a detour costs its length.
 
     Args:
         scenario: Scenario file, or the name of a scenario that ships.
@@ -97,6 +115,9 @@ class UavPathV1Env(FlightEnv):
             the way that the object can fly in an episode.
         efficiency_bit_s_hz: Spectral efficiency that is a radio part of 0: the best one that counts.
         outage_snr_db: A user with a lower SNR [dB] is in outage.
+        deliveries: Number of addresses, 1 to `deliveries.MOST_ADDRESSES`; 0: there is one goal.
+        no_fly_m: Boxes to keep out of, each as its lowest and its highest corner [m]. Starts, goals and
+            addresses are drawn outside of them; nothing but the reward keeps the object out.
         weights: Of the parts: `Weights`, by name; what is left out has its default.
         observe: Further parts: `caviar_protocol.observations.PARTS`; their bounds are their own.
         options: The other arguments of `SessionEnv`, but for ``reward``.
@@ -112,11 +133,11 @@ class UavPathV1Env(FlightEnv):
         ['goal', 'outage', 'position', 'rate', 'velocity']
         >>> *_, info = env.step(env.action_space.sample())
         >>> sorted(info["reward_parts"])
-        ['arrival', 'outage', 'progress', 'radio']
+        ['arrival', 'energy', 'intrusion', 'outage', 'progress', 'radio']
         >>> env.close()
     """
 
-    reset_options = ("start", "goal")
+    reset_options = ("start", "goal", "addresses")
     uses_scenery = True
     needs_parts = False
 
@@ -129,6 +150,8 @@ class UavPathV1Env(FlightEnv):
         distance_m: tuple[float, float] | None = None,
         efficiency_bit_s_hz: float = 10.0,
         outage_snr_db: float = 0.0,
+        deliveries: int = 0,
+        no_fly_m: Sequence[tuple[Sequence[float], Sequence[float]]] = (),
         weights: Mapping[str, float] | None = None,
         observe: Sequence[str] = (),
         **options: Any,
@@ -147,17 +170,22 @@ class UavPathV1Env(FlightEnv):
         self._low, self._high = self._bounds()
         self._drawn_in = (self._low, self._high) if box_m is None else self._box(box_m)
         self._step_way = self._max_speed * self.scenario.run.sampling_period_ns / 1e9
+        self._count = _count(deliveries)
+        self._no_fly = _boxes(no_fly_m)
+        self._greatest_power = greatest_power(self._max_speed)
         self._distance = self._distances(distance_m)
         self._airspace: Airspace | None = None
-        self._goal: Vector = (0.0, 0.0, 0.0)
+        self._deliveries: Deliveries | None = None
         self._parts_now: RewardParts | None = None
-        self.observation_space = spaces.Dict(
-            {
-                **{name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in OWN_PARTS[:3]},
-                **{name: spaces.Box(0.0, 1.0, (1,), np.float32) for name in OWN_PARTS[3:]},
-                **self.observation_space.spaces,
-            }
-        )
+        self._energy_j = 0.0
+        own_parts = {
+            **{name: spaces.Box(-1.0, 1.0, (3,), np.float32) for name in OWN_PARTS[:3]},
+            **{name: spaces.Box(0.0, 1.0, (1,), np.float32) for name in OWN_PARTS[3:]},
+        }
+        if self._count:
+            own_parts["addresses"] = spaces.Box(-1.0, 1.0, (self._count, 3), np.float32)
+            own_parts["delivered"] = spaces.Box(0.0, 1.0, (self._count,), np.float32)
+        self.observation_space = spaces.Dict({**own_parts, **self.observation_space.spaces})
 
     # --- arguments ---------------------------------------------------------------------------------
 
@@ -190,7 +218,7 @@ class UavPathV1Env(FlightEnv):
         if distance_m is None:
             # Frame 0 puts the object at its start: it flies in the others.
             way = self._step_way * (self.scenario.run.frames - 1)
-            low, high = SHARE_OF_WAY
+            low, high = (share / max(1, self._count) for share in SHARE_OF_WAY)
             return max(low * way, 2 * self._reach), max(high * way, 4 * self._reach)
         found = tuple(distance_m) if isinstance(distance_m, Sequence) else ()
         if not (len(found) == 2 and all(map(_is_number, found)) and self._reach < found[0] <= found[1]):
@@ -206,40 +234,74 @@ class UavPathV1Env(FlightEnv):
         if moment is None or session is None:
             raise RunError("no episode has begun; call reset()")
         self._moment = None  # there is no episode to step until the object is at its start
-        start, self._goal = self._start_and_goal(moment, options)
+        start, addresses = self._start_and_addresses(moment, options)
+        self._deliveries, self._energy_j = Deliveries(addresses, self._reach), 0.0
         there = WaypointCommand(object=self.vehicle, position=start, speed=self._max_speed, at_once=True)
         frame = session.step({"action": Action(commands=(*self._beams(moment), there))})
         # The link that comes with it is that of the place before.
         self._moment, self._parts_now = msgspec.structs.replace(self._at(frame), link=None), None
 
-    def _start_and_goal(self, moment: Moment, options: Mapping[str, Any]) -> tuple[Vector, Vector]:
+    def _start_and_addresses(self, moment: Moment, options: Mapping[str, Any]) -> tuple[Vector, list[Vector]]:
         frame = moment.frame
         # From the seed of the episode, which a broker elsewhere has, too, and not from gymnasium's generator.
         random = generator(frame.seed, frame.seed_episode, f"{self.agent}/start-and-goal")
         bounds, box = self._space((self._low, self._high)), self._space(self._drawn_in)
-        given = {name: self._given(bounds, name, options.get(name)) for name in self.reset_options}
-        start, goal = given["start"], given["goal"]
+        start = self._given(bounds, "start", options.get("start"))
+        addresses = self._given_addresses(bounds, options)
         if start is None:
-            start = box.draw(random) if goal is None else box.draw(random, goal, self._distance)
-        if goal is None and start is not None:
-            goal = box.draw(random, start, self._distance)
-        if start is None or goal is None:
+            start = box.draw(random, addresses[0], self._distance) if addresses else box.draw(random)
+        tries = TRIES
+        while start is not None and len(addresses) < max(1, self._count):
+            address = box.draw(random, start, self._distance)
+            tries -= 1
+            if address is None or not tries:
+                start = None
+            # Two in reach of one place would be one delivery.
+            elif all(math.dist(address, other) > 2 * self._reach for other in addresses):
+                addresses.append(address)
+        if start is None:
             low, high = self._distance
+            what = f"{self._count} addresses" if self._count else "goal"
             raise ScenarioError(
-                f"no start and goal {low:g} to {high:g} m apart were found between {list(box.low)} and "
+                f"no start and {what} {low:g} to {high:g} m apart were found between {list(box.low)} and "
                 f"{list(box.high)}; write another box_m or distance_m, or other options"
             )
         # Given by options: drawn ones are farther apart than the reach.
-        if math.dist(start, goal) <= self._reach:
-            raise ScenarioError(f"start {list(start)} is within reach_m={self._reach:g} of goal {list(goal)}")
-        return start, goal
+        for address in addresses:
+            if math.dist(start, address) <= self._reach:
+                where = f"within reach_m={self._reach:g} of {'address' if self._count else 'goal'}"
+                raise ScenarioError(f"start {list(start)} is {where} {list(address)}")
+        return start, addresses
+
+    def _given_addresses(self, space: Airspace, options: Mapping[str, Any]) -> list[Vector]:
+        """Addresses, or the goal, that the options set; none where they are to be drawn."""
+        name, other = ("addresses", "goal") if self._count else ("goal", "addresses")
+        if options.get(other) is not None:
+            raise ScenarioError(f"option {other!r} does not go with deliveries={self._count}; write {name!r}")
+        given = options.get(name)
+        if given is None:
+            return []
+        if not self._count:
+            given = [given]
+        elif not isinstance(given, Sequence) or len(given) != self._count:
+            raise ScenarioError(
+                f"addresses {given!r} are not {self._count} points; write so many, x, y, z [m]"
+            )
+        places = [self._given(space, name, place) for place in given]
+        return [place for place in places if place is not None]
 
     def _space(self, box: tuple[Vector, Vector]) -> Airspace:
         # Made once: scenery is known after the first reset, and it stays.
         if self._airspace is None and self._session is not None:
             # The world keeps the object at its clearance, up to rounding: a start just there may be inside.
             clearance = float(self._flown.get("clearance_m", 1.0)) + _MARGIN
-            self._airspace = Airspace(self._low, self._high, clearance, self._session.scenery)
+            self._airspace = Airspace(
+                self._low,
+                self._high,
+                clearance,
+                self._session.scenery,
+                lambda place: not any(box.meets(place, place) for box in self._no_fly),
+            )
         if self._airspace is None:
             raise RunError("no episode has begun; call reset()")
         return self._airspace.within(*box)
@@ -251,7 +313,8 @@ class UavPathV1Env(FlightEnv):
         if place is None or not space.is_free(place):
             raise ScenarioError(
                 f"{name} {value!r} is no place for {self.vehicle!r}; write a point [m] between "
-                f"{list(space.low)} and {list(space.high)}, clear of the scenery and outside of buildings"
+                f"{list(space.low)} and {list(space.high)}, clear of the scenery and outside of buildings "
+                "and of the boxes of no_fly_m"
             )
         return place
 
@@ -259,15 +322,33 @@ class UavPathV1Env(FlightEnv):
 
     def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
         efficiency, outage = self._radio(before, link)
-        nearer = self._left(before) - self._left(now)
+        deliveries = self._episode_deliveries
+        start, end = self._place(before), self._place(now)
+        # Before what is reached is taken off the tour: the rest of the way to it is nothing that was flown.
+        nearer = deliveries.tour_m(start) - deliveries.tour_m(end)
+        x, y, z = now.scene.velocity[now.scene.names.index(self.vehicle)].tolist()
+        power = rotary_wing_power((x, y, z))
+        self._energy_j += power * (now.frame.t_ns - before.frame.t_ns) / 1e9
         self._parts_now = RewardParts(
             # Beyond ±1 only by rounding: the world bounds the speed.
             progress=min(1.0, max(-1.0, nearer / self._step_way)),
             radio=efficiency - 1.0,
             outage=0.0 - outage,  # and not -outage, which is −0.0 without one
-            arrival=float(self._terminated(now)),
+            arrival=float(deliveries.deliver(end)),
+            intrusion=0.0 - any(box.meets(start, end) for box in self._no_fly),
+            energy=0.0 - power / self._greatest_power,
         )
         return self._parts_now.weighted(self._weights)
+
+    @property
+    def _episode_deliveries(self) -> Deliveries:
+        if self._deliveries is None:
+            raise RunError("no episode has begun; call reset()")
+        return self._deliveries
+
+    def _place(self, moment: Moment) -> Vector:
+        x, y, z = self._position(moment).tolist()
+        return x, y, z
 
     def _radio(self, moment: Moment, link: Link | None) -> tuple[float, float]:
         """Mean spectral efficiency of the users over the best one that counts, and the share in outage; both
@@ -283,11 +364,8 @@ class UavPathV1Env(FlightEnv):
         in_outage = ~link.has_path[mine] | (link.snr[mine] < self._outage_snr)
         return float(efficiency.mean()), float(in_outage.mean())
 
-    def _left(self, moment: Moment) -> float:
-        return float(np.linalg.norm(np.asarray(self._goal) - self._position(moment)))
-
     def _terminated(self, moment: Moment) -> bool:
-        return self._left(moment) <= self._reach
+        return self._episode_deliveries.is_done
 
     def _observation(self, moment: Moment) -> Observation:
         low, size = np.asarray(self._low), np.subtract(self._high, self._low)
@@ -297,15 +375,37 @@ class UavPathV1Env(FlightEnv):
         own = {
             "position": 2 * (position - low) / size - 1,
             "velocity": moment.scene.velocity[index] / self._max_speed,
-            "goal": (np.asarray(self._goal) - position) / size,
+            "goal": self._way(self._first_address(position), position) / size,
         }
+        deliveries = self._episode_deliveries
+        if self._count:
+            ways = [
+                np.zeros(3) if done else self._way(address, position) / size
+                for address, done in zip(deliveries.addresses, deliveries.delivered, strict=True)
+            ]
+            own["addresses"], own["delivered"] = np.array(ways), np.array(deliveries.delivered, np.float64)
         found: Observation = {name: _clipped(values) for name, values in own.items()}
         found["rate"], found["outage"] = (np.array([value], np.float32) for value in (efficiency, outage))
         return {**found, **super()._observation(moment)}
 
+    def _first_address(self, position: Float64Array) -> Vector:
+        """First address of the shortest tour; the last one delivered to where none is left."""
+        x, y, z = position.tolist()
+        first = self._episode_deliveries.next_address((x, y, z))
+        return self._episode_deliveries.addresses[-1] if first is None else first
+
+    def _way(self, address: Vector, position: Float64Array) -> Float64Array:
+        way: Float64Array = np.asarray(address) - position
+        return way
+
     def _info(self, moment: Moment) -> dict[str, Any]:
         known = super()._info(moment)
-        known["goal_m"], known["distance_m"] = self._goal, self._left(moment)
+        place, deliveries = self._place(moment), self._episode_deliveries
+        known["goal_m"] = self._first_address(self._position(moment))
+        # With one goal its distance to the end: nothing is left of a tour that is done.
+        goal = deliveries.addresses[0]
+        known["distance_m"] = deliveries.tour_m(place) if self._count else math.dist(place, goal)
+        known["delivered"], known["energy_j"] = deliveries.delivered, self._energy_j
         if self._parts_now is not None:
             known["reward_parts"] = msgspec.structs.asdict(self._parts_now)
         return known
@@ -325,6 +425,25 @@ def _positive(name: str, value: float) -> float:
     if not (_is_number(value) and value > 0):
         raise ScenarioError(f"{name}={value!r}; write a finite number above 0")
     return float(value)
+
+
+def _count(deliveries: int) -> int:
+    if type(deliveries) is not int or not 0 <= deliveries <= MOST_ADDRESSES:
+        raise ScenarioError(f"deliveries={deliveries!r}; write a whole number from 0 to {MOST_ADDRESSES}")
+    return deliveries
+
+
+def _boxes(no_fly_m: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[Box, ...]:
+    found = []
+    for given in no_fly_m:
+        corners = [point(corner) for corner in given] if isinstance(given, Sequence) else []
+        low, high = corners if len(corners) == 2 else (None, None)
+        if low is None or high is None or not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ScenarioError(
+                f"no_fly_m has {given!r}; write the lowest and the highest corner of a box, x, y, z [m] each"
+            )
+        found.append(Box(low, high))
+    return tuple(found)
 
 
 def _decibels(name: str, value: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -213,10 +213,19 @@ class Airspace:
         low, high: Corners [m] of the box that it keeps within.
         clearance: Least distance [m] of its centre from scenery.
         scenery: Files of the run's scenery, by asset name.
+        is_allowed: Tells of a point [m] whether the object may be there.
     """
 
-    def __init__(self, low: Vector, high: Vector, clearance: float, scenery: Mapping[str, Path]) -> None:
+    def __init__(
+        self,
+        low: Vector,
+        high: Vector,
+        clearance: float,
+        scenery: Mapping[str, Path],
+        is_allowed: Callable[[Vector], bool] = lambda point: True,
+    ) -> None:
         self.low, self.high = low, high
+        self._is_allowed = is_allowed
         self._clearance = clearance
         triangles = scenery_triangles(scenery)
         # What ends below the box is no obstacle: an object may fly low over the ground.
@@ -232,6 +241,8 @@ class Airspace:
     def is_free(self, point: Vector) -> bool:
         """Tell whether the object can be at a point [m]."""
         if not all(a <= x <= b for a, x, b in zip(self.low, point, self.high, strict=True)):
+            return False
+        if not self._is_allowed(point):
             return False
         if self._obstacles.distance(point, self._clearance) < self._clearance:
             return False
