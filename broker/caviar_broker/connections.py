@@ -231,8 +231,8 @@ class Connections:
 
     def _stranger(self, route: bytes) -> str:
         """What to call a connection that is no service's."""
-        address = self._guard.address(route)
-        return f"a connection from {address}" if address else "a connection"
+        origin = self._guard.origin(route)
+        return f"a connection from {origin}" if origin else "a connection"
 
     def _tell(self, kind: str, text: str, service: str, notice: str) -> None:
         text = self._throttle.tell(kind, text, time.monotonic_ns())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import struct
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -154,6 +157,42 @@ def test_bytes_that_are_no_zeromq_end_their_connection_and_are_told(tmp_path: Pa
             eventually(lambda: is_ended(connection), "the connection is ended", 8.0)
         told(background.broker, "ended before it sent a message, like one that has no ZMTP 3")
         unharmed(background)
+
+
+KNOCKS = """
+import socket, sys
+with socket.socket(socket.AF_UNIX) as door:
+    door.connect(sys.argv[1])
+    door.sendall(b"GET / HTTP/1.1\\r\\n\\r\\n" * 20)
+    try:
+        while door.recv(100):
+            pass
+    except ConnectionResetError:
+        pass
+"""
+
+
+@pytest.mark.parametrize("sibling", [False, True])
+def test_at_a_socket_file_a_process_is_named_unless_it_is_a_service_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sibling: bool
+) -> None:
+    """A service that ends before its first message is missed by whoever started it."""
+    file = tmp_path / "broker"
+    if sibling:
+        monkeypatch.setattr(os, "getppid", os.getpid)  # so that the test's child has the broker's parent
+    with serving(plan("world"), tmp_path, endpoint=f"ipc://{file}") as broker:
+        wires = broker.server._guard._wires
+        knocker = subprocess.Popen([sys.executable, "-c", KNOCKS, str(file)])
+        assert knocker.wait(20) == 0
+        eventually(lambda: len(wires) == 0, "it has gone")
+        with Client(broker.endpoint, "stranger", "agent", inputs=(), outputs=("action",)) as stranger:
+            stranger.send(stranger.hello)
+            assert stranger.expect(m.Refuse).code == "unknown-name"
+            texts = broker.witness.texts()
+        words = f"a connection from process {knocker.pid} ("
+        assert (words in texts) is not sibling
+        assert "from  " not in texts
+        assert f"HELLO of a connection from process {os.getpid()} (" in texts
 
 
 def test_connections_that_say_nothing_make_room_for_those_that_do(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_a_connection_is_known_where_no_descriptor_is_left(couple) -> None:
         found = _identity(far.fileno())
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-    assert found == (os.fstat(far.fileno()).st_ino, "127.0.0.1")
+    assert found == (os.fstat(far.fileno()).st_ino, "127.0.0.1", None)
     assert far.send(b"x") == 1, "it is still open"
 
 

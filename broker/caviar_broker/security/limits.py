@@ -264,16 +264,22 @@ class PeerGuard:
             return "its connection is not known any more"
         return self.access.refusal(peer.key, name, role, outputs)
 
-    def address(self, route: bytes) -> str:
-        """Return the address that a peer connects from; empty for one that is not remembered."""
+    def origin(self, route: bytes) -> str:
+        """Say where a peer connects from: an address, or at a socket file a process; empty where its routing
+        id is not remembered."""
         peer = self._peers.get(route)
-        return peer.address if peer is not None else ""
+        return self._origin(peer) if peer is not None else ""
 
     def cut(self, route: bytes, why: str) -> None:
         """End the connection of a peer, and bar it for a while."""
         peer = self._peers.get(route)
         if peer is not None and not peer.cut:
             self._cut(peer, why)
+
+    def _origin(self, peer: _Peer) -> str:
+        wire = peer.wire or peer.maybe
+        # The address that libzmq has of a peer at a socket file is made of numbers: localhost:0:0:4711.
+        return wire.process if wire is not None and wire.process else peer.address
 
     def _meet(self, route: bytes, part: zmq.Frame) -> _Peer:
         """Remember a routing id at its first message."""
@@ -398,9 +404,12 @@ class PeerGuard:
             self._by_wire.pop(wire).ended = now
         spoke = {peer.maybe for peer in self._peers.values()} if failures else ()
         what = "no authorized key" if self.access else "no ZMTP 3"
-        for address in [wire.address for wire in failures if wire not in spoke]:
-            text = f"a connection from {address} ended before it sent a message, like one that has {what}"
-            self._tell(f"handshake {address}", text)
+        for wire in failures:
+            # A service that ends before its first message is missed by whoever started it, and by the clock.
+            if wire in spoke or wire.is_sibling:
+                continue
+            text = f"a connection from {wire.origin} ended before it sent a message, like one that has {what}"
+            self._tell(f"handshake {wire.origin}", text)
         for wire in fresh:
             if self._barred.get(wire.address, 0) > now:
                 wire.end()
@@ -420,7 +429,8 @@ class PeerGuard:
         for wire in beyond:
             wire.end()
         for address, count in Counter(wire.address for wire in beyond).items():
-            text = f"{count} connections from {address} that never said HELLO were ended: there were too many"
+            whose = f" from {address}" if address else ""
+            text = f"{count} connections{whose} that never said HELLO were ended: there were too many"
             self._tell(f"connections {address}", text)
 
     def _is_service(self, wire: TcpConnection) -> bool:
@@ -436,7 +446,7 @@ class PeerGuard:
             return
         wire.end()
         self._bar(wire.address)
-        self._tell(f"cut {wire.address}", f"a connection from {wire.address} was cut off: {why}")
+        self._tell(f"cut {wire.origin}", f"a connection from {wire.origin} was cut off: {why}")
 
     def _cut(self, peer: _Peer, why: str, *, bar: bool = True) -> None:
         peer.cut, peer.credit = True, float("-inf")
@@ -448,12 +458,9 @@ class PeerGuard:
             self._bar(peer.address)
         if not self._lost(peer.route, why):
             name = self.access.name(peer.key) if self.access is not None else ""
-            who = (
-                f"a connection of {name!r} from {peer.address}"
-                if name
-                else f"a connection from {peer.address}"
-            )
-            self._tell(f"cut {peer.address}", f"{who} was cut off: {why}")
+            who = f"a connection of {name!r}" if name else "a connection"
+            who += f" from {origin}" if (origin := self._origin(peer)) else ""
+            self._tell(f"cut {origin}", f"{who} was cut off: {why}")
 
     def _bar(self, address: str) -> None:
         """Bar an address, unless services in good standing are at home there, which may have to come back."""
@@ -473,7 +480,8 @@ class PeerGuard:
             self._zap.send_multipart(reply, zmq.NOBLOCK)
             if why:
                 address = request[3].decode(errors="replace") if len(request) > 3 else ""
-                self._tell(f"key {address}", f"a connection from {address} was refused: {why}")
+                whose = f" from {address}" if address else ""
+                self._tell(f"key {address}", f"a connection{whose} was refused: {why}")
 
 
 def _property(part: zmq.Frame, name: str) -> str:

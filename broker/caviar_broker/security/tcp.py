@@ -1,4 +1,4 @@
-"""The TCP connections under a ZeroMQ socket: whose they are, what waits in them, and ending one of them.
+"""The connections under a ZeroMQ socket: whose they are, what waits in them, and ending one of them.
 
 libzmq has no call that ends one connection of a socket, and none that says how much memory one takes. But
 its messages carry the descriptor that they came from (``__fd``), a monitor tells when connections begin and
@@ -15,12 +15,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import zmq
 
 _EVENT = struct.Struct("=HI")
 _BYTES = struct.Struct("=QQ")
+# Of struct ucred: process, user and group (unix(7)).
+_PEER = struct.Struct("=iII")
+COMMAND = 80
+"""Letters of a command line that are shown."""
 # Where ``tcpi_bytes_acked`` and ``tcpi_bytes_received`` stand in struct tcp_info (linux/tcp.h).
 _BYTES_AT = 120
 _WATCHED = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | int(zmq.EVENT_CLOSED)
@@ -47,6 +52,15 @@ class TcpConnection:
     open: bool = True
     dismissed: bool = False
     """Whether the broker ended it."""
+    process: str = ""
+    """What connected to a socket file, which has no address: its process id and command line."""
+    is_sibling: bool = False
+    """Whether that process was started by the one that started the broker, as services of a run are."""
+
+    @property
+    def origin(self) -> str:
+        """Where it comes from, for people: an address, or a process of this machine."""
+        return self.address or self.process
 
     def end(self) -> None:
         """End the connection; does nothing where it has ended."""
@@ -177,9 +191,11 @@ class TcpConnections:
         found = _identity(fd)
         if found is None:
             return TcpConnection(fd, 0, UNKNOWN, now, open=False)
-        inode, address = found
+        inode, address, pid = found
         until = self._closed.pop(fd, -UNCLEAR_NS) + UNCLEAR_NS
         wire = self._open[fd] = TcpConnection(fd, inode, address, now, until)
+        if pid is not None:
+            wire.process, wire.is_sibling = _process(pid)
         return wire
 
     def _ended(self, fd: int) -> TcpConnection | None:
@@ -201,9 +217,10 @@ def plain(address: str) -> str:
     return address.removeprefix("::ffff:").partition("%")[0]
 
 
-def _identity(fd: int) -> tuple[int, str] | None:
-    """Inode and peer address of libzmq's socket, also where no descriptor is left for one of our own;
-    None where it is no socket."""
+def _identity(fd: int) -> tuple[int, str, int | None] | None:
+    """Inode and peer address of libzmq's socket, and the process at the other end of a socket file, also
+    where no descriptor is left for one of our own; None where it is no socket."""
+    pid = None
     try:
         found = os.fstat(fd)
         if not stat.S_ISSOCK(found.st_mode):
@@ -213,11 +230,25 @@ def _identity(fd: int) -> tuple[int, str] | None:
         return None
     try:
         name = borrowed.getpeername()
+        if borrowed.family == socket.AF_UNIX:
+            pid, _, _ = _PEER.unpack(borrowed.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
     except OSError:
         name = ""
     finally:
         borrowed.detach()
-    return found.st_ino, plain(str(name[0])) if isinstance(name, tuple) else ""
+    return found.st_ino, plain(str(name[0])) if isinstance(name, tuple) else "", pid
+
+
+def _process(pid: int) -> tuple[str, bool]:
+    """A process as people know it, and whether it has the same parent as this one."""
+    folder = Path("/proc", str(pid))
+    try:
+        command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        # After the name, in brackets, which may hold anything: the state, then the parent.
+        parent = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
+    except (OSError, ValueError, IndexError):
+        return f"process {pid}", False
+    return f"process {pid} ({command[:COMMAND]})", parent == os.getppid()
 
 
 def _duplicate(fd: int) -> socket.socket | None:
