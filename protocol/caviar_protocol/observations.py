@@ -11,6 +11,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import reduce
+from operator import add
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -25,7 +27,7 @@ from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.scenario.schema import ServiceSpec, owned_by
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
-from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Link, Scene
+from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Scene
 
 P = TypeVar("P", bound=Payload)
 
@@ -165,12 +167,41 @@ def _array(device: DeviceSpec) -> AntennaArray:
     return device.array or AntennaArray()
 
 
+class LinkFigures(Protocol):
+    """What is read of a link: a `Link`, with one number for each user, or a link of many episodes, with a row
+    of users for each of them."""
+
+    @property
+    def tx(self) -> tuple[str, ...]:
+        """Transmitter of each user."""
+
+    @property
+    def rx(self) -> tuple[str, ...]:
+        """Receiver of each user."""
+
+    @property
+    def tx_beam(self) -> NDArray[Any]:
+        """Chosen TX beam, −1: none; Shape ``[..., U]`` as all below."""
+
+    @property
+    def rx_beam(self) -> NDArray[Any]:
+        """Chosen RX beam."""
+
+    @property
+    def abs_y(self) -> Float64Array:
+        """|y|."""
+
+    @property
+    def spectral_efficiency(self) -> Float64Array:
+        """[bit/s/Hz]."""
+
+
 class Moment(msgspec.Struct, frozen=True):
     """What is known at a frame, from which observations are read."""
 
     frame: ObservedFrame
     scene: Scene
-    link: Link | None
+    link: LinkFigures | None
     """Of the frame before; None in frame 0."""
     users: tuple[tuple[int, Pair], ...]
     """Place and pair of the users that are there."""
@@ -277,21 +308,76 @@ class Velocity(_PerUser):
         return [device_velocity(moment.scene, pair.rx) for _, pair in moment.users]
 
 
-_NO_LINK = [0.0]
+class _OfLink(Part):
+    """A number for each place out of the link of the frame before; 0 in frame 0 and for an empty place."""
+
+    low: ClassVar[float] = 0.0
+    high: ClassVar[float] = FAR
+    _known: tuple[Any, Any, Any] | None = None  # what `_taken` was found for
+    _taken: Sequence[tuple[int, Pair, Sequence[int]]] = ()
+
+    @property
+    def bounds(self) -> Bounds:
+        return Bounds(self.low, self.high, (len(self.users),), np.float32)
+
+    def read(self, moment: Moment) -> NDArray[np.float32]:
+        link = moment.link
+        if link is None:
+            return np.zeros(len(self.users), np.float32)
+        known = (link.tx, link.rx, moment.users)
+        if known != self._known:
+            self._known, self._taken = known, _taken_places(*known)
+        values = np.zeros((*link.abs_y.shape[:-1], len(self.users)), np.float32)
+        for place, pair, users in self._taken:
+            # One after the other, so that a mean does not depend on how many are worked out at once.
+            values[..., place] = reduce(add, [self._of_user(link, u, pair) for u in users]) / len(users)
+        return values
+
+    @abstractmethod
+    def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
+        """The number of one user, Shape ``[...]`` as the link has beside its users; that of a place is the
+        mean over carriers."""
 
 
-class LastMagnitude(_PerUser):
+def _taken_places(
+    tx: Sequence[str], rx: Sequence[str], present: Sequence[tuple[int, Pair]]
+) -> list[tuple[int, Pair, list[int]]]:
+    """The places that are taken: pair, and its users in the link, one a carrier."""
+    of_pair: dict[tuple[str, str], list[int]] = {}
+    for index, names in enumerate(zip(tx, rx, strict=True)):
+        of_pair.setdefault(names, []).append(index)
+    # A pair that came in this frame has no link yet.
+    taken = ((place, pair, of_pair.get((pair.tx.name, pair.rx.name), [])) for place, pair in present)
+    return [entry for entry in taken if entry[2]]
+
+
+class LastMagnitude(_OfLink):
     """|y| of the frame before, the mean over carriers; 0 in frame 0. Shape ``[U]``."""
 
-    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
-        of_pair: dict[tuple[str, str], list[float]] = {}
-        link = moment.link
-        if link is not None:
-            for tx, rx, abs_y in zip(link.tx, link.rx, link.abs_y.tolist(), strict=True):
-                of_pair.setdefault((tx, rx), []).append(abs_y)
-        # A pair that came in this frame has no link yet.
-        found = [of_pair.get((pair.tx.name, pair.rx.name), _NO_LINK) for _, pair in moment.users]
-        return [sum(values) / len(values) for values in found]
+    low = -FAR  # as it was: a trained policy is tied to its bounds
+
+    def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
+        return link.abs_y[..., user]
+
+
+class LastRate(_OfLink):
+    """Spectral efficiency [bit/s/Hz] of the beams of the frame before, the mean over carriers: what a
+    receiver feeds back. 0 in frame 0. Shape ``[U]``."""
+
+    def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
+        return link.spectral_efficiency[..., user]
+
+
+class LastBeam(_OfLink):
+    """The pair of beams of the frame before, by its index ``i = tx_beam·Nr + rx_beam`` as
+    ``(i + 1) / (Nt·Nr)``; 0 in frame 0 and where none was chosen. Shape ``[U]``."""
+
+    high = 1.0
+
+    def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
+        tx_beam, receive = link.tx_beam[..., user], pair.rx.array.size
+        share = (tx_beam * receive + link.rx_beam[..., user] + 1) / (pair.tx.array.size * receive)
+        return np.where(tx_beam < 0, 0.0, share)
 
 
 class LidarGrid(Part):
@@ -362,6 +448,8 @@ PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "position": Position,
     "velocity": Velocity,
     "last_abs_y": LastMagnitude,
+    "last_rate": LastRate,
+    "last_beam": LastBeam,
     "lidar_grid": LidarGrid,
     "depth": DepthImage,
     "camera": CameraImage,

@@ -73,16 +73,36 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
     """
     if array.size == 1:
         return np.ones((*directions.shape[:-1], 1), np.complex128)
-    y, z = _phases(array)
     # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
-    columns: Complex128Array = np.exp(directions[..., 1, None] * y)
+    columns = _progression(directions[..., 1], array.columns, array.horizontal_spacing)
     if array.rows == 1:
         return columns
-    rows = np.exp(directions[..., 2, None] * z)
+    rows = _progression(directions[..., 2], array.rows, -array.vertical_spacing)  # from +z to −z
     vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
         *directions.shape[:-1], array.size
     )
     return vector
+
+
+FIRST = 16
+"""Elements along an axis whose phases are exponentials; from there on their number is doubled by one product,
+which costs a twentieth of an exponential."""
+
+
+def _progression(cosines: Float64Array, size: int, spacing: float) -> Complex128Array:
+    """Phases of elements along one axis, centred, with these direction cosines, Shape ``[...]`` to
+    ``[..., size]``."""
+    exponents, begins = _anchors(size, spacing)
+    known = np.exp(cosines[..., None] * exponents)
+    if not begins:
+        return known
+    found = np.empty((*cosines.shape, size), np.complex128)
+    found[..., :FIRST] = known[..., :FIRST]
+    for number, begin in enumerate(begins):
+        count = min(begin, size - begin)
+        turn = known[..., FIRST + number, None]
+        np.multiply(found[..., :count], turn, out=found[..., begin : begin + count])
+    return found
 
 
 # A scenario has few arrays, and each frame asks for them for every path.
@@ -99,10 +119,16 @@ def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
 
 
 @lru_cache(maxsize=256)
-def _phases(array: AntennaArray) -> tuple[Complex128Array, Complex128Array]:
-    """j2π times the grid."""
-    y, z = _grid(array)
-    return np.multiply(2j * np.pi, y, dtype=np.complex128), np.multiply(2j * np.pi, z, dtype=np.complex128)
+def _anchors(size: int, spacing: float) -> tuple[Complex128Array, tuple[int, ...]]:
+    """j2π times the places [wavelengths] of the first elements, then those of the steps that double them, and
+    the elements at which these begin."""
+    places = (np.arange(min(size, FIRST)) - (size - 1) / 2) * spacing
+    begins, begin = [], FIRST
+    while begin < size:
+        begins.append(begin)
+        begin *= 2
+    steps = np.array(begins, np.float64) * spacing
+    return np.multiply(2j * np.pi, np.concatenate([places, steps]), dtype=np.complex128), tuple(begins)
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:

@@ -389,6 +389,10 @@ class Service(ABC, Generic[S]):
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
     checkpoints: ClassVar[bool] = False
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
+    batches: ClassVar[bool] = False
+    """Whether this class, and not one that it subclasses, computes many episodes at once: a world whose
+    scenes depend on the instant alone, a channel model with `ChannelModel.batch`, a link with
+    `LinkModel.batch`."""
     extra: ClassVar[str] = ""
     """Extra of the distribution that brings the libraries of this service; empty: the base install does."""
     attributes_to_set: ClassVar[tuple[str, ...]] = ()
@@ -411,6 +415,12 @@ class Service(ABC, Generic[S]):
     def __init__(self, settings: S, run: RunInfo) -> None:
         self.settings = settings
         self.run = run
+
+    @classmethod
+    def computes_batches(cls) -> bool:
+        """Whether many episodes can be computed at once by this implementation (`batches`)."""
+        # What a subclass overrides would be left out: it has to say so itself.
+        return bool(vars(cls).get("batches", False))
 
     @property
     def needs_assets(self) -> bool:

@@ -246,7 +246,7 @@ class ServiceSession:
 
     def _prepare(self, order: m.Prepare, _: Sequence[Any], now: float) -> None:
         with self._reporting("prepare"):
-            service = self._running
+            service = self.running
             # Before its rules are adopted: what an idle service would ask for is not in demand.
             if not is_needed(service, order):
                 self._ready(m.Ready(**self._identity))
@@ -301,7 +301,7 @@ class ServiceSession:
     def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
         files = self._store.folder_of(assets) if assets else {}
         demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
-        prepared = self._running.prepare(Preparation(demand=demand, assets=files, producers=order.producers))
+        prepared = self.running.prepare(Preparation(demand=demand, assets=files, producers=order.producers))
         self._ready(
             m.Ready(
                 **self._identity,
@@ -336,7 +336,7 @@ class ServiceSession:
             self._progress(f"reset to episode {reset.episode}", 0.0)
             if self._answers is not None:
                 self._answers.clear()
-            self._running.reset(reset.seed_episode, reset.seed, reset.t0_ns)
+            self.running.reset(reset.seed_episode, reset.seed, reset.t0_ns)
             self._reset_to = reset
             self._send(m.ResetDone(**self._identity, episode=reset.episode), ())
 
@@ -358,7 +358,7 @@ class ServiceSession:
             self._unexpected(grant, f"frame {grant.frame} was answered long ago")
         if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:
             with self._reporting("release", grant.episode, grant.frame):
-                self._running.release_memory()
+                self.running.release_memory()
                 if self._tunes_memory and now >= self._trim_at:
                     trim_memory()
                     self._trim_at = now + TRIM_S
@@ -374,12 +374,12 @@ class ServiceSession:
         """
         phase = "step"
         try:
-            result = self._running.step(frame)
+            result = self.running.step(frame)
             phase = "encode"
             sorted_products(self.use, result)  # each is of its topic's class
             phase = "release"
             if frame.number % TRIM_EVERY == TRIM_EVERY - 1:
-                self._running.release_memory()
+                self.running.release_memory()
         except Exception as error:
             self.report(error, phase, frame.episode, frame.number)
             return None
@@ -396,7 +396,7 @@ class ServiceSession:
         try:
             frame = self._frame(reset, grant, parts)
             began = time.monotonic_ns()
-            result = self._running.step(frame)
+            result = self.running.step(frame)
             step_ns = time.monotonic_ns() - began
             phase = "encode"
             answer: Answer = self._done(grant, result, step_ns)
@@ -408,7 +408,7 @@ class ServiceSession:
 
     def _frame(self, reset: m.Reset, grant: m.Grant, parts: Sequence[Any]) -> Frame:
         inputs = frame_inputs(grant, parts, self._check, encoded=self._encodes)
-        return granted_frame(self._running, reset, grant, inputs)
+        return granted_frame(self.running, reset, grant, inputs)
 
     def _done(self, grant: m.Grant, result: StepResult, step_ns: int) -> tuple[m.Done, Sequence[Any]]:
         if self._encodes:
@@ -417,7 +417,7 @@ class ServiceSession:
 
     def _episode_end(self, end: m.EpisodeEnd, _: Sequence[Any], __: float) -> None:
         with self._reporting("end of episode", end.episode):
-            self._running.end_episode(end.frames)
+            self.running.end_episode(end.frames)
 
     # --- state (clause 18) -------------------------------------------------------------------------
 
@@ -426,7 +426,7 @@ class ServiceSession:
             return
         with self._reporting("checkpoint", order.episode, order.frame):
             self._progress(f"saving the state after frame {order.frame}", 0.0)
-            state = self._running.checkpoint()
+            state = self.running.checkpoint()
             self._send(m.CheckpointDone(**self._identity, episode=order.episode, frame=order.frame), (state,))
 
     def _restore(self, order: m.Restore, parts: Sequence[Any], _: float) -> None:
@@ -434,7 +434,7 @@ class ServiceSession:
             return
         with self._reporting("restore", order.episode, order.frame):
             self._progress(f"restoring the state after frame {order.frame}", 0.0)
-            self._running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed after this
+            self.running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed after this
             if self._answers is not None:
                 self._answers.clear(order.frame)
             self._send(m.Ready(**self._identity), ())
@@ -452,7 +452,8 @@ class ServiceSession:
     # --- what all handlers need --------------------------------------------------------------------
 
     @property
-    def _running(self) -> Service[Any]:
+    def running(self) -> Service[Any]:
+        """The service. Raises `RunError` before it is made, and where that failed."""
         if self._service is None:
             raise RunError(f"{self.name!r} could not be set up")
         return self._service

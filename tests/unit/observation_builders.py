@@ -19,7 +19,7 @@ from caviar_protocol.topics import (
 from caviar_services.service import FrameInput
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
-PER_USER = {"aoa": 1, "aod": 1, "position": 3, "velocity": 3, "last_abs_y": 1}
+PER_USER = {"aoa": 1, "aod": 1, "position": 3, "velocity": 3, "last_abs_y": 1, "last_rate": 1, "last_beam": 1}
 """Parts of the observation that every user has, and how many numbers each is."""
 
 

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from link_builders import antenna, scene_of
+from msgspec.structs import replace
 from observation_builders import (
     PER_USER,
+    antenna_spec,
     car_street,
     cars,
     link_of,
     read,
+    scenario_of,
 )
 
 from caviar_protocol.errors import ScenarioError
@@ -153,6 +156,28 @@ def test_the_last_magnitude_is_the_mean_over_carriers(scenario: Scenario) -> Non
 
 def test_the_last_magnitude_is_0_in_frame_0(scenario: Scenario) -> None:
     assert read(scenario, "last_abs_y", cars(1), link=None).tolist() == [0, 0, 0]
+
+
+def test_the_last_rate_is_the_mean_spectral_efficiency_over_carriers(scenario: Scenario) -> None:
+    link = link_of([("bs", "car.1/rx", 0.2), ("bs", "car.2/rx", 0.3), ("bs", "car.1/rx", 0.4)])
+    link = replace(link, spectral_efficiency=np.array([3.0, 7.5, 4.0]))
+    assert read(scenario, "last_rate", cars(1, 2), link=link).tolist() == [3.5, 7.5, 0.0]
+
+
+def test_the_last_beam_counts_pairs_as_actions_do_and_is_0_where_none_was_chosen() -> None:
+    """Of 4 × 2 beams: TX beam 3 and RX beam 1 are pair 7, the last of 8."""
+    street = scenario_of(antenna_spec("bs", "tx"), antenna_spec("rx", "rx", on="car.*", count=3))
+    scene = scene_of(
+        antenna("bs", "tx", array=(1, 4)),
+        *(antenna(f"car.{n}/rx", "rx", array=(1, 2), parent=f"car.{n}") for n in (1, 2, 3)),
+        objects={f"car.{n}": ((10.0 * n, 0, 0), 0.0) for n in (1, 2, 3)},
+    )
+    link = replace(
+        link_of([("bs", f"car.{n}/rx", 0.1) for n in (1, 2, 3)]),
+        tx_beam=np.array([3, 0, -1], np.int32),
+        rx_beam=np.array([1, 0, -1], np.int32),
+    )
+    assert read(street, "last_beam", scene, link=link).tolist() == [1.0, 0.125, 0.0]
 
 
 @pytest.mark.parametrize(

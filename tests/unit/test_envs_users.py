@@ -42,7 +42,7 @@ def test_a_place_whose_vehicle_left_is_zeros(scenario: Scenario, name: str) -> N
         assert value is not None
         assert value.shape == (3 * width,)
         assert not value[width * len(present) :].any()
-        if name in ("aod", "position", "last_abs_y"):
+        if name in ("aod", "position", "last_abs_y", "last_beam"):
             assert value.reshape(3, width)[: len(present)].any(axis=1).all()
 
 

@@ -1,6 +1,7 @@
 """Environments of gymnasium: importing this registers them.
 
-* ``caviar/BeamSelection-v0``: a beam pair for each user (`base.BeamSelectionEnv`);
+* ``caviar/BeamSelection-v0``: a beam pair for each user (`base.BeamSelectionEnv`), and many of them computed
+  together by ``gymnasium.make_vec`` (`vector.BeamSelectionVectorEnv`);
 * ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
   reward of comparable parts (`uav_path_v1`);
 * ``caviar/UavPath-v0``: the same with a reward of |y| and metres (`uav_path`), replaced by version 1.
@@ -13,6 +14,10 @@
 import gymnasium
 
 # As text: a program loads the environments that it makes, and no others.
-gymnasium.register("caviar/BeamSelection-v0", "caviar_clients.envs.base:BeamSelectionEnv")
+gymnasium.register(
+    "caviar/BeamSelection-v0",
+    "caviar_clients.envs.base:BeamSelectionEnv",
+    vector_entry_point="caviar_clients.envs.vector:BeamSelectionVectorEnv",
+)
 gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path_v1:UavPathV1Env")

@@ -7,8 +7,10 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from functools import reduce
+from operator import add
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeAlias, TypeVar, get_args
 
 import gymnasium
 import numpy as np
@@ -28,7 +30,7 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError, SetupE
 from caviar_protocol.host import install_command
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input
-from caviar_protocol.observations import Observer, Users
+from caviar_protocol.observations import LinkFigures, Observer, Users
 from caviar_protocol.space.beams import beam_gain
 from caviar_protocol.space.scene import Pair, device_pose
 from caviar_protocol.topics import Action, BeamChoice, Link, Scene
@@ -101,6 +103,40 @@ class MapRenderer:
             self._high = np.maximum(self._high, seen.max(0) + MARGIN_M)
 
 
+class LinkResult(LinkFigures, Protocol):
+    """What environments say about a link: a `Link`, or one of many episodes."""
+
+    @property
+    def has_path(self) -> BoolArray:
+        """Whether each user has a path, Shape ``[..., U]`` as all below."""
+
+    @property
+    def los(self) -> BoolArray:
+        """Whether the line of sight is free."""
+
+    @property
+    def top_abs_y(self) -> Float64Array:
+        """|y| of the best pairs, best first, Shape ``[..., U, K]``."""
+
+    @property
+    def baseline_abs_y(self) -> Float64Array:
+        """|y| of the pair along the straight line."""
+
+    @property
+    def snr(self) -> Float64Array:
+        """Linear."""
+
+
+def link_info(link: LinkResult) -> dict[str, NDArray[Any]]:
+    """What ``info`` has of a link, by name."""
+    return {
+        "abs_y": link.abs_y,
+        "best_abs_y": link.top_abs_y[..., 0],
+        "baseline_abs_y": link.baseline_abs_y,
+        "los": link.los,
+    }
+
+
 RewardKind: TypeAlias = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
 KINDS: tuple[RewardKind, ...] = get_args(RewardKind)
 
@@ -118,7 +154,7 @@ class Reward:
         self._known: tuple[tuple[str, ...], tuple[str, ...], Collection[tuple[str, str]]] | None = None
         self._served: BoolArray | None = None
 
-    def served(self, link: Link, pairs: Collection[tuple[str, str]]) -> BoolArray | None:
+    def served(self, link: LinkResult, pairs: Collection[tuple[str, str]]) -> BoolArray | None:
         """Find the users of a link that are among some pairs.
 
         Args:
@@ -151,10 +187,31 @@ class Reward:
             counted = counted & served
         if len(values) == 1:  # without a mask and a mean of NumPy, which take 5 µs more
             return float(values[0]) if counted[0] else 0.0
-        chosen = values[counted]
-        return float(chosen.mean()) if len(chosen) else 0.0
+        chosen: list[float] = values[counted].tolist()
+        # One after the other, as `means` adds them: `sum` has an order of its own.
+        return reduce(add, chosen) / len(chosen) if chosen else 0.0
 
-    def _values(self, link: Link) -> Float64Array:
+    def means(self, link: LinkResult, pairs: Collection[tuple[str, str]]) -> Float64Array:
+        """Work out the rewards for a frame of many episodes.
+
+        Args:
+            link: What the decisions led to, with M rows of users.
+            pairs: Names of transmitter and receiver of the users that count.
+
+        Returns:
+            What `mean` returns for the link of each episode, Shape ``[M]``.
+        """
+        values = self._values(link)
+        counted, served = link.has_path, self.served(link, pairs)
+        if served is not None:
+            counted = counted & served
+        total, number = np.zeros(len(values)), counted.sum(axis=1)
+        for user in range(values.shape[1]):
+            total += np.where(counted[:, user], values[:, user], 0.0)
+        means: Float64Array = np.divide(total, number, out=np.zeros(len(values)), where=number > 0)
+        return means
+
+    def _values(self, link: LinkResult) -> Float64Array:
         match self.kind:
             case "abs_y":
                 return link.abs_y
@@ -163,8 +220,8 @@ class Reward:
             case "spectral_efficiency":
                 return link.spectral_efficiency
             case "normalised":
-                best = link.top_abs_y.max(axis=1, initial=0.0)
-                share: Float64Array = np.divide(link.abs_y, best, out=np.zeros(len(best)), where=best > 0)
+                best = link.top_abs_y.max(axis=-1, initial=0.0)
+                share: Float64Array = np.divide(link.abs_y, best, out=np.zeros(best.shape), where=best > 0)
                 return share
 
 
@@ -176,6 +233,7 @@ class Moment(observations.Moment, frozen=True):
     """What is known at a frame of a session."""
 
     frame: Frame
+    link: Link | None
 
 
 class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
@@ -253,11 +311,13 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
         self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)
-        self._observer = Observer(self.scenario, self.users, observe)
+        self.observer = Observer(self.scenario, self.users, observe)
+        """Reads the parts of the observation."""
         self.observation_space: spaces.Dict[Any] = spaces.Dict(  # type: ignore[assignment]  # of arrays
-            {name: spaces.Box(*bounds) for name, bounds in self._observer.bounds.items()}
+            {name: spaces.Box(*bounds) for name, bounds in self.observer.bounds.items()}
         )
-        self._reward = Reward(reward)
+        self.reward = Reward(reward)
+        """Of the link."""
         self._broker = broker
         own, its = (None if path is None else Path(path) for path in (key, broker_key))
         self._credentials = None if broker is None else credentials(own, its)
@@ -409,7 +469,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
         """Work out the reward of the decision between two moments; ``link`` is what it led to."""
         served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
-        return self._reward.mean(link, served) + self._further_reward(before, now)
+        return self.reward.mean(link, served) + self._further_reward(before, now)
 
     def _further_reward(self, before: Moment, now: Moment) -> float:
         """Work out what is rewarded beside the link."""
@@ -423,7 +483,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def inputs(self) -> tuple[Input, ...]:
         """Give what the agent consumes: one input for each topic, since two cameras are in one product."""
-        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self._observer.inputs)
+        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self.observer.inputs)
 
     def _at(self, frame: Frame) -> Moment:
         link = frame.only("link", Link)
@@ -436,14 +496,13 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         return Moment(frame, scene, link, self.users.present(scene))
 
     def _observation(self, moment: Moment) -> Observation:
-        return self._observer.read(moment)
+        return self.observer.read(moment)
 
     def _info(self, moment: Moment) -> dict[str, Any]:
         link = moment.link
         known: dict[str, Any] = {"frame": moment.frame.number, "t_ns": moment.frame.t_ns}
         if link is not None:
-            known["abs_y"], known["best_abs_y"] = link.abs_y, link.top_abs_y[:, 0]
-            known["baseline_abs_y"], known["los"] = link.baseline_abs_y, link.los
+            known |= link_info(link)
         return known
 
 

@@ -241,6 +241,17 @@ class EmbeddedRun:
                     self._skip_time()
                 yield
 
+    def service(self, name: str) -> Service[Any]:
+        """A service of the run, from its WELCOME to the end.
+
+        Args:
+            name: Of the service.
+
+        Raises:
+            RunError: It has not joined, or could not be set up.
+        """
+        return self._sessions[name].running
+
     def stop(self, reason: str) -> None:
         """End the run after the present step, for a reason that its outcome gets. May be called from a signal
         handler."""
@@ -416,6 +427,14 @@ class EmbeddedSession(Session):
         self._seat = self._run.seats[agent]
         self._seats_beside = {name: self._run.seats[name] for name in beside}
         self._steps = self._run.steps()
+
+    def service(self, name: str) -> Service[Any]:
+        """A service of the run, which is prepared after the first `reset`.
+
+        Args:
+            name: Of the service.
+        """
+        return self._run.service(name)
 
     def close(self) -> None:
         """End the run and close its services."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,10 @@ UnitQuaternion = tuple[float, float, float, float]
 
 SPEED_OF_LIGHT = 299_792_458.0
 """[m/s] in vacuum, exact (SI)."""
+
+
+N = TypeVar("N", float, Float64Array)
+"""A number, or an array of them."""
 
 
 class Pose(NamedTuple):
@@ -125,12 +129,12 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
     )
 
 
-def unrotated(q: Sequence[float], v: Sequence[float]) -> Vector:
+def unrotated(q: Sequence[N], v: Sequence[N]) -> tuple[N, N, N]:
     """Body components of one vector given in world axes: the inverse of `rotated`, by the transposed matrix.
 
     Args:
         q: Unit quaternion (w, x, y, z) of the body.
-        v: Components in world axes.
+        v: Components in world axes; of many vectors an array each.
 
     Example:
         >>> [round(x, 6) for x in unrotated(quaternion_from_euler(math.pi / 2), (0.0, 1.0, 0.0))]

@@ -30,6 +30,7 @@ from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Channel
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.arrays.channel_matrices import Matrices, check_size, empty_parts
 from caviar_services.channel.assemble import Product, assemble, outage_counts
+from caviar_services.channel.batch import ChannelBatch
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
@@ -206,6 +207,14 @@ class ChannelModel(Service[S]):
             transmitters: Antennas that send, in the order of `Channel.tx`.
             receivers: Antennas that receive, in the order of `Channel.rx`.
         """
+
+    def batch(self) -> ChannelBatch:
+        """Make the channels of many episodes at once; of models that say so with ``batches``.
+
+        Returns:
+            Channels that are equal, bit by bit, to those of a run of each episode.
+        """
+        raise NotImplementedError(f"{type(self).__name__} computes one episode at a time")
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Read pattern files, load the model, and say what the user should know.

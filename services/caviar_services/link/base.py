@@ -7,7 +7,7 @@ different beams, and each is scored for itself. To add a link, subclass `LinkMod
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, TypeVar, cast
@@ -20,6 +20,8 @@ from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import GrantInput, Input, Role, Status
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Scene, UserSchedule
+from caviar_services.channel.batch import ChannelBatch, SceneAt
+from caviar_services.link.batch import LinkBatch
 from caviar_services.service import Frame, Service
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -61,6 +63,22 @@ class LinkModel(Service[S]):
         Input(topic="action", required=False),
     )
     outputs: ClassVar[tuple[str, ...]] = ("link",)
+
+    def batch(
+        self, channels: ChannelBatch, members: int, frames: int, scene_at: Callable[[int], SceneAt]
+    ) -> LinkBatch:
+        """Make the links of many episodes at once; of links that say so with ``batches``.
+
+        Args:
+            channels: Of all members.
+            members: Number of members.
+            frames: Of an episode.
+            scene_at: The scene of a frame, by its number.
+
+        Returns:
+            Links that are equal, bit by bit, to those of a run of each episode.
+        """
+        raise NotImplementedError(f"{type(self).__name__} computes one episode at a time")
 
 
 @dataclass(frozen=True)

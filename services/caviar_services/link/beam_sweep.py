@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
@@ -35,6 +35,7 @@ from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.topics.scene import AntennaArray, Device
 from caviar_services.antenna_arrays import dft_beam, steering_vector
+from caviar_services.channel.batch import ChannelBatch, SceneAt
 from caviar_services.link.base import (
     Choices,
     LinkModel,
@@ -47,6 +48,7 @@ from caviar_services.link.base import (
     transmit_power,
     users_of,
 )
+from caviar_services.link.batch import LinkBatch
 from caviar_services.service import Frame, StepResult
 
 RewardKind = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
@@ -84,9 +86,19 @@ class BeamLink(LinkModel[BeamLinkSettings]):
     """
 
     Settings = BeamLinkSettings
+    batches = True
     # Of the last frame. Devices and carriers seldom change from frame to frame; comparing them is cheaper
     # than naming all users and their noise anew.
-    _budget: _Budget | None = None
+    _budget: Budget | None = None
+
+    def batch(
+        self, channels: ChannelBatch, members: int, frames: int, scene_at: Callable[[int], SceneAt]
+    ) -> LinkBatch:
+        """Make the links of many episodes at once."""
+        # Late: it is made of what this module has.
+        from caviar_services.link.beam_batch import BeamBatch
+
+        return BeamBatch(self.settings, self.run.carriers, channels, members, frames, scene_at)
 
     def step(self, frame: Frame) -> StepResult:
         """Compute the link of a frame.
@@ -99,7 +111,7 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         scene = frame.scene()
         budget = self._budget
         if budget is None or (budget.devices, budget.carriers) != (scene.devices, channel.carriers):
-            budget = self._budget = _Budget.of(scene, channel.carriers, self.settings)
+            budget = self._budget = Budget.of(scene, channel.carriers, self.settings)
         users = budget.users
         choices = choices_of(frame, users)
         channels = channels_of(channel, users)
@@ -117,16 +129,13 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         )
 
     def _link(
-        self, budget: _Budget, choices: Choices, channels: UserChannels, scores: _Scores, without_path: int
+        self, budget: Budget, choices: Choices, channels: UserChannels, scores: _Scores, without_path: int
     ) -> Link:
         settings = self.settings
         best = scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
-        # Beams have unit norm, so |y|² is the power gain of the pair; one RF chain an end carries one stream,
-        # whose Shannon bound this is.
+        # Beams have unit norm, so |y|² is the power gain of the pair.
         snr = budget.power_over_noise * scores.abs_y**2
-        efficiency = np.log2(1 + snr)
-        if settings.max_spectral_efficiency is not None:
-            efficiency = np.minimum(efficiency, settings.max_spectral_efficiency)
+        efficiency = spectral_efficiency(snr, settings)
         match settings.reward:
             case "abs_y":
                 reward = scores.abs_y
@@ -160,8 +169,17 @@ class BeamLink(LinkModel[BeamLinkSettings]):
         )
 
 
+def spectral_efficiency(snr: Float64Array, settings: BeamLinkSettings) -> Float64Array:
+    """log2(1 + SNR), at most as the settings say [bit/s/Hz]; of any Shape."""
+    # One RF chain an end carries one stream, whose Shannon bound this is.
+    efficiency: Float64Array = np.log2(1 + snr)
+    if settings.max_spectral_efficiency is not None:
+        efficiency = np.minimum(efficiency, settings.max_spectral_efficiency)
+    return efficiency
+
+
 @dataclass(frozen=True, eq=False)
-class _Budget:
+class Budget:
     """What stays the same while the same devices are there; Shape ``[U]`` each."""
 
     devices: tuple[Device, ...]
@@ -172,9 +190,18 @@ class _Budget:
     carrier: tuple[str, ...]
     bandwidth: Float64Array
     power_over_noise: Float64Array
+    receive_beams: Int64Array
+    """Beams of the receivers."""
 
     @classmethod
-    def of(cls, scene: Scene, carriers: tuple[Carrier, ...], settings: BeamLinkSettings) -> _Budget:
+    def of(cls, scene: Scene, carriers: tuple[Carrier, ...], settings: BeamLinkSettings) -> Budget:
+        """Of the devices of a scene.
+
+        Args:
+            scene: Has the devices.
+            carriers: C carriers.
+            settings: Of the noise.
+        """
         users = users_of(scene, carriers)
         figure, temperature = settings.noise_figure_db, settings.temperature_k
         noise = np.array([noise_power(user.carrier, figure, temperature) for user in users])
@@ -187,6 +214,7 @@ class _Budget:
             carrier=tuple(user.carrier.name for user in users),
             bandwidth=np.array([user.carrier.bandwidth_hz for user in users], dtype=np.float64),
             power_over_noise=np.array([transmit_power(user) for user in users]) / noise,
+            receive_beams=np.array([user.rx.array.size for user in users], np.int64),
         )
 
 

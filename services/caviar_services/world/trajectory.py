@@ -78,6 +78,7 @@ class TrajectoryWorld(World[TrajectorySettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = TrajectorySettings
+    batches = True
 
     def __init__(self, settings: TrajectorySettings, run: RunInfo) -> None:
         super().__init__(settings, run)

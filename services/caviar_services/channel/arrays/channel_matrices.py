@@ -372,8 +372,12 @@ def carrier_phase(carriers: Sequence[Carrier], tau: Float64Array) -> Complex128A
         array([[0.-1.j]])
     """
     frequency = np.array([carrier.frequency_hz for carrier in carriers])
+    return turn_phase(frequency[:, None] * tau)
+
+
+def turn_phase(turns: Float64Array) -> Complex128Array:
+    """exp(−j2πx) of numbers of turns x, of any Shape."""
     # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
-    turns = frequency[:, None] * tau
     phase: Complex128Array = np.exp(-2j * np.pi * (turns - np.round(turns)))
     return phase
 

@@ -76,17 +76,18 @@ def amplitude_factor(db_per_km: Float64Array, tau: Float64Array) -> Float64Array
 
     Args:
         db_per_km: γ of each carrier [dB/km], Shape ``[C]``.
-        tau: Delay of each path [s], Shape ``[P]``.
+        tau: Delay of each path [s], Shape ``[..., P]``.
 
     Returns:
-        Factors of Shape ``[C, P]``.
+        Factors of Shape ``[..., C, P]``.
 
     Example:
         >>> km = np.array([1e3 / SPEED_OF_LIGHT])
         >>> (20 * np.log10(amplitude_factor(np.array([15.0]), km))).round(6).tolist()
         [[-15.0]]
     """
-    factor: Float64Array = 10 ** (-db_per_km[:, None] * (SPEED_OF_LIGHT / 1000 * tau) / 20)
+    km = SPEED_OF_LIGHT / 1000 * tau
+    factor: Float64Array = 10 ** (-db_per_km[:, None] * km[..., None, :] / 20)
     return factor
 
 

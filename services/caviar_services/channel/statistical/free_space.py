@@ -14,6 +14,7 @@ import numpy as np
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.base import ChannelSettings, Found, PathModel
+from caviar_services.channel.batch import SameChannels
 from caviar_services.channel.paths import Antenna, PathTable
 
 
@@ -36,6 +37,11 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
 
     Settings: ClassVar[type[ChannelSettings]] = FreeSpaceSettings
     rung = "free-space"
+    batches = True
+
+    def batch(self) -> SameChannels:
+        """Make the channels of many episodes at once, which are the same in all of them."""
+        return SameChannels(self, self.run.name)
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)

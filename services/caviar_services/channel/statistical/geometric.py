@@ -30,11 +30,10 @@ Waves have no polarization: arrays of dual polarization, and of several panels, 
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from itertools import pairwise, product
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,9 +50,9 @@ from caviar_protocol.arrays import (
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import device_pose
-from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.arrays.channel_matrices import (
     Bins,
@@ -65,22 +64,24 @@ from caviar_services.channel.arrays.channel_matrices import (
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.clearance import Boxes
+from caviar_services.channel.statistical.batch import GeometricBatch
 from caviar_services.channel.statistical.waves import (
+    BLOCK,
+    Components,
     Draws,
     GeometricSettings,
     Line,
     PairWaves,
+    Shares,
     Waves,
     angles,
-    direction,
     dot,
+    superposed_waves,
+    times,
+    turned,
     velocity,
-    with_phase,
 )
 from caviar_services.service import Frame, Preparation, RunInfo
-
-BLOCK = 256
-"""Frames whose draws are made at once: a generator costs more than what one frame takes from it."""
 
 KEPT = 4096
 """Pairs whose draws are kept at most."""
@@ -107,27 +108,22 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     Settings = GeometricSettings
     rung = "geometric"
+    batches = True
 
     def __init__(self, settings: GeometricSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
-        count, k = settings.components, 10 ** (settings.k_factor_db / 10)
         self._frequencies = [carrier.frequency_hz for carrier in run.carriers]
         self._frequency = np.array(self._frequencies)[:, None]
-        # Amplitudes: all components of a blocked pair share the power, of a free one those after the
-        # straight path.
-        self._reflected = math.sqrt(1 / count)
-        self._behind_straight = math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0
-        self._straight = math.sqrt(k / (k + 1)) if count > 1 else 1.0
-        ids = [_id(f"component {number}") for number in range(count)]
+        self._shares = Shares.of(settings)
+        ids = [_id(f"component {number}") for number in range(settings.components)]
         # Of a pair, by whether its line of sight is free.
         self._ids = {False: ids, True: [_id("straight"), *ids[1:]]}
         self._obstacles = Boxes.aligned([(box.minimum_m, box.maximum_m) for box in settings.obstacles])
-        self._draws: dict[tuple[str, str], Draws] = {}
+        self._drawn: dict[tuple[str, str], _Drawn] = {}
         self._block = 0
-        loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
-        self._nlos_factor = 10 ** (-loss_db / 20)
-        self._unit = settings.normalization == "unit"
-        self._nearest = 0.0 if self._unit else float((SPEED_OF_LIGHT / self._frequency).max())
+        self.has_path_gain = settings.normalization != "unit"
+        """Whether amplitudes follow from distance, carrier and element patterns."""
+        self._nearest = float((SPEED_OF_LIGHT / self._frequency).max()) if self.has_path_gain else 0.0
 
     @property
     def options(self) -> ChannelOptions:
@@ -145,9 +141,13 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
                 raise ScenarioError(f"device {spec.name!r} {_NOT_UNIFORM}", key=place.key)
         return ()
 
+    def batch(self) -> GeometricBatch:
+        """Make the channels of many episodes at once."""
+        return GeometricBatch(self)
+
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Forget the draws of the episode before."""
-        self._draws.clear()
+        self._drawn.clear()
 
     def model(
         self,
@@ -159,24 +159,40 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         for device in (*transmitters, *receivers):
             if not device.array.is_uniform:
                 raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
-        waves, count = Waves(), self.settings.components
-        offsets, los, blocked = [0], [], self._blocks(scene)
-        poses = {device.name: device_pose(scene, device) for device in (*transmitters, *receivers)}
-        speeds = {device.name: velocity(scene, device) for device in (*transmitters, *receivers)}
-        for tx in transmitters:
-            for rx in receivers:
-                pair = Line(tx, rx, poses[tx.name], poses[rx.name], speeds[tx.name], speeds[rx.name])
-                is_near = pair.length == 0 or pair.length < self._nearest
-                free = is_near or not blocked(pair)
-                if not is_near:
-                    self._add(waves, frame, pair, free)
-                los.append(free)
-                offsets.append(len(waves.tau))
-        too_close = len(los) - len(waves.tau) // count
-        channel = self._channel(transmitters, receivers, poses, waves, los, offsets)
+        sight = self.sight(scene, transmitters, receivers)
+        waves, offsets = Waves(len(self._frequencies)), [0]
+        for line, free, near in zip(*sight, strict=True):
+            if not near:
+                self._add(waves, frame, line, free)
+            offsets.append(len(waves.tau))
+        too_close = sum(sight.near)
+        channel = self._channel(transmitters, receivers, waves, sight, offsets)
         return Modelled(channel=channel, counts={"too_close": too_close} if too_close else {})
 
     # --- the line of sight -----------------------------------------------------------------------
+
+    def sight(
+        self, scene: Scene, transmitters: Sequence[AntennaDevice], receivers: Sequence[AntennaDevice]
+    ) -> Sight:
+        """Find the straight lines between antennas of a scene, and which of them are free.
+
+        Args:
+            scene: The scene.
+            transmitters: Antennas that send.
+            receivers: Antennas that receive.
+        """
+        poses = {device.name: device_pose(scene, device) for device in (*transmitters, *receivers)}
+        speeds = {device.name: velocity(scene, device) for device in (*transmitters, *receivers)}
+        blocked, found = self._blocks(scene), Sight([], [], [])
+        for tx in transmitters:
+            for rx in receivers:
+                ends = poses[tx.name], poses[rx.name], speeds[tx.name], speeds[rx.name]
+                line = Line(tx, rx, *ends, self._frequencies)
+                near = line.length == 0 or line.length < self._nearest
+                found.lines.append(line)
+                found.free.append(near or not blocked(line))
+                found.near.append(near)
+        return found
 
     def _blocks(self, scene: Scene) -> Callable[[Line], bool]:
         """A function that says whether something in the scene blocks a line."""
@@ -202,53 +218,69 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     # --- waves -----------------------------------------------------------------------------------------
 
-    def _add(self, waves: Waves, frame: Frame, pair: Line, free: bool) -> None:
+    def _add(self, waves: Waves, frame: Frame, line: Line, free: bool) -> None:
         """Add the components of a pair."""
-        # Numbers, not arrays: there are a handful of waves, and an array of three costs as much as ten
-        # numbers.
-        gains, excess, deviations = self._drawn(frame, pair.tx.name, pair.rx.name, free)
-        scale = self._behind_straight if free else self._reflected
-        delay = pair.length / SPEED_OF_LIGHT
-        loss = 1.0 if free or self._unit else self._nlos_factor
-        for number, gain in enumerate(gains):
-            if free and number == 0:
-                amplitude, tau, departure, arrival = complex(self._straight), delay, pair.along, pair.back
-            else:
-                amplitude, tau = gain * scale, delay + excess[number]
-                tilt = deviations[number]
-                departure = direction(pair.zenith + tilt[0], pair.azimuth + tilt[1])
-                arrival = direction(math.pi - pair.zenith + tilt[2], pair.azimuth + math.pi + tilt[3])
-            waves.amplitude.append(amplitude * loss)
-            waves.tau.append(tau)
+        amplitude, excess, turns = self._rows(frame, line.tx.name, line.rx.name, free)
+        for late, (at_tx, at_rx) in zip(excess, turns, strict=True):
+            departure, arrival = turned(line.outwards, at_tx), turned(line.inwards, at_rx)
+            waves.tau.append(line.delay + late)
             waves.departure.append(departure)
             waves.arrival.append(arrival)
             # To first order in v/c: motion of either end along its own direction outwards raises the
             # frequency.
-            approach = dot(pair.velocity[0], departure) + dot(pair.velocity[1], arrival)
+            approach = dot(line.velocity[0], departure) + dot(line.velocity[1], arrival)
             waves.doppler_ratio.append(approach / SPEED_OF_LIGHT)
+        for mine, phase, of_carrier in zip(waves.amplitude, line.phase, amplitude, strict=True):
+            parts = phase.real, phase.imag
+            mine += [complex(*times(a, parts)) for a in of_carrier]
         waves.id += self._ids[free]
-        waves.length += [pair.length] * len(gains)
+        waves.length += [line.length] * len(excess)
 
-    def _drawn(
-        self, frame: Frame, tx: str, rx: str, free: bool
-    ) -> tuple[Sequence[complex], Sequence[float], Sequence[Sequence[float]]]:
-        """Gain, excess delay and deviations of a pair's components in a frame, sorted by delay.
-
-        Where the line of sight is ``free``, component 0 stands in front and its delay is not used.
-        """
+    def block_of(self, number: int) -> tuple[int, int]:
+        """Find the block of draws that a frame is in, and its row there."""
         # Blocks begin at fixed numbers, so that a frame has the same draws wherever a run or a replay begins.
-        whole_episode = self.settings.redraw == "episode"
-        block, row = (0, 0) if whole_episode else divmod(frame.number, BLOCK)
-        if block != self._block or (whole_episode and len(self._draws) >= KEPT):
+        return (0, 0) if self.draws_last else divmod(number, BLOCK)
+
+    @property
+    def draws_last(self) -> bool:
+        """Whether draws last an episode, whose only block has one row."""
+        return self.settings.redraw == "episode"
+
+    def draws(self, seed: int, seed_episode: int, pair: tuple[str, str], block: int) -> Draws:
+        """Draw a block of frames.
+
+        Args:
+            seed: Of the episode.
+            seed_episode: Episodes since the first one with this seed.
+            pair: Names of transmitter and receiver.
+            block: As `block_of` numbers them.
+        """
+        stream = "/".join((self.run.name, *pair))
+        random = generator(seed, seed_episode, stream, block)
+        return Draws.of(random, 1 if self.draws_last else BLOCK, self.settings)
+
+    def components(self, draws: Draws, free: BoolArray) -> Components:
+        """Components of pairs; see `Components.of`."""
+        return Components.of(draws, free, self._shares, self._frequency[:, 0])
+
+    def _rows(self, frame: Frame, tx: str, rx: str, free: bool) -> tuple[Any, Any, Any]:
+        """The fields of `Components` of a pair in a frame, as lists."""
+        block, row = self.block_of(frame.number)
+        if block != self._block or (self.draws_last and len(self._drawn) >= KEPT):
             # Pairs that have left go with it; the others draw the same again.
-            self._draws.clear()
+            self._drawn.clear()
             self._block = block
-        made = self._draws.get((tx, rx))
-        if made is None:
-            random = generator(frame.seed, frame.seed_episode, f"{self.run.name}/{tx}/{rx}", block)
-            made = Draws.of(random, 1 if whole_episode else BLOCK, self.settings)
-            self._draws[tx, rx] = made
-        return made.gain[row], (made.excess_free if free else made.excess)[row], made.deviation[row]
+        drawn = self._drawn.get((tx, rx))
+        if drawn is None:
+            drawn = self._drawn[tx, rx] = _Drawn(
+                self.draws(frame.seed, frame.seed_episode, (tx, rx), block), {}
+            )
+        rows = drawn.rows.get(free)
+        if rows is None:
+            made = self.components(drawn.draws, np.array(free))
+            rows = drawn.rows[free] = tuple(field.tolist() for field in made)
+        amplitude, excess, turn = rows
+        return amplitude[row], excess[row], turn[row]
 
     # --- the product -----------------------------------------------------------------------------------
 
@@ -256,23 +288,22 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         self,
         transmitters: Sequence[AntennaDevice],
         receivers: Sequence[AntennaDevice],
-        poses: Mapping[str, Pose],
         waves: Waves,
-        los: list[bool],
+        sight: Sight,
         offsets: list[int],
     ) -> Channel:
-        a = np.array([with_phase(waves, f) for f in self._frequencies], np.complex128)
+        a = np.array(waves.amplitude, np.complex128)
         pairs = [
-            PairWaves(tx, rx, poses[tx.name], poses[rx.name], slice(*ends))
-            for (tx, rx), ends in zip(product(transmitters, receivers), pairwise(offsets), strict=True)
+            PairWaves(line.tx, line.rx, line.tx_pose, line.rx_pose, slice(*ends))
+            for line, ends in zip(sight.lines, pairwise(offsets), strict=True)
         ]
-        if not self._unit:
+        if self.has_path_gain:
             a *= self._path_gain(waves, pairs)
         # One array for both ends: making an array costs more than its numbers.
         both = waves.departure + waves.arrival
         aod, aoa = np.array([x for wave in both for x in angles(wave)], np.float64).reshape(2, -1, 2)
         shape = (len(transmitters), len(receivers))
-        constant = _constant(tuple(los), tuple(offsets), tuple(waves.id), shape)
+        constant = _constant(tuple(sight.free), tuple(offsets), tuple(waves.id), shape)
         wideband = self._wideband(a, waves, pairs, constant.offsets, len(receivers))
         return Channel(
             rung=self.rung,
@@ -297,37 +328,69 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         )
 
     def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
-        """λ/(4πd), both element patterns and absorption, Shape ``[C, P]``."""
+        """Path gain of all waves, Shape ``[C, P]``."""
         patterns = np.ones(len(waves.tau))
         for pair in pairs:
-            patterns[pair.mine] = self.patterns.of(pair.tx.array).amplitude(pair.departures(waves))
-            patterns[pair.mine] *= self.patterns.of(pair.rx.array).amplitude(pair.arrivals(waves))
-        factor: Float64Array = (
-            SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.array(waves.length)) * patterns
-        )
+            patterns[pair.mine] = self.pattern_gain(
+                pair.tx.array, pair.departures(waves), pair.rx.array, pair.arrivals(waves)
+            )
+        return self.path_gain(np.array(waves.length), patterns, np.array(waves.tau))
+
+    def pattern_gain(
+        self, tx: AntennaArray, departures: Float64Array, rx: AntennaArray, arrivals: Float64Array
+    ) -> Float64Array:
+        """Amplitude of the two element patterns together.
+
+        Args:
+            tx: Array of the transmitter.
+            departures: Directions of departure in its axes, Shape ``[..., 3]``.
+            rx: Array of the receiver.
+            arrivals: Directions of arrival in its axes, Shape ``[..., 3]``.
+
+        Returns:
+            Shape ``[...]``.
+        """
+        sent = self.patterns.of(tx).amplitude(departures.reshape(-1, 3))
+        sent *= self.patterns.of(rx).amplitude(arrivals.reshape(-1, 3))
+        return sent.reshape(departures.shape[:-1])
+
+    def path_gain(self, length: Float64Array, patterns: Float64Array, tau: Float64Array) -> Float64Array:
+        """λ/(4πd), element patterns and absorption.
+
+        Args:
+            length: Of the straight line [m], of a shape that broadcasts to ``[..., P]``.
+            patterns: From `pattern_gain`, Shape ``[..., P]``.
+            tau: Delay [s], Shape ``[..., P]``.
+
+        Returns:
+            Factors of amplitudes, Shape ``[..., C, P]``.
+        """
+        spread = SPEED_OF_LIGHT / self._frequency / (4 * np.pi * length[..., None, :])
+        factor: Float64Array = spread * patterns[..., None, :]
         if self.absorption_db_per_km is not None:
-            factor *= amplitude_factor(self.absorption_db_per_km, np.array(waves.tau))
+            factor *= amplitude_factor(self.absorption_db_per_km, tau)
         return factor
 
     def _matrices(
         self, a: Complex128Array, waves: Waves, pairs: Sequence[PairWaves], receivers: int
     ) -> tuple[ChannelMatrix, ...]:
-        """H[m, n] = Σ_l a[l] · receive[l, m] · transmit[l, n] of every carrier and pair."""
-        steered = []
+        """H of every carrier and pair."""
+        of_pair = []
         for pair in pairs:
             transmit = steering_vector(pair.tx.array, pair.departures(waves))
-            # A single element sees every direction with the same phase.
-            single = pair.rx.array.size == 1
-            steered.append(
-                (transmit, None if single else steering_vector(pair.rx.array, pair.arrivals(waves)))
-            )
+            receive = None
+            if pair.rx.array.size > 1:
+                receive = steering_vector(pair.rx.array, pair.arrivals(waves))
+            if pair.mine.start == pair.mine.stop:
+                shape = (len(a), pair.rx.array.size, pair.tx.array.size)
+                of_pair.append(np.zeros(shape, np.complex128))
+            else:
+                of_pair.append(superposed_waves(a[:, pair.mine], transmit, receive))
         found = []
-        for carrier, of_carrier in enumerate(a):
-            for number, (pair, (transmit, receive)) in enumerate(zip(pairs, steered, strict=True)):
+        for carrier in range(len(a)):
+            for number, h in enumerate(of_pair):
                 tx, rx = divmod(number, receivers)
-                mine = of_carrier[pair.mine]
-                h = mine.dot(transmit)[None] if receive is None else (receive * mine[:, None]).T @ transmit
-                found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h))
+                found.append(ChannelMatrix(carrier=carrier, tx=tx, rx=rx, h=h[carrier]))
         return tuple(found)
 
     def _wideband(
@@ -355,6 +418,24 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
         bins = bins_of(self.wideband, self.run.carriers, tau, offsets)
         return wideband_parts(bins, responses(bins), receivers)
+
+
+class Sight(NamedTuple):
+    """Straight lines of all pairs of a scene, by transmitter, then receiver."""
+
+    lines: list[Line]
+    free: list[bool]
+    """Whether nothing blocks each."""
+    near: list[bool]
+    """Whether its ends are so near to each other that there is no path."""
+
+
+class _Drawn(NamedTuple):
+    """Of a pair, for a block of frames."""
+
+    draws: Draws
+    rows: dict[bool, tuple[Any, Any, Any]]
+    """`Components` as lists, by whether the line of sight is free; made where they are asked for."""
 
 
 class _Constant(NamedTuple):

@@ -1,7 +1,14 @@
-"""Multipath of the channel ``geometric`` as plain numbers, and its settings.
+"""Multipath of the channel ``geometric``: its formulas, and its settings.
 
-A pair has a handful of waves: an array of three costs as much as ten numbers. The settings' defaults are the
-medians of 3GPP TR 38.901, table 7.5-6, UMi street canyon with line of sight at 28 GHz, rounded.
+The service computes one frame as plain numbers: a pair has a handful of waves, and an array of three costs as
+much as ten numbers. Many episodes are computed as arrays (`caviar_services.channel.statistical.batch`). Both
+use the formulas of this module, which take either, and agree bit by bit: what is done frame by frame is sums
+and products alone, in one order. Sines and exponentials are those of the draws, taken for a block of frames
+at once, and those of the straight line, which are numbers in both.
+
+A direction stands as cosine and sine of its zenith and its azimuth, so that deviations are added without
+angles. The settings' defaults are the medians of 3GPP TR 38.901, table 7.5-6, UMi street canyon with line of
+sight at 28 GHz, rounded.
 """
 
 from __future__ import annotations
@@ -9,16 +16,16 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, quantity
-from caviar_protocol.space.coordinates import Pose, Vector, unrotated
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, quantity
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose, Vector, unrotated
 from caviar_protocol.space.scene import device_velocity
 from caviar_protocol.topics import AntennaDevice, Scene
+from caviar_services.channel.arrays.channel_matrices import turn_phase
 from caviar_services.channel.base import ChannelSettings
 
 Corner = tuple[float, float, float]
@@ -119,21 +126,24 @@ class Line:
         rx_pose: See ``tx``.
         tx_speed: See ``tx``.
         rx_speed: See ``tx``.
+        frequencies: Of the carriers [Hz].
     """
 
     # One is made for each pair of each frame: slots are quicker to fill than the fields of a dataclass.
     __slots__ = (
         "along",
-        "azimuth",
-        "back",
+        "delay",
         "end",
+        "inwards",
         "length",
+        "outwards",
+        "phase",
         "rx",
+        "rx_pose",
         "start",
         "tx",
         "tx_pose",
         "velocity",
-        "zenith",
     )
 
     def __init__(
@@ -144,16 +154,26 @@ class Line:
         rx_pose: Pose,
         tx_speed: Vector,
         rx_speed: Vector,
+        frequencies: Sequence[float],
     ) -> None:
-        self.tx, self.rx, self.tx_pose = tx, rx, tx_pose
+        self.tx, self.rx, self.tx_pose, self.rx_pose = tx, rx, tx_pose, rx_pose
         self.start, self.end = tx_pose.position, rx_pose.position
         self.velocity = tx_speed, rx_speed
         (x0, y0, z0), (x1, y1, z1) = self.start, self.end
         x, y, z = x1 - x0, y1 - y0, z1 - z0
         self.length = math.hypot(x, y, z)
         scale = 1 / self.length if self.length > 0 else 0.0
-        self.along, self.back = (x * scale, y * scale, z * scale), (-x * scale, -y * scale, -z * scale)
-        self.zenith, self.azimuth = angles(self.along)
+        self.along = x, y, z = x * scale, y * scale, z * scale
+        level = math.hypot(x, y)
+        # A vertical line has no azimuth: it is 0, as atan2 has it.
+        cosine, sine = (x / level, y / level) if level > 0 else (1.0, 0.0)
+        # Seen from the other end: π − zenith, azimuth + π.
+        self.outwards, self.inwards = (z, level, cosine, sine), (-z, level, -cosine, -sine)
+        self.delay = self.length / SPEED_OF_LIGHT
+        # exp(−j2πfτ) on each carrier. The whole turns of f·τ go first: they are millions, and only the rest
+        # is a phase.
+        turns = [frequency * self.delay for frequency in frequencies]
+        self.phase = [cmath.rect(1.0, -2 * math.pi * (turn - round(turn))) for turn in turns]
 
     @property
     def azimuth_deg(self) -> float:
@@ -163,11 +183,15 @@ class Line:
 
 
 class Waves:
-    """Waves of all pairs, added pair after pair as plain numbers."""
+    """Waves of all pairs, added pair after pair as plain numbers.
 
-    def __init__(self) -> None:
-        self.amplitude: list[complex] = []
-        """Without carrier phase and path gain."""
+    Args:
+        carriers: Number of carriers.
+    """
+
+    def __init__(self, carriers: int) -> None:
+        self.amplitude: list[list[complex]] = [[] for _ in range(carriers)]
+        """On each carrier, without path gain."""
         self.tau: list[float] = []
         """[s]."""
         self.departure: list[Vector] = []
@@ -179,18 +203,21 @@ class Waves:
         """Length of the pair's straight line [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Random draws of one pair for some frames, as lists; within a frame sorted by delay."""
+BLOCK = 256
+"""Frames whose draws are made at once: a generator costs more than what one frame takes from it."""
 
-    gain: list[list[complex]]
-    """Of mean power 1, by frame and component."""
-    excess: list[list[float]]
-    """[s], by frame and component."""
-    excess_free: list[list[float]]
+
+class Draws(NamedTuple):
+    """Random draws of one pair for F frames; within a frame sorted by delay."""
+
+    gain: Complex128Array
+    """Of mean power 1, Shape ``[F, L]``."""
+    excess: Float64Array
+    """Delay after that of the straight line [s], Shape ``[F, L]``."""
+    excess_free: Float64Array
     """The same, sorted after component 0: dropping the shortest of all would make the others longer."""
-    deviation: list[list[list[float]]]
-    """[rad] of departure zenith and azimuth, arrival zenith and azimuth, by frame and component."""
+    deviation: Float64Array
+    """[rad] of departure zenith and azimuth, arrival zenith and azimuth, Shape ``[F, L, 4]``."""
 
     @classmethod
     def of(cls, random: np.random.Generator, frames: int, settings: GeometricSettings) -> Draws:
@@ -218,16 +245,128 @@ class Draws:
             settings.azimuth_spread_arrival_deg,
         )
         scale = np.radians(spreads) / math.sqrt(2)  # a Laplacian of scale b has the variance 2b²
-        deviation = random.laplace(0.0, 1.0, (*shape, 4)) * scale
-        return cls(gain.tolist(), excess.tolist(), excess_free.tolist(), deviation.tolist())
+        return cls(gain, excess, excess_free, random.laplace(0.0, 1.0, (*shape, 4)) * scale)
 
 
-def with_phase(waves: Waves, frequency: float) -> list[complex]:
-    """Amplitudes times exp(−j2πfτ) at a frequency [Hz]."""
-    # The whole turns of f·τ go first: they are millions, and only the rest is a phase.
-    turns = [frequency * tau for tau in waves.tau]
-    phases = [cmath.rect(1.0, -2 * math.pi * (turn - round(turn))) for turn in turns]
-    return [amplitude * phase for amplitude, phase in zip(waves.amplitude, phases, strict=True)]
+class Shares(NamedTuple):
+    """Amplitudes of the kinds of components."""
+
+    straight: float
+    """The straight path of a free pair."""
+    behind: float
+    """Each of the others of a free pair."""
+    reflected: float
+    """Each of a blocked pair."""
+
+    @classmethod
+    def of(cls, settings: GeometricSettings) -> Shares:
+        """Amplitudes whose squares add up to 1; those of a blocked pair are weaker by ``nlos_loss_db``."""
+        count, k = settings.components, 10 ** (settings.k_factor_db / 10)
+        loss_db = 20.0 if settings.nlos_loss_db is None else settings.nlos_loss_db
+        loss = 1.0 if settings.normalization == "unit" else 10 ** (-loss_db / 20)
+        return cls(
+            straight=math.sqrt(k / (k + 1)) if count > 1 else 1.0,
+            behind=math.sqrt(1 / ((k + 1) * (count - 1))) if count > 1 else 0.0,
+            reflected=math.sqrt(1 / count) * loss,
+        )
+
+
+class Components(NamedTuple):
+    """Draws as they are beside any straight line. The straight path of a free pair is component 0, whose
+    excess delay and deviations are 0."""
+
+    amplitude: Float64Array
+    """Real and imaginary part, with the carrier phase of the excess delay, Shape ``[..., C, L, 2]``."""
+    excess: Float64Array
+    """[s], Shape ``[..., L]``."""
+    turn: Float64Array
+    """Cosine and sine of the deviations of zenith and azimuth, at TX and at RX, Shape ``[..., L, 2, 4]``."""
+
+    @classmethod
+    def of(cls, draws: Draws, free: BoolArray, shares: Shares, frequencies: Float64Array) -> Components:
+        """Components of pairs with and without a line of sight.
+
+        Args:
+            draws: Of Shape ``[...]`` in place of ``[F]``.
+            free: Whether the line of sight is, of a shape that broadcasts to ``[...]``.
+            shares: Amplitudes.
+            frequencies: Of C carriers [Hz], Shape ``[C]``.
+        """
+        free = free[..., None]
+        straight = free & (np.arange(draws.gain.shape[-1]) == 0)
+        scaled = draws.gain * np.where(free, shares.behind, shares.reflected)
+        gain = np.where(straight, shares.straight, scaled)[..., None, :]
+        excess = np.where(straight, 0.0, np.where(free, draws.excess_free, draws.excess))
+        phase = turn_phase(frequencies[:, None] * excess[..., None, :])
+        amplitude = np.stack(times((gain.real, gain.imag), (phase.real, phase.imag)), axis=-1)
+        turn = np.exp(1j * np.where(straight[..., None], 0.0, draws.deviation)).view(np.float64)
+        return cls(amplitude, excess, turn.reshape(*excess.shape, 2, 4))
+
+
+N = TypeVar("N", float, Float64Array)
+Turn: TypeAlias = tuple[N, N, N, N] | Sequence[N]
+"""Cosine and sine of a zenith, cosine and sine of an azimuth."""
+
+
+def times(a: tuple[N, N] | Sequence[N], b: tuple[N, N] | Sequence[N]) -> tuple[N, N]:
+    """Real and imaginary part of the product of two complex numbers, or of arrays of them.
+
+    Written out: processors that multiply and add in one step round a complex product in ways of their own.
+    """
+    (x, y), (u, v) = a, b
+    return x * u - y * v, x * v + y * u
+
+
+def turned(line: Turn[N], turn: Turn[N]) -> tuple[N, N, N]:
+    """Unit vector of a direction that deviates from another one; a zenith beyond a pole comes down on its
+    other side.
+
+    Args:
+        line: The other direction.
+        turn: The deviations.
+
+    Returns:
+        x, y and z: numbers, or arrays.
+
+    Example:
+        >>> north_east = (0.0, 1.0, math.sqrt(0.5), math.sqrt(0.5))
+        >>> [round(x, 9) for x in turned(north_east, (1.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))]
+        [0.0, 1.0, 0.0]
+    """
+    cosine, sine, along, across = line
+    up, down, ahead, aside = turn
+    level = sine * up + cosine * down
+    return (
+        level * (along * ahead - across * aside),
+        level * (across * ahead + along * aside),
+        cosine * up - sine * down,
+    )
+
+
+def superposed_waves(
+    amplitude: Complex128Array, transmit: Complex128Array, receive: Complex128Array | None
+) -> Complex128Array:
+    """H[m, n] = Σ_l a[l] · receive[l, m] · transmit[l, n].
+
+    Args:
+        amplitude: On C carriers, Shape ``[..., C, L]``.
+        transmit: Phases of the elements of TX, Shape ``[..., L, Nt]``.
+        receive: Phases of the elements of RX, Shape ``[..., L, Nr]``; None: a single element, which sees
+            every direction with the same phase.
+
+    Returns:
+        Shape ``[..., C, Nr, Nt]``.
+    """
+    weights = amplitude[..., None]
+    if receive is not None:
+        weights = weights * receive[..., None, :, :]
+    terms = weights[..., None] * transmit[..., None, :, None, :]
+    # One after the other: a product of matrices, and a sum along an axis, have an order that depends on the
+    # shape.
+    h: Complex128Array = terms[..., 0, :, :]
+    for component in range(1, terms.shape[-3]):
+        h = h + terms[..., component, :, :]
+    return h
 
 
 def velocity(scene: Scene, device: AntennaDevice) -> Vector:
@@ -236,17 +375,6 @@ def velocity(scene: Scene, device: AntennaDevice) -> Vector:
         return (0.0, 0.0, 0.0)
     x, y, z = device_velocity(scene, device).tolist()
     return (x, y, z)
-
-
-def direction(zenith: float, azimuth: float) -> Vector:
-    """Unit vector of a direction [rad]; a zenith beyond a pole comes down on its other side.
-
-    Example:
-        >>> [round(x, 9) for x in direction(math.pi / 2, math.pi / 2)]
-        [0.0, 1.0, 0.0]
-    """
-    sine = math.sin(zenith)
-    return (sine * math.cos(azimuth), sine * math.sin(azimuth), math.cos(zenith))
 
 
 def angles(vector: Vector) -> tuple[float, float]:
