@@ -142,6 +142,8 @@ class TcpConnections:
                 if wire.open:
                     fresh[fd] = wire
                 else:
+                    # At a socket file it is hardly another than a service of the run that was ended.
+                    wire.is_sibling = self._is_at_socket_file
                     failures.append(wire)
                     self._closed[fd] = time.monotonic_ns()
             else:
@@ -176,6 +178,10 @@ class TcpConnections:
         """Stop watching."""
         self._watched.disable_monitor()
         self.monitor.close(0)
+
+    @property
+    def _is_at_socket_file(self) -> bool:
+        return self._watched.getsockopt_string(zmq.LAST_ENDPOINT).startswith("ipc:")
 
     def _next(self) -> tuple[int, int] | None:
         try:
@@ -243,12 +249,12 @@ def _process(pid: int) -> tuple[str, bool]:
     """A process as people know it, and whether it has the same parent as this one."""
     folder = Path("/proc", str(pid))
     try:
-        command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        words = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").split()
         # After the name, in brackets, which may hold anything: the state, then the parent.
         parent = int((folder / "stat").read_bytes().rpartition(b")")[2].split()[1])
     except (OSError, ValueError, IndexError):
         return f"process {pid}", False
-    return f"process {pid} ({command[:COMMAND]})", parent == os.getppid()
+    return f"process {pid} ({' '.join(words)[:COMMAND]})", parent == os.getppid()
 
 
 def _duplicate(fd: int) -> socket.socket | None:
