@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 from recording_builders import record_run
 
 from caviar_clients.cli import main as command
+from caviar_protocol.scenario.schema import Run
 
 pytestmark = pytest.mark.slow
 
@@ -117,3 +119,18 @@ def test_every_command_answers_alike_where_a_file_is_in_the_way_of_a_folder(
     err = capsys.readouterr().err
     assert f"{file} is a file, not a folder; choose another folder" in err
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("name", ["run", "broker"])
+def test_each_pace_that_a_scenario_may_have_is_told_of_by_the_help_and_the_page(monkeypatch, capsys, name):
+    monkeypatch.setattr(sys, "argv", ["caviar", name, "--help"])
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        command.main()
+    (help_text,) = (line for line in capsys.readouterr().out.splitlines() if "--pace" in line)
+    page = (Path(__file__).parents[2] / "docs" / "topics" / "clock-and-deadlines.md").read_text()
+    words = get_args(get_args(get_type_hints(Run)["pace"])[0])
+    assert "realtime" in words
+    for word in words:
+        assert re.search(rf"\b{word}\b", help_text), word
+        assert f"`{word}`" in page

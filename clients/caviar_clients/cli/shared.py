@@ -71,7 +71,11 @@ RunDirectory = Annotated[
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 Pace = Annotated[
-    str | None, typer.Option(help="free, realtime or a number (times real time), instead of the scenario's")
+    str | None,
+    typer.Option(
+        help="instead of the scenario's: free (or fast, its older name), as fast as the services are; "
+        "realtime, as simulated time passes; or a number, 2 for twice as fast as real time"
+    ),
 ]
 RunsFolder = Annotated[Path, typer.Option(help="directory in which the run's own is made")]
 Embedded = Annotated[bool, typer.Option("--embedded", help="all in this process, without sockets")]
