@@ -1,0 +1,80 @@
+"""The programs of ``examples/``, as a user starts them, in a short form."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from scenarios_support import SCENARIOS, running
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ENDPOINT = re.compile(r"waiting for .* at (tcp://[\w.:-]+\d)")
+
+
+def started(folder: Path, program: str, *arguments: str) -> str:
+    """What a program prints that ends with status 0."""
+    command = [sys.executable, str(EXAMPLES / program), *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("program", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_each_example_is_tried_here_and_on_the_page(program: str) -> None:
+    assert program in Path(__file__).read_text(encoding="utf-8")
+    assert f"({program})" in (EXAMPLES / "README.md").read_text(encoding="utf-8")
+
+
+def test_train_and_evaluate(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+    printed = started(tmp_path, "train_and_evaluate.py", "--steps", "300")
+    assert (tmp_path / "beams.onnx").is_file()
+    assert re.findall(r"^(\S+) +all \d", printed, re.MULTILINE) == ["policy", "los-beam", "random", "optimum"]
+
+
+def test_own_policy_learns(tmp_path: Path) -> None:
+    """A few frames of 64 members suffice to be far above random beams."""
+    pytest.importorskip("torch", reason="PyTorch is not installed")
+    printed = started(tmp_path, "own_policy.py", "--frames", "150")
+    means = {name: float(mean) for name, mean in re.findall(r"^(\S+) +all ([\d.]+)", printed, re.MULTILINE)}
+    assert means["policy"] > 3 * means["random"]
+
+
+def test_vector_of_environments(tmp_path: Path) -> None:
+    printed = started(tmp_path, "vector_of_environments.py", "--frames", "30")
+    assert re.search(r"of 64 together: \d+ times as many\nmean \|y\| by azimuth alone: \d", printed)
+
+
+def test_two_agents_deliver(tmp_path: Path) -> None:
+    pytest.importorskip("pettingzoo", reason="PettingZoo is not installed")
+    printed = started(tmp_path, "two_agents.py", "--seeds", "1")
+    assert [line.split(":")[1].split()[0] for line in printed.splitlines()] == ["2", "2"]
+
+
+def test_the_remote_trainer_plays_all_episodes(tmp_path: Path) -> None:
+    scenario = tmp_path / "remote.toml"
+    text = (SCENARIOS / "remote.toml").read_text()
+    scenario.write_text(text.replace("frames = 100", "frames = 30\nepisodes = 2"))
+    with running(scenario, tmp_path / "out", "--bind", "tcp://127.0.0.1:0") as (process, _):
+        assert process.stdout is not None
+        output, until = "", time.monotonic() + 30
+        while not (found := ENDPOINT.search(output)):
+            assert time.monotonic() < until, f"no endpoint came: {output}"
+            output += os.read(process.stdout.fileno(), 65536).decode()
+        printed = started(tmp_path, "remote_trainer.py", str(scenario), found[1])
+        process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "episode 2: mean |y| 0." in printed
+    assert "the run is over" in printed
+
+
+def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "remote_trainer.py"), "remote", "tcp://127.0.0.1:9"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "tcp://127.0.0.1:9" in done.stdout + done.stderr
