@@ -85,6 +85,44 @@ def reserved(*paths: Path) -> Iterator[None]:
         raise
 
 
+FILE_SUFFIXES = frozenset(
+    (".eps", ".gif", ".jpeg", ".jpg", ".json", ".md", ".mp4", ".pdf", ".png", ".svg", ".webp")
+)
+"""Of files that users may think a command writes, where it writes several."""
+
+
+def require_folder(option: str, path: Path, what: str) -> None:
+    """Refuse the name of a file where that of a folder is asked for; a folder of that name is right.
+
+    Args:
+        option: As the user writes it, ``--out``.
+        path: Its value.
+        what: What comes into the folder, ``pictures``.
+
+    Raises:
+        RunError: The name ends as that of a file does.
+
+    Example:
+        >>> require_folder("--out", Path("x.png"), "pictures")
+        Traceback (most recent call last):
+        ...
+        caviar_protocol.errors.RunError: --out x.png: several pictures are written; name a folder: --out x
+    """
+    if path.suffix.lower() in FILE_SUFFIXES and not path.is_dir():
+        folder = path.with_suffix("")
+        raise RunError(f"{option} {path}: several {what} are written; name a folder: {option} {folder}")
+
+
+def file_in(folder: Path, name: str) -> str:
+    """Say what to write where the name of a file is asked for and a folder is given.
+
+    Example:
+        >>> file_in(Path("runs"), "video.gif")
+        'is a folder; write the name of a file in it, as runs/video.gif'
+    """
+    return f"is a folder; write the name of a file in it, as {folder / name}"
+
+
 def printable(text: str) -> str:
     r"""Escape what would steer a terminal: control characters are written as Python writes them.
 

@@ -9,7 +9,7 @@ import recording_builders
 from recording_builders import channel, frame_of, lidar, link, record, scene
 
 from caviar_clients.cli.plot import plot_run, scenery
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.recording import Recording
 
 pytestmark = pytest.mark.slow
@@ -84,6 +84,23 @@ def test_a_frame_or_user_that_is_not_there_is_refused(tmp_path):
         plot_run(run, tmp_path, frame=99)
     with pytest.raises(RecordingError, match="no user is named 'bike'"):
         plot_run(run, tmp_path, user="bike")
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.PDF"])
+def test_a_file_is_no_folder_for_several_pictures(tmp_path, name):
+    """A folder called x.png was made, and its picture could not be opened."""
+    run = record(tmp_path / "run")
+    with pytest.raises(RunError, match=rf"--out .*{name}: several pictures are written; .* --out .*/x$"):
+        plot_run(run, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.usefixtures("maps_alone")
+@pytest.mark.parametrize("name", ["run-2.5", "old.png"])
+def test_a_folder_may_have_any_name(tmp_path, name):
+    (tmp_path / "old.png").mkdir()
+    run = record(tmp_path / "run")
+    assert plot_run(run, tmp_path / name)[0] == tmp_path / name / "map.png"
 
 
 def test_an_empty_recording_has_nothing_to_draw(tmp_path):

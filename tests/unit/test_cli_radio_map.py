@@ -260,6 +260,15 @@ def test_cells_that_cannot_be_are_refused_with_those_that_can(tmp_path: Path, wa
         _surface(tmp_path, **wanted)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("", r"is a folder; write .*, as .*/radio-map.png"), ("map.jpg", "write a name that ends in .png")],
+)
+def test_a_map_goes_into_a_png(tmp_path: Path, name: str, words: str) -> None:
+    with pytest.raises(RunError, match=words):
+        draw_radio_map(Path("smoke"), tmp_path / name, options_of(None, Wanted(), "wide"), Console())
+
+
 def test_a_power_in_another_unit_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As before a run; the map itself is made."""
     screen = StringIO()

@@ -220,6 +220,14 @@ def test_what_cannot_be_is_refused_with_the_remedy_and_leaves_no_file(tmp_path, 
     assert not folder.exists()
 
 
+def test_a_folder_is_no_video(tmp_path):
+    run = record(tmp_path / "run", 2)
+    with pytest.raises(
+        SetupError, match=rf"{tmp_path} is a folder; write .*, as {tmp_path}/video.mp4 or .gif"
+    ):
+        film_run(run, tmp_path)
+
+
 def test_a_camera_of_a_run_without_any_is_refused(tmp_path):
     run = record(tmp_path / "run", 2)
     with pytest.raises(RecordingError, match="no images of camera 'pole', nor of any other; leave out"):

@@ -318,7 +318,9 @@ def inspect(
 @app.command(rich_help_panel=LOOK)
 def plot(
     run: RunDirectory,
-    out: Annotated[Path | None, typer.Option(help="where the PNGs go; by default into the run")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder that the PNGs go into; by default the run's")
+    ] = None,
     frame: Annotated[int | None, typer.Option(help="frame of map, scan and images")] = None,
     user: Annotated[str | None, typer.Option(help="receiver whose |y| and paths are drawn")] = None,
     camera: Annotated[

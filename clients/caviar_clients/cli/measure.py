@@ -28,7 +28,7 @@ from caviar_clients.cli.shared import (
     require_writable,
     write_json,
 )
-from caviar_clients.files import reserved, write_file
+from caviar_clients.files import require_folder, reserved, write_file
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import has_extra, install_command
@@ -218,6 +218,8 @@ def trade(
     from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
     from caviar_clients.tradeoff.tables import by_reason, markdown, screen_table
 
+    if out is not None:
+        require_folder("--out", out, "tables and pictures")
     _require_extras_of_ladder(source, options, with_pictures=out is not None)
     files = [file for file in (json_file, out and out / "tradeoff.md") if file is not None]
     # Files that are still empty after an error are removed: an empty table looks like a result.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.files import make_folder_of
+from caviar_clients.files import make_folder_of, require_folder
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
@@ -63,12 +63,14 @@ def plot_run(
         RecordingError: It is not a recording, it holds nothing to draw, or frame, user or camera are not in
             it.
         SetupError: Matplotlib is not installed; the text has the command.
-        RunError: A file cannot be written.
+        RunError: A file cannot be written, or ``out`` is named as a file is.
 
     Example:
         >>> [file.name for file in plot_run(Path("runs/smoke-20261122-101500"), Path("pictures"))][:2]
         ['map.png', 'beams-over-time.png']
     """
+    if out is not None:
+        require_folder("--out", out, "pictures")
     recording = Recording(run)
     folder = out or recording.directory
     make_folder_of(folder / "map.png")  # before frames are read, which takes minutes of a long run

@@ -16,7 +16,7 @@ from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 
 from caviar_clients.cli.radio_map_inputs import Wanted, carrier_of, channel_of, noise_of, surface_of
 from caviar_clients.cli.shared import print_line, progress_bar, require_installed, require_known
-from caviar_clients.files import reserved, writing
+from caviar_clients.files import file_in, reserved, writing
 from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
 from caviar_clients.session.checks import checked_scenario
@@ -202,6 +202,8 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
     """
     require_installed("a radio map", ("channel", "plot"))
     picture = out or (source if is_recording(source) and source.is_dir() else Path()) / "radio-map.png"
+    if picture.is_dir():
+        raise RunError(f"--out {picture} {file_in(picture, 'radio-map.png')}")
     if picture.suffix.lower() != ".png":
         raise RunError(f"--out {picture}: a radio map is a PNG; write a name that ends in .png")
     several = len(options.metrics) > 1

@@ -13,7 +13,7 @@ from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingCol
 
 from caviar_clients.cli.plot import agent_names, choose_camera, map_data, scenery
 from caviar_clients.cli.shared import progress_bar
-from caviar_clients.files import make_folder_of
+from caviar_clients.files import file_in, make_folder_of
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
 from caviar_clients.plots.map import Mark, View, chosen_beam, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
@@ -107,6 +107,8 @@ def _format(
     """Frames a second and width [pixels]."""
     if suffix not in WRITERS:
         what = f"ends in {suffix!r}, which is no format of a video" if suffix else "has no suffix"
+        if file.is_dir():
+            raise SetupError(f"{file} {file_in(file, 'video.mp4')} or .gif")
         raise SetupError(f"{file} {what}; write .mp4 or .gif")
     if suffix == ".mp4":
         needed_ffmpeg(file)
