@@ -131,6 +131,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
             "tradeoff-convergence": "Convergence",
         },
     ),
+    "cell": Measurement(
+        "python tests/bench/bench_cell.py --frames 200 --markdown {out}/cell.md",
+        "python tests/bench/bench_cell.py --frames 2000 --markdown {out}/cell.md",
+        "cell.md",
+        {"cell-times": "Times"},
+    ),
     "wideband": Measurement(
         "python tests/bench/bench_wideband.py --sionna --frames 5 --markdown {out}/wideband.md",
         "python tests/bench/bench_wideband.py --sionna --markdown {out}/wideband.md",

@@ -189,10 +189,15 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         shapes: tuple[Any, ...] = ()
         try:
             shapes = (*layout.shapes_of(self), *map(len, layout.listed_of(self)))
+            optional = layout.optional_of(self)
+            if [values for values in optional if values is not None]:
+                shapes += tuple(
+                    [values if values is None else (values.dtype, values.shape) for values in optional]
+                )
             is_known = layout.dtypes_of(self) == layout.dtypes and shapes in layout.known
         except (AttributeError, TypeError):  # no array, or no length: reported below
             is_known = False
-        if not is_known or [values for values in layout.optional_of(self) if values is not None]:
+        if not is_known:
             self._check_arrays()
             # A lidar has another number of hits in every frame: without a bound the set would grow for hours.
             if len(layout.known) >= KNOWN_SHAPES:
@@ -251,7 +256,6 @@ class _Layout:
 @cache
 def _layout(cls: type[Payload]) -> _Layout:
     fields = array_fields(cls)
-    # Arrays that may be None are checked each time: their absence is no shape to remember.
     optional = {f.name for f in msgspec.structs.fields(cls) if f.name in fields and not f.required}
     required = tuple(name for name in fields if name not in optional)
     return _Layout(

@@ -264,6 +264,16 @@ SINCE: dict[str, str] = {
     "Panel": "1.4",
     "Channel.error_bound_db": "1.4",
     "Channel.error_reference": "1.4",
+    "Link.arrived": "1.5",
+    "Link.sent": "1.5",
+    "Link.dropped": "1.5",
+    "Link.delivered": "1.5",
+    "Link.delay": "1.5",
+    "Link.waiting": "1.5",
+    "Link.sinr": "1.5",
+    "Link.throughput": "1.5",
+    "Link.blocks": "1.5",
+    "Link.block_errors": "1.5",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -237,7 +237,26 @@ def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
 
 
 def _wrong_link(link: Link) -> str:
-    return _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
+    found = _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
+    if not found and link.arrived is not None:
+        found = next(filter(None, (_negative(getattr(link, key), key, u) for key, u in _PACKETS)), "")
+    return found
+
+
+# Fields of a link with packets that are at least 0, and their units.
+_PACKETS = (
+    ("buffered", "bit"),
+    ("arrived", "bit"),
+    ("sent", "bit"),
+    ("dropped", "bit"),
+    ("delivered", "1"),
+    ("delay", "s"),
+    ("waiting", "s"),
+    ("sinr", "1"),
+    ("throughput", "bit/s"),
+    ("blocks", "1"),
+    ("block_errors", "1"),
+)
 
 
 def _wrong_lidar(lidar: Lidar) -> str:

@@ -17,7 +17,7 @@ from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import LosBeamAgent, OracleAgent
 from caviar_services.antenna_arrays import dft_codebook, element_positions, steering_vector
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
+from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 CARRIER = Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6)

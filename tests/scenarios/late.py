@@ -17,7 +17,7 @@ from caviar_protocol.topics import Camera, Lidar
 from caviar_services.agent.base import AgentSettings
 from caviar_services.agent.baselines import LosBeamAgent
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
+from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Frame, Service, StepResult
 
 

@@ -68,6 +68,25 @@ def scene(frame: int, cars: int = 3) -> Scene:
     )
 
 
+def with_packets(plain: Link) -> Link:
+    """The link with packets: user u got u of the 10 that came, after 2 ms; 1 was dropped, the others wait."""
+    users = np.arange(len(plain.rx))
+    return replace(
+        plain,
+        arrived=np.full(len(users), 10_000),
+        sent=1000 * users,
+        dropped=np.full(len(users), 1000),
+        buffered=9000.0 - 1000 * users,
+        delivered=users.copy(),
+        delay=np.where(users > 0, 2e-3, 0.0),
+        waiting=np.full(len(users), 5e-3),
+        sinr=np.full(len(users), 3.0),
+        throughput=1e4 * users,
+        blocks=2 * users,
+        block_errors=users // 2,
+    )
+
+
 def link(frame: int, users: int = 3, without_path: tuple[int, ...] = ()) -> Link:
     """Best |y| of 4, the agent reaches half of it, the baseline a quarter."""
     has_path = np.array([u not in without_path for u in range(users)], dtype=bool)

@@ -13,7 +13,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import Action, BeamChoice, Carrier, Channel, Link, Scene
 from caviar_services.agent.base import AgentSettings
 from caviar_services.agent.baselines import OracleAgent
-from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
+from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import RunInfo
 
 SECOND = Carrier(name="second", frequency_hz=60e9)

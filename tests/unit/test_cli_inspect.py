@@ -6,7 +6,7 @@ import json
 import sys
 
 import pytest
-from recording_builders import absent, frame, link, product, record, recorder, scene
+from recording_builders import absent, frame, link, product, record, recorder, scene, with_packets
 
 from caviar_clients.cli.main import main
 from caviar_clients.cli.recordings import inspect_command
@@ -80,6 +80,18 @@ def test_the_summary_counts_every_status_and_leaves_users_without_path_out_of_me
     assert summary.link.no_path_share == pytest.approx(1 / 3)
     assert (summary.frames, summary.frames_planned, summary.episodes) == (2, 10, 1)
     assert summary.simulated_s == pytest.approx(0.2)
+
+
+def test_the_summary_adds_up_packets_where_the_link_has_some(tmp_path, capsys):
+    links = [with_packets(link(0)), link(1), with_packets(link(2))]
+    record(tmp_path, [frame(n, product("link", "link", made, n)) for n, made in enumerate(links)])
+    assert inspect_command(tmp_path) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    # Of each three users 0, 1 and 2 kbit of 10 kbit came through; 1 of 6 blocks failed.
+    assert "10.0% sent, 10.0% dropped, mean delay 2 ms, mean throughput 10 kbit/s a user" in shown
+    assert inspect_command(tmp_path, as_json=True) == 0
+    packets = json.loads(capsys.readouterr().out)["link"]["packets"]
+    assert (packets["sent"], packets["block_errors"], packets["blocks"]) == (6000, 2, 12)
 
 
 def test_the_json_summary_is_complete_json(tmp_path, capsys):

@@ -78,8 +78,16 @@ def _wideband() -> dict[str, Any]:
     return {}
 
 
+def _packets() -> dict[str, Any]:
+    """Thirty frames of `cell`."""
+    text = re.sub(r"(?m)^frames = .*", "frames = 30", find_scenario("cell").read_text())
+    record_run(Path("runs/cell"), parse_scenario(text, folder=find_scenario("cell").parent))
+    return {}
+
+
 GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
     "CONTRIBUTING.md": _channel_model,
+    "docs/howto/packets.md": _packets,
     "docs/howto/wideband.md": _wideband,
     "docs/topics/channel.md": _keyframes,
     "caviar_broker.core.clock": _clock,

@@ -59,6 +59,14 @@ def test_a_scheduled_receiver_is_the_only_one_served() -> None:
     assert beams(found) == [(-1, -1), (2, 0)]
 
 
+def test_several_receivers_of_a_transmitter_may_be_scheduled() -> None:
+    found = chosen(
+        choices("beams", ("bs", "a/rx", 1, 1), ("bs", "b/rx", 2, 0)),
+        choices("scheduler", UserSchedule(tx="bs", rx="a/rx"), UserSchedule(tx="bs", rx="b/rx")),
+    )
+    assert beams(found) == [(1, 1), (2, 0)]
+
+
 def test_an_absent_action_is_no_action() -> None:
     absent = choices("late", ("bs", "a/rx", 1, 1), status=Status.ABSENT)
     assert beams(chosen(absent)) == [(-1, -1), (-1, -1)]
@@ -117,7 +125,11 @@ def test_a_held_action_may_name_a_user_that_left_and_is_counted() -> None:
                 choices("p", UserSchedule(tx="bs", rx="a/rx")),
                 choices("q", UserSchedule(tx="bs", rx="b/rx")),
             ),
-            r"agents 'p' and 'q' both schedule a receiver of 'bs'; at most one",
+            r"agents 'p' and 'q' both schedule receivers of 'bs'; let one of them own 'schedule:bs'",
+        ),
+        (
+            (choices("p", UserSchedule(tx="bs", rx="a/rx"), UserSchedule(tx="bs", rx="a/rx")),),
+            r"action of 'p', frame .*: two commands schedule bs → a/rx",
         ),
     ],
 )

@@ -8,7 +8,18 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from recording_builders import absent, channel, frame, lidar, link, product, record, recorder, scene
+from recording_builders import (
+    absent,
+    channel,
+    frame,
+    lidar,
+    link,
+    product,
+    record,
+    recorder,
+    scene,
+    with_packets,
+)
 
 from caviar_protocol.errors import ProductError, RecordingError
 from caviar_protocol.messages import Status
@@ -152,6 +163,18 @@ def test_link_has_the_users_of_the_channel_and_all_its_fields(street: Path) -> N
     assert np.isnan(links.buffered).all()
     fields = {name for name in Link.__struct_fields__ if name not in ("tx", "rx", "carrier", "no_path")}
     assert set(links.columns) == fields
+
+
+def test_a_link_with_packets_has_them_and_nan_where_a_user_is_not_there(tmp_path: Path) -> None:
+    """Beside a frame of a link without, as of a run from before protocol 1.5."""
+    links = [with_packets(link(0, 2)), with_packets(link(1, 3)), link(2, 3)]
+    record(tmp_path, [frame(n, product("link", "link", found, n)) for n, found in enumerate(links)])
+    read = Recording(tmp_path)["link"]
+    np.testing.assert_array_equal(read.sent[:2], [[0, 1000, np.nan], [0, 1000, 2000]])
+    assert np.isnan(read.sent[2]).all()
+    assert read.block_errors[1].tolist() == [0, 0, 1]
+    balance = read.arrived - read.sent - read.dropped - read.buffered
+    assert balance[1].tolist() == [0, 0, 0]
 
 
 def test_objects_and_devices_are_rows_by_name(street: Path) -> None:

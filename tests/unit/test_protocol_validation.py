@@ -285,6 +285,11 @@ VALUES: dict[str, tuple[Callable[[], Payload], str]] = {
     "expected error": (lambda: made("channel", expected_error_db=np.nan), "expected_error_db is nan: leave"),
     "|y|": (lambda: made("link", abs_y=np.array([-0.5])), "abs_y is -0.5"),
     "snr": (lambda: made("link", snr=np.array([np.nan])), r"Link.snr\[0\] is nan"),
+    "dropped": (
+        lambda: made("link", arrived=np.array([5]), dropped=np.array([-1])),
+        "dropped is -1 bit at worst: it is at least 0",
+    ),
+    "sinr": (lambda: made("link", arrived=np.array([5]), sinr=np.array([np.inf])), r"Link.sinr\[0\] is inf"),
     "range": (lambda: scan(range=np.array([1.0, -3.0], "<f4")), "scan of 'car.1/lidar': range is -3 m"),
     "points": (lambda: scan(points=np.full((2, 3), np.inf, "<f4")), r"points\[0, 0\] is inf"),
     "pose": (lambda: scan(orientation=(0.0, 2.0, 0.0, 0.0)), "orientation has norm 2"),

@@ -13,6 +13,7 @@ from caviar_clients.files import make_folder_of, require_folder
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
+from caviar_clients.plots.traffic import draw_traffic, packet_series
 from caviar_clients.plots.user_curves import (
     choose_user,
     draw_dispersion,
@@ -43,8 +44,9 @@ def plot_run(
 ) -> list[Path]:
     """Draw what a recording holds, as PNG.
 
-    Map; |y| over time and angle of arrival; a user's delay spread, K-factor, coherence and frequency
-    response; LIDAR scan; a camera's images.
+    Map; |y| over time and angle of arrival; where the link has packets, throughput, delay and drops of all
+    receivers over time; a user's delay spread, K-factor, coherence and frequency response; LIDAR scan; images
+    of a camera.
 
     Args:
         run: Run directory or segment.
@@ -57,7 +59,8 @@ def plot_run(
             are fixed if there are any.
 
     Returns:
-        The files, in the order map, |y|, dispersion, LIDAR, camera. What was not recorded is not drawn.
+        The files, in the order map, |y|, traffic, dispersion, LIDAR, camera. What was not recorded is not
+        drawn.
 
     Raises:
         RecordingError: It is not a recording, it holds nothing to draw, or frame, user or camera are not in
@@ -86,6 +89,10 @@ def plot_run(
         data, agent = series(recording, chosen), agent_names(recording)
         draw_over_time(data, agent, files[-2])
         draw_over_angle(data, agent, files[-1])
+    packets = packet_series(recording) if chosen is not None else None
+    if packets is not None:
+        files.append(folder / "traffic.png")
+        draw_traffic(packets, files[-1])
     paths = user_paths(recording, chosen) if "channel" in topics else None
     if paths is not None:
         files += [folder / "dispersion.png", folder / "frequency-response.png"]

@@ -24,6 +24,7 @@ from rich.text import Text
 
 from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
+from caviar_clients.cli.packet_summary import packet_line
 from caviar_clients.cli.shared import counted, print_line, scaled
 from caviar_clients.cli.summary import (
     SHOWN_DAMAGE,
@@ -139,6 +140,8 @@ def _facts(summary: RunSummary) -> Table:
         )
     if link is not None and link.mean_bit_rate is not None:
         table.add_row("mean SNR", link_quality(link.mean_snr_db, link.mean_snr_best_db, link.mean_bit_rate))
+    if link is not None and link.packets is not None:
+        table.add_row("packets", packet_line(link.packets).removeprefix("packets: "))
     if link is not None:
         table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'user')} over all frames")
     for line in [] if summary.outage is None else outage_lines(summary.outage):

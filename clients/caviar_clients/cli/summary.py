@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
 
+from caviar_clients.cli.packet_summary import PacketSummary, PacketTotals, packet_line
 from caviar_clients.cli.shared import counted, scaled
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
@@ -94,6 +95,8 @@ class LinkSummary(msgspec.Struct, kw_only=True):
     """Share of users without a path; None where there was no user."""
     users: int
     """Users summed over frames."""
+    packets: PacketSummary | None = None
+    """None where the link has no packets."""
 
 
 class RunSummary(msgspec.Struct, kw_only=True):
@@ -229,9 +232,11 @@ class _LinkTotals:
         self.users = self.served = 0
         # Of |y|, best and baseline |y|, SNR, best SNR, bit rate; sums, so that a run of any length fits.
         self._sums = np.zeros(6)
+        self._packets = PacketTotals()
 
     def add(self, link: Link) -> None:
         with_path = link.has_path
+        self._packets.add(link)
         self.users += len(link.rx)
         self.served += int(with_path.sum())
         best = link.top_abs_y[:, :1].sum(axis=1)  # the column lacks where there is no user
@@ -254,6 +259,7 @@ class _LinkTotals:
             mean_bit_rate=bit_rate,
             no_path_share=1 - self.served / self.users,
             users=self.users,
+            packets=self._packets.summary(),
         )
 
 
@@ -425,7 +431,11 @@ def summary_of(
         "deadlines": outcome["deadlines"],
         "pace": outcome["pace"],
         "digest": outcome["digest"],
-        **{name: getattr(figures, name, None) for name in LinkSummary.__struct_fields__ if name != "users"},
+        **{
+            name: msgspec.to_builtins(getattr(figures, name, None))
+            for name in LinkSummary.__struct_fields__
+            if name != "users"
+        },
         "outage": msgspec.to_builtins(recorded.outage) if recorded else None,
         "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
         "warnings": [*warnings, *(recorded.warnings if recorded else ())],
@@ -478,6 +488,8 @@ def _caption(summary: Mapping[str, Any]) -> str:
     if summary["mean_bit_rate"] is not None:
         quality = link_quality(summary["mean_snr_db"], summary["mean_snr_best_db"], summary["mean_bit_rate"])
         parts.append(f"mean SNR {quality}")
+    if summary.get("packets") is not None:
+        parts.append(packet_line(msgspec.convert(summary["packets"], PacketSummary)))
     if summary["outage"] is not None:
         causes, *inside = outage_lines(msgspec.convert(summary["outage"], OutageSummary))
         parts += [f"{summary['no_path_share']:.1%} of users without a path: {causes}", *inside]

@@ -42,6 +42,7 @@ from caviar_protocol.multipath import (
     subcarrier_weights,
 )
 from caviar_protocol.recording import Recording
+from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.topics import Carrier, Link
 
 # A pale red that neither the grey of NLOS nor one of the curves looks like.
@@ -280,6 +281,25 @@ class UserPaths:
     """[Hz], Shape ``[F, P]``."""
 
 
+def running_time(topic: TopicArrays[Any, Any], period_ns: int) -> Float64Array:
+    """Simulated time of each frame of a topic, in which an episode begins where the one before ended.
+
+    Args:
+        topic: Arrays of the topic.
+        period_ns: Between frames [ns].
+
+    Returns:
+        [s], Shape ``[F]``.
+    """
+    # Each episode counts its time from its own start: what came before it is added up.
+    begins = np.flatnonzero(np.diff(topic.episode, prepend=-1))
+    lasted = np.diff(np.append(begins, len(topic)))
+    last = topic.t_ns[begins + lasted - 1] + period_ns - topic.t_ns[begins]
+    ahead = np.repeat(np.concatenate([[0], np.cumsum(last[:-1])]) - topic.t_ns[begins], lasted)
+    time: Float64Array = (topic.t_ns + ahead + topic.t_ns[0]) * 1e-9
+    return time
+
+
 def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserPaths | None:
     """Read the paths of a user.
 
@@ -297,18 +317,12 @@ def user_paths(recording: Recording, user: tuple[str, str, str] | None) -> UserP
     if (tx, rx, carrier) not in channel.users:
         return None
     mine = channel.select(tx=tx, rx=rx, carrier=carrier)
-    # Each episode counts its time from its own start: what came before it is added up.
-    begins = np.flatnonzero(np.diff(channel.episode, prepend=-1))
-    period = recording.metadata.sampling_period_ns
-    lasted = np.diff(np.append(begins, len(channel)))
-    last = channel.t_ns[begins + lasted - 1] + period - channel.t_ns[begins]
-    ahead = np.repeat(np.concatenate([[0], np.cumsum(last[:-1])]) - channel.t_ns[begins], lasted)
     return UserPaths(
         tx=tx,
         rx=rx,
         carrier=channel.carriers[carrier],
         frames=list(zip(channel.episode.tolist(), channel.frame.tolist(), strict=True)),
-        time=(channel.t_ns + ahead + channel.t_ns[0]) * 1e-9,
+        time=running_time(channel, recording.metadata.sampling_period_ns),
         los=mine.los[:, 0],
         a=mine.a[:, 0],
         tau=mine.tau[:, 0],

@@ -250,10 +250,22 @@ class ChannelArrays(UserArrays[Channel]):
         return [User(tx[t], rx[r], carriers[c].name) for c, t, r in _pairs(payload)]
 
 
-class LinkArrays(UserArrays[Link]):
-    """Topic ``link``: chosen and best beams, |y|, SNR, rates and reward, by user.
+def _packets(field: str, unit: str, doc: str) -> Any:
+    """A column of a field that a link with packets has; NaN in frames of another."""
 
-    |y| = |w* H f| is the equivalent channel of a beam pair; axis K counts the best pairs, best first.
+    def rows(_: Any, link: Link) -> Rows:
+        values = getattr(link, field)
+        return np.full(len(link.tx), np.nan) if values is None else values
+
+    return Column(np.float64, unit=unit, doc=f"{doc}; NaN without packets", rows=rows)
+
+
+class LinkArrays(UserArrays[Link]):
+    """Topic ``link``: chosen and best beams, |y|, SNR, rates and reward, by user; packets, where it has some.
+
+    |y| = |w* H f| is the equivalent channel of a beam pair; axis K counts the best pairs, best first. Of
+    packets, what a frame added: sums over the frames of an episode are arrived = sent + dropped + the last
+    buffered.
 
     Example:
         >>> from caviar_protocol.recording import Recording
@@ -280,12 +292,17 @@ class LinkArrays(UserArrays[Link]):
     bit_rate = payload_column(np.float64, Link, "bit_rate")
     reward = payload_column(np.float64, Link, "reward")
 
-    def _buffers(self, link: Link) -> Rows:
-        return np.full(len(link.tx), np.nan) if link.buffered is None else link.buffered
-
-    buffered = Column(
-        np.float64, unit="bit", doc="waiting in the user's buffer; NaN where there is none", rows=_buffers
-    )
+    buffered = _packets("buffered", "bit", "waiting in the user's buffer")
+    arrived = _packets("arrived", "bit", "came for the user in the frame")
+    sent = _packets("sent", "bit", "left the buffer and came through")
+    dropped = _packets("dropped", "bit", "left the buffer unsent: too old, or it was full")
+    delivered = _packets("delivered", "1", "packets of which the last bit came through")
+    delay = _packets("delay", "s", "mean of the delivered packets, from arrival on")
+    waiting = _packets("waiting", "s", "age of the oldest packet")
+    sinr = _packets("sinr", "1", "linear, mean over the slots in which the user was served")
+    throughput = _packets("throughput", "bit/s", "`sent` over the length of the frame")
+    blocks = _packets("blocks", "1", "transport blocks, one for each slot that served the user")
+    block_errors = _packets("block_errors", "1", "of these, how many were not decoded")
 
     def keys_of(self, payload: Link) -> Sequence[User]:
         return [User(*user) for user in zip(payload.tx, payload.rx, payload.carrier, strict=True)]

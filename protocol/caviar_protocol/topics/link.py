@@ -6,7 +6,16 @@ from typing import Annotated, ClassVar
 
 import msgspec
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Payload, Vector3, array, quantity
+from caviar_protocol.arrays import (
+    BoolArray,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    Payload,
+    Vector3,
+    array,
+    quantity,
+)
 
 
 class BeamChoice(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="beam"):
@@ -63,7 +72,11 @@ class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
 # Agents choose beams of all users; which of them is served is a decision of its own.
 class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="schedule"):
-    """Let a transmitter serve one receiver in this frame. The actuator is ``schedule:<tx>``.
+    """Let a transmitter serve this receiver in the frame. The actuator is ``schedule:<tx>``.
+
+    Receivers of the transmitter that no command names are not served; without any command for it all may be.
+    Since 1.5 there may be several for a transmitter: a link with packets serves these in turn, or at once, as
+    it is set; a link without takes each of them as served.
 
     Example:
         >>> UserSchedule(tx="bs", rx="car/rx").rx
@@ -82,7 +95,8 @@ Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule
 class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """All commands of one agent in a frame, sorted by actuator, TX and carrier.
 
-    At most one per actuator; of beam choices, one per actuator, TX and carrier.
+    At most one per actuator; of beam choices, one per actuator, TX and carrier; of schedules, since 1.5, one
+    per actuator and receiver.
 
     Example:
         >>> from caviar_protocol.codec import decode_payload, encode_payload
@@ -123,6 +137,16 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     and |y| 0. The lists of best pairs end with beams −1 and |y| 0 where a user has no path or
     fewer pairs. Of pairs with equal |y| the one of lower TX, then RX beam stands first. Means
     over users leave out those without a path and state how many they were.
+
+    A link with packets has a buffer for each receiver and carrier. What it did in the frame stands with the
+    user of the transmitter that serves the receiver, and 0 with its other users. Over the users of a receiver
+    and carrier, from one frame to the next,
+
+        buffered(k) = buffered(k − 1) + arrived(k) − sent(k) − dropped(k)
+
+    exactly, where ``buffered`` was 0 before the first frame of an episode, and of a receiver that comes. Ages
+    and delays count in whole slots, from the beginning of that in which a packet arrives to the end of that
+    in which its last bit is sent.
 
     Example:
         >>> from caviar_protocol.recording import Recording
@@ -177,3 +201,50 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
         Annotated[Float64Array, array("<f8", "U", unit="bit", doc="waiting in the user's buffer")] | None
     ) = None
     no_path: Annotated[int, quantity("1", "users without a path in this frame", ge=0)] = 0
+    # A link with packets sends all that follow and `buffered`, one without none of them.
+    arrived: (
+        Annotated[Int64Array, array("<i8", "U", unit="bit", doc="came for the user in this frame")] | None
+    ) = None
+    sent: (
+        Annotated[Int64Array, array("<i8", "U", unit="bit", doc="left the buffer and came through")] | None
+    ) = None
+    dropped: (
+        Annotated[
+            Int64Array,
+            array("<i8", "U", unit="bit", doc="left the buffer unsent: too old, or it was full"),
+        ]
+        | None
+    ) = None
+    delivered: (
+        Annotated[Int64Array, array("<i8", "U", unit="1", doc="packets of which the last bit came through")]
+        | None
+    ) = None
+    delay: (
+        Annotated[
+            Float64Array,
+            array("<f8", "U", unit="s", doc="mean of the delivered packets, from arrival on; 0: none"),
+        ]
+        | None
+    ) = None
+    waiting: (
+        Annotated[Float64Array, array("<f8", "U", unit="s", doc="age of the oldest packet; 0: none waits")]
+        | None
+    ) = None
+    sinr: (
+        Annotated[
+            Float64Array,
+            array("<f8", "U", unit="1", doc="linear, mean over the slots in which the user was served"),
+        ]
+        | None
+    ) = None
+    throughput: (
+        Annotated[Float64Array, array("<f8", "U", unit="bit/s", doc="`sent` over the length of the frame")]
+        | None
+    ) = None
+    blocks: (
+        Annotated[Int64Array, array("<i8", "U", unit="1", doc="transport blocks, one a slot that served it")]
+        | None
+    ) = None
+    block_errors: (
+        Annotated[Int64Array, array("<i8", "U", unit="1", doc="of these, how many were not decoded")] | None
+    ) = None

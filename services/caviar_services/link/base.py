@@ -293,7 +293,7 @@ def choices_of(frame: Frame, users: Users) -> Choices:
     """Collect the beams that the agents of this frame chose.
 
     A choice without a carrier holds for every carrier on which its agent makes no other. Where an
-    agent schedules a receiver, the transmitter's other receivers are not served. A held action may name
+    agent schedules receivers, the transmitter's other receivers are not served. A held action may name
     users that left since; those commands are counted.
 
     Args:
@@ -337,9 +337,9 @@ class _FrameCommands:
     """Commands of a frame, entered one after the other."""
 
     users: Users
-    # Agent and command by index of the user; agent and receiver by transmitter.
+    # Agent and command by index of the user; agent and receivers by transmitter.
     chosen: dict[int, tuple[str, BeamChoice]] = field(default_factory=dict)
-    scheduled: dict[str, tuple[str, str]] = field(default_factory=dict)
+    scheduled: dict[str, tuple[str, set[str]]] = field(default_factory=dict)
     outdated: int = 0
 
     def choose_beams(self, action: GrantInput, command: BeamChoice) -> None:
@@ -361,16 +361,19 @@ class _FrameCommands:
         if (command.tx, command.rx) not in self.users.by_pair:
             self._no_such_user(action, command.tx, command.rx, "")
             return
-        if command.tx in self.scheduled:
-            other = self.scheduled[command.tx][0]
-            problem = f"schedule a receiver of {command.tx!r}; at most one command per transmitter and frame"
-            raise _contradiction(other, action, problem)
-        self.scheduled[command.tx] = (action.source, command.rx)
+        agent, receivers = self.scheduled.setdefault(command.tx, (action.source, set()))
+        if agent != action.source:
+            problem = f"schedule receivers of {command.tx!r}; let one of them own 'schedule:{command.tx}'"
+            raise _contradiction(agent, action, problem)
+        if command.rx in receivers:
+            raise _contradiction(agent, action, f"schedule {_user(command.tx, command.rx)}; send one of them")
+        receivers.add(command.rx)
 
     def choices(self) -> Choices:
         tx_beam, rx_beam = ([-1] * len(self.users) for _ in range(2))
         for index, (_, command) in self.chosen.items():
-            if self.scheduled.get(command.tx, ("", command.rx))[1] == command.rx:
+            scheduled = self.scheduled.get(command.tx)
+            if scheduled is None or command.rx in scheduled[1]:
                 tx_beam[index], rx_beam[index] = command.tx_beam, command.rx_beam
         beams = np.array(tx_beam + rx_beam, np.int32).reshape(2, -1)
         return Choices(beams[0], beams[1], self.outdated)

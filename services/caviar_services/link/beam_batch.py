@@ -12,13 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.cell.rates import shannon
 from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import antennas, directions
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import User, Users
 from caviar_services.link.batch import BatchLink, LinkBatch
-from caviar_services.link.beam_sweep import BeamLinkSettings, Budget, spectral_efficiency, sweep
+from caviar_services.link.beam_sweep import sweep
+from caviar_services.link.beams import BeamLinkSettings, Budget
 
 HELD = 2**17
 """Complex numbers that are held at once while frames are computed ahead: they stay in the caches."""
@@ -96,7 +98,7 @@ class BeamBatch(LinkBatch):
             top_abs_y=np.broadcast_to(ahead.best[:, row], shape)[..., None].copy(),
             baseline_abs_y=np.broadcast_to(ahead.baseline[:, row], shape).copy(),
             snr=snr,
-            spectral_efficiency=spectral_efficiency(snr, self._settings),
+            spectral_efficiency=shannon(snr, self._settings.max_spectral_efficiency),
         )
 
     def _sweep_from(self, number: int) -> _Ahead:

@@ -1,9 +1,8 @@
-"""Link ``beams``: analog beamforming with DFT codebooks at both ends, and what beam pairs get over the band.
+"""Sweep of DFT codebooks, and what beam pairs get over the band.
 
 Each end has one RF chain and the DFT codebook of its array (paper, section 2.1). Every beam pair of every
-user is swept each frame (eq. 1), so that the chosen pair stands beside the best one (eq. 2) and beside the
-pair along the straight line (the baseline of section 4). The sweep is a Fourier transform of H; the codebook
-as vectors is in `caviar_services.antenna_arrays`.
+user is swept each frame (eq. 1). The sweep is a Fourier transform of H; the codebook as vectors is in
+`caviar_services.antenna_arrays`.
 
 Over the band and the slots of a frame the equivalent channel (eq. 1) of a pair of beams w and f is
 
@@ -15,267 +14,24 @@ with the phases r_p and t_p of the elements on path p: two numbers a path instea
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, Literal, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array, quantity
+from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.multipath import subcarrier_weights
-from caviar_protocol.space.beams import straight_beams
-from caviar_protocol.space.coordinates import Vector, rotation_matrix
-from caviar_protocol.space.scene import device_pose, directions
-from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import device_pose
+from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_protocol.topics.scene import AntennaArray, Device
+from caviar_protocol.topics.scene import AntennaArray
 from caviar_services.antenna_arrays import dft_beam, steering_vector
-from caviar_services.channel.batch import ChannelBatch, SceneAt
-from caviar_services.link.base import (
-    Choices,
-    LinkModel,
-    UserChannels,
-    Users,
-    channels_of,
-    choices_of,
-    noise_power,
-    require_channel,
-    transmit_power,
-    users_of,
-)
-from caviar_services.link.batch import LinkBatch
-from caviar_services.service import Frame, StepResult
-
-RewardKind = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
-
-
-class BeamLinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of the link ``beams``."""
-
-    top_k: Annotated[int, quantity("1", "best pairs listed per user", ge=1, le=4096)] = 10
-    noise_figure_db: Annotated[float, quantity("dB", "of the receivers", ge=0, le=60)] = 9.0
-    temperature_k: Annotated[float, quantity("K", "of the thermal noise", gt=0, le=1e6)] = 290.0
-    max_spectral_efficiency: (
-        Annotated[float, quantity("bit/s/Hz", "of the highest modulation and coding", gt=0, le=1e3)] | None
-    ) = None
-    """Cap of the spectral efficiency; absent: Shannon's bound as it is."""
-    reward: RewardKind = "abs_y"
-    """``abs_y``: |y| (paper, section 4); ``normalised``: |y| over that of the best pair; ``snr``:
-    linear; ``spectral_efficiency``."""
-
-
-class BeamLink(LinkModel[BeamLinkSettings]):
-    """Scores the agents' beam pairs against the best pair and the straight-line pair.
-
-    Args:
-        settings: Noise, cap of the spectral efficiency, reward, and how many pairs are listed.
-        run: What the link knows about the run.
-
-    Example:
-        >>> from caviar_services.service import RunInfo
-        >>> from caviar_services.testing.samples import granted
-        >>> link = BeamLink(BeamLinkSettings(top_k=1), RunInfo(name="link"))
-        >>> found = link.step(granted(link.inputs, 0, "link")).products["link"]
-        >>> found.rx, bool((found.abs_y <= found.top_abs_y[:, 0]).all())
-        (('car.1/rx', 'truck.2/rx'), True)
-    """
-
-    Settings = BeamLinkSettings
-    batches = True
-    # Of the last frame. Devices and carriers seldom change from frame to frame; comparing them is cheaper
-    # than naming all users and their noise anew.
-    _budget: Budget | None = None
-
-    def batch(
-        self, channels: ChannelBatch, members: int, frames: int, scene_at: Callable[[int], SceneAt]
-    ) -> LinkBatch:
-        """Make the links of many episodes at once."""
-        # Late: it is made of what this module has.
-        from caviar_services.link.beam_batch import BeamBatch
-
-        return BeamBatch(self.settings, self.run.carriers, channels, members, frames, scene_at)
-
-    def step(self, frame: Frame) -> StepResult:
-        """Compute the link of a frame.
-
-        Raises:
-            PayloadError: There is no channel, or a user, or two agents, are at fault; the text names them.
-            ProductError: An agent is at fault.
-        """
-        channel = require_channel(frame)
-        scene = frame.scene()
-        budget = self._budget
-        if budget is None or (budget.devices, budget.carriers) != (scene.devices, channel.carriers):
-            budget = self._budget = Budget.of(scene, channel.carriers, self.settings)
-        users = budget.users
-        choices = choices_of(frame, users)
-        channels = channels_of(channel, users)
-        scores = _score(scene, users, choices, channels, self.settings.top_k)
-        without_path = sum([h is None for h in channels.h])
-        counts = {
-            "users-without-path": without_path - channels.unknown,  # what is unknown has no path either
-            "users-without-channel": channels.unknown,
-            "commands-for-absent-users": choices.outdated,
-        }
-        return StepResult(
-            products={"link": self._link(budget, choices, channels, scores, without_path)},
-            fidelity=channel.rung,
-            counts={name: count for name, count in counts.items() if count},
-        )
-
-    def _link(
-        self, budget: Budget, choices: Choices, channels: UserChannels, scores: _Scores, without_path: int
-    ) -> Link:
-        settings = self.settings
-        best = scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
-        # Beams have unit norm, so |y|² is the power gain of the pair.
-        snr = budget.power_over_noise * scores.abs_y**2
-        efficiency = spectral_efficiency(snr, settings)
-        match settings.reward:
-            case "abs_y":
-                reward = scores.abs_y
-            case "normalised":
-                reward = np.divide(scores.abs_y, best, out=np.zeros(len(best)), where=best > 0)
-            case "snr":
-                reward = snr
-            case "spectral_efficiency":
-                reward = efficiency
-        return Link(
-            tx=budget.tx,
-            rx=budget.rx,
-            carrier=budget.carrier,
-            has_path=channels.has_path,
-            los=channels.los,
-            tx_beam=choices.tx_beam,
-            rx_beam=choices.rx_beam,
-            abs_y=scores.abs_y,
-            top_tx_beam=scores.top_tx_beam,
-            top_rx_beam=scores.top_rx_beam,
-            top_abs_y=scores.top_abs_y,
-            baseline_abs_y=scores.baseline_abs_y,
-            aod_azimuth=scores.aod_azimuth,
-            aoa_azimuth=scores.aoa_azimuth,
-            snr=snr,
-            snr_best=budget.power_over_noise * best**2,
-            spectral_efficiency=efficiency,
-            bit_rate=budget.bandwidth * efficiency,
-            reward=reward,
-            no_path=without_path,
-        )
-
-
-def spectral_efficiency(snr: Float64Array, settings: BeamLinkSettings) -> Float64Array:
-    """log2(1 + SNR), at most as the settings say [bit/s/Hz]; of any Shape."""
-    # One RF chain an end carries one stream, whose Shannon bound this is.
-    efficiency: Float64Array = np.log2(1 + snr)
-    if settings.max_spectral_efficiency is not None:
-        efficiency = np.minimum(efficiency, settings.max_spectral_efficiency)
-    return efficiency
-
-
-@dataclass(frozen=True, eq=False)
-class Budget:
-    """What stays the same while the same devices are there; Shape ``[U]`` each."""
-
-    devices: tuple[Device, ...]
-    carriers: tuple[Carrier, ...]
-    users: Users
-    tx: tuple[str, ...]
-    rx: tuple[str, ...]
-    carrier: tuple[str, ...]
-    bandwidth: Float64Array
-    power_over_noise: Float64Array
-    receive_beams: Int64Array
-    """Beams of the receivers."""
-
-    @classmethod
-    def of(cls, scene: Scene, carriers: tuple[Carrier, ...], settings: BeamLinkSettings) -> Budget:
-        """Of the devices of a scene.
-
-        Args:
-            scene: Has the devices.
-            carriers: C carriers.
-            settings: Of the noise.
-        """
-        users = users_of(scene, carriers)
-        figure, temperature = settings.noise_figure_db, settings.temperature_k
-        noise = np.array([noise_power(user.carrier, figure, temperature) for user in users])
-        return cls(
-            devices=scene.devices,
-            carriers=carriers,
-            users=users,
-            tx=tuple(user.tx.name for user in users),
-            rx=tuple(user.rx.name for user in users),
-            carrier=tuple(user.carrier.name for user in users),
-            bandwidth=np.array([user.carrier.bandwidth_hz for user in users], dtype=np.float64),
-            power_over_noise=np.array([transmit_power(user) for user in users]) / noise,
-            receive_beams=np.array([user.rx.array.size for user in users], np.int64),
-        )
-
-
-class _Scores(msgspec.Struct, frozen=True):
-    """Fields of `Link` that come out of the sweep."""
-
-    abs_y: Float64Array
-    baseline_abs_y: Float64Array
-    aod_azimuth: Float64Array
-    aoa_azimuth: Float64Array
-    top_tx_beam: Int32Array
-    top_rx_beam: Int32Array
-    top_abs_y: Float64Array
-
-
-def _score(scene: Scene, users: Users, choices: Choices, channels: UserChannels, top_k: int) -> _Scores:
-    """Sweep all pairs of all users and read off the chosen, the best and the baseline pairs."""
-    towards_rx, towards_tx = directions(scene, users)
-    # Users with fewer pairs than others fill up with −1 (`_listed`), so that the lists are one array.
-    k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
-    chosen, baseline = [0.0] * len(users), [0.0] * len(users)
-    tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
-    swept = sweep_users(users, channels.h)
-    for group in swept:
-        for u, abs_y in zip(group.users, group.abs_y, strict=True):
-            user = users[u]
-            if tx_beams[u] >= 0:
-                chosen[u] = abs_y[tx_beams[u], rx_beams[u]]
-            baseline[u] = abs_y[straight_beams(user.tx.array, towards_rx[u], user.rx.array, towards_tx[u])]
-    # One array of all numbers, cut up: nested lists take three times as long.
-    numbers = np.array([*chosen, *baseline, *_azimuths(towards_rx), *_azimuths(towards_tx)], np.float64)
-    abs_y, baseline_abs_y, aod_azimuth, aoa_azimuth = numbers.reshape(4, -1)
-    best = _listed(swept, len(users), k)
-    return _Scores(
-        abs_y=abs_y,
-        baseline_abs_y=baseline_abs_y,
-        aod_azimuth=aod_azimuth,
-        aoa_azimuth=aoa_azimuth,
-        top_tx_beam=best.tx_beam,
-        top_rx_beam=best.rx_beam,
-        top_abs_y=best.abs_y,
-    )
-
-
-def _azimuths(directions: Sequence[Vector]) -> list[float]:
-    return [math.atan2(y, x) for x, y, _ in directions]
-
-
-def _listed(swept: Sequence[Swept], users: int, k: int) -> Pairs:
-    """The best pairs of all users, Shape ``[U, k]``; −1 and |y| 0 where a user has fewer."""
-    found = [best_pairs(group.abs_y, k) for group in swept]
-    if len(swept) == 1 and found[0].abs_y.shape == (users, k):
-        return found[0]  # all users in their order
-    listed = Pairs(np.full((users, k), -1, np.int32), np.full((users, k), -1, np.int32), np.zeros((users, k)))
-    for group, pairs in zip(swept, found, strict=True):
-        length = pairs.abs_y.shape[1]
-        listed.tx_beam[group.users, :length] = pairs.tx_beam
-        listed.rx_beam[group.users, :length] = pairs.rx_beam
-        listed.abs_y[group.users, :length] = pairs.abs_y
-    return listed
-
+from caviar_services.link.base import Users
 
 SORTED_WHOLE = 256
 """Pairs up to which sorting all of them is faster than looking for the best first."""
@@ -397,6 +153,7 @@ def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept
         A batch for each combination of arrays.
 
     Example:
+        >>> from caviar_services.link.base import channels_of, users_of
         >>> from caviar_services.testing.samples import CARRIERS, product, scene
         >>> users = users_of(scene(0), CARRIERS)
         >>> [batch.abs_y.shape for batch in sweep_users(users, channels_of(product("channel", 0), users).h)]
@@ -434,6 +191,7 @@ def beam_responses(
             missing.
 
     Example:
+        >>> from caviar_services.link.base import users_of
         >>> from caviar_services.testing.samples import CARRIERS, product, scene
         >>> users = users_of(scene(0), CARRIERS)
         >>> responses = beam_responses(product("channel", 0), scene(0), users, [(0, 0)] * len(users))

@@ -279,7 +279,7 @@ class LinkConformance(ServiceConformance):
     """Links: what users got out of the chosen beams.
 
     Example:
-        >>> from caviar_services.link.beam_sweep import BeamLink
+        >>> from caviar_services.link.beams import BeamLink
         >>> class TestBeamLink(LinkConformance):
         ...     service_class = BeamLink
         ...     settings = {"top_k": 3}

@@ -20,7 +20,7 @@ from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link
 from caviar_services.antenna_arrays import dft_codebook
-from caviar_services.link.beam_sweep import BeamLink, BeamLinkSettings
+from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import FrameInput, RunInfo, StepResult
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)

@@ -1,0 +1,66 @@
+"""Settings of the link ``cell``: traffic, slots, scheduler, rates."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from caviar_protocol.arrays import quantity
+from caviar_protocol.cell.scheduling import Scheduler
+from caviar_protocol.cell.traffic import Traffic, check_traffic
+from caviar_protocol.scenario.conversion import Place
+from caviar_services.link.beams import RewardKind, SweepSettings
+
+RateModel = Literal["shannon", "capped"]
+
+CellReward = RewardKind | Literal["throughput", "delay"]
+
+
+class CellSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the link ``cell``, beside those of ``beams``."""
+
+    reward: CellReward = "throughput"
+    """As of ``beams``; or ``throughput`` [bit/s]; or ``delay``: minus the mean delay of the packets that were
+    delivered in the frame [s]."""
+    traffic: Annotated[tuple[Traffic, ...], msgspec.Meta(min_length=1)] = (Traffic(),)
+    """What arrives for the receivers; a receiver that fits no entry has no traffic."""
+    slots: Annotated[int, quantity("1", "of a frame, evenly long", ge=1, le=10_000)] = 1
+    rate_model: RateModel = "shannon"
+    """Spectral efficiency of a user: ``shannon``: log2(1 + SINR); ``capped``: this up to
+    ``max_spectral_efficiency``, by default 7.4063 bit/s/Hz of 256-QAM (3GPP TS 38.214)."""
+    scheduler: Scheduler = "round-robin"
+    """Which users of a transmitter are served in a slot, of those with something to send and beams that an
+    agent chose; where an agent schedules receivers, of these alone. ``round-robin``: who was not served for
+    longest; ``max-rate``: for whom the slot carries most bits; ``proportional-fair``: this over what each got
+    on average."""
+    users_per_slot: Annotated[int, quantity("1", "served at once by a transmitter", ge=1, le=1024)] = 1
+    """They share power and bandwidth of the carrier evenly, each with beams of its own."""
+    average_slots: Annotated[float, quantity("slot", "that the average of fairness forgets in", ge=1)] = 100.0
+    """Of ``proportional-fair``."""
+
+
+def check_cell_settings(settings: CellSettings, place: Place) -> None:
+    """Check what the types of settings do not say.
+
+    Args:
+        settings: The settings.
+        place: Where they stand.
+
+    Raises:
+        ScenarioError: A key is missing or has no effect, or a trace is wrong; names key, or file and line.
+
+    Example:
+        >>> from caviar_protocol.errors import ScenarioError
+        >>> try:
+        ...     check_cell_settings(CellSettings(max_spectral_efficiency=5.55), Place("settings"))
+        ... except ScenarioError as error:
+        ...     print(error)
+        settings.max_spectral_efficiency: has no effect with rate_model 'shannon'; write rate_model = "capped"
+    """
+    for index, entry in enumerate(settings.traffic):
+        check_traffic(entry, place.at("traffic").at(index))
+    if settings.max_spectral_efficiency is not None and settings.rate_model != "capped":
+        raise place.at("max_spectral_efficiency").error(
+            f'has no effect with rate_model {settings.rate_model!r}; write rate_model = "capped"'
+        )
