@@ -29,7 +29,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.keys import credentials
-from caviar_protocol.messages import Input
+from caviar_protocol.messages import Input, Status
 from caviar_protocol.observations import LinkFigures, Observer, Users
 from caviar_protocol.space.beams import beam_gain
 from caviar_protocol.space.scene import Pair, device_pose
@@ -366,7 +366,9 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         Returns:
             Observation of the next frame; reward of the decision; whether the goal is reached; whether the
             episode is over; and information: ``abs_y``, ``best_abs_y``, ``baseline_abs_y`` and ``los`` of
-            each user, Shape ``[U]``, beside ``frame`` and ``t_ns``.
+            each user, Shape ``[U]``, beside ``frame`` and ``t_ns``. At a broker also ``late``, whether the
+            decision came after its deadline, so that the agent's late policy stood in for it, and
+            ``missed_frames``, how many frames then went on before the next one that it is asked for.
 
         Raises:
             PayloadError: The action is none of `action_space`.
@@ -425,7 +427,17 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if now.link is None:
             raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
         reward = self._rewarded(before, now, now.link)
-        return self._observation(now), reward, self._terminated(now), now.frame.final, self._info(now)
+        info = self._info(now)
+        if self._broker is not None:
+            info |= self._lateness(before.frame, frame)
+        return self._observation(now), reward, self._terminated(now), now.frame.final, info
+
+    def _lateness(self, before: Frame, now: Frame) -> dict[str, Any]:
+        """Whether the decision for a frame came too late for it, and how many frames went on without any."""
+        missed = now.number - before.number - 1
+        own = (i.provenance for i in now.inputs if i.provenance.topic == "action")
+        in_time = any(entry.source == self.agent and entry.status is Status.FRESH for entry in own)
+        return {"late": missed > 0 or not in_time, "missed_frames": missed}
 
     def close(self) -> None:
         """End the run, or leave it. A later `reset` begins another one."""
@@ -483,7 +495,9 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def inputs(self) -> tuple[Input, ...]:
         """Give what the agent consumes: one input for each topic, since two cameras are in one product."""
-        return (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self.observer.inputs)
+        own = (Input(topic="scene"), Input(topic="link", lag=1, required=False), *self.observer.inputs)
+        # What became of its own decision; in this process none is ever late.
+        return own if self._broker is None else (*own, Input(topic="action", lag=1, required=False))
 
     def _at(self, frame: Frame) -> Moment:
         link = frame.only("link", Link)
