@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +20,7 @@ from caviar_clients.cli import launch
 from caviar_clients.cli.launch import TAIL, Child, Launcher
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
+from caviar_protocol.scratch import remove_leftovers
 
 pytestmark = pytest.mark.slow
 
@@ -93,6 +96,29 @@ def test_a_local_run_talks_over_a_socket_file_of_its_user_alone(tmp_path: Path) 
         assert started.endpoint == listening["endpoint"]
     assert (finished["error"], finished["frames"]) == ("", 100)
     assert not folder.exists()
+
+
+def test_the_folder_of_a_run_that_was_killed_goes_with_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    command = [sys.executable, "-m", "caviar_clients", "run", str(SMOKE), "--frames", "1000000"]
+    killed = subprocess.Popen([*command, "--out", str(tmp_path / "runs")], stdout=subprocess.DEVNULL)
+    until = time.monotonic() + 20.0
+    while not [*tmp_path.glob("runs/*/recording-*.mcap")]:
+        assert time.monotonic() < until
+        os.sched_yield()
+    (left,) = tmp_path.glob("caviar-*")
+    with launcher(tmp_path) as beside:
+        assert left.exists(), "it is a live run's"
+        killed.kill()
+        killed.wait()
+        while left.exists():  # its broker holds the folder until it has ended
+            assert time.monotonic() < until
+            remove_leftovers()
+        assert alive(beside) == []
+        assert wait_for(beside, "finished")[-1]["frames"] == 10
 
 
 @pytest.mark.parametrize("case", ["remote", "keys", "long path"])

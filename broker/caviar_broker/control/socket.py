@@ -8,10 +8,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import shutil
 import socket
 import struct
-import tempfile
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import Any
 from caviar_broker.event_loop import call_with_timeout
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, read_regular, refuse_other_kinds, replace_file
+from caviar_protocol.scratch import PrivateFolder
 
 BACKLOG = 16
 """Connections that wait for the broker's loop; with more, a client waits `REACH_S` for its place."""
@@ -57,7 +56,8 @@ class ControlSocket:
     def __init__(self, directory: Path) -> None:
         # A socket file may be left by a broker that was killed: only a connection shows whether one is there.
         refuse_second_broker(directory)
-        self._files, self._elsewhere = RunDirectory(directory), ""
+        self._files = RunDirectory(directory)
+        self._elsewhere: PrivateFolder | None = None
         self.socket = _listening()
         path = self._files.control_socket
         try:
@@ -65,8 +65,8 @@ class ControlSocket:
             with _short(directory) as folder:
                 self.socket.bind(f"{folder}/{path.name}")
         except OSError:  # the file system takes no sockets
-            self._elsewhere = tempfile.mkdtemp(prefix="caviar-")
-            path = Path(self._elsewhere, path.name)
+            self._elsewhere = PrivateFolder("control")
+            path = self._elsewhere.path / path.name
             self.socket.close()
             self.socket = _listening()
             self.socket.bind(str(path))
@@ -100,8 +100,8 @@ class ControlSocket:
         for file in (self._files.control_socket, self._files.control_note):
             with suppress(OSError):  # what was there before and is no file stays
                 file.unlink(missing_ok=True)
-        if self._elsewhere:
-            shutil.rmtree(self._elsewhere, ignore_errors=True)
+        if self._elsewhere is not None:
+            self._elsewhere.cleanup()
 
 
 def refuse_second_broker(directory: Path) -> None:

@@ -14,7 +14,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -32,6 +31,7 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
+from caviar_protocol.scratch import PrivateFolder
 from caviar_services import drjit_setup
 
 EXTRAS = ("channel", "sensors", "world", "plot", "policy", "learning")
@@ -137,8 +137,8 @@ def check_frames() -> Check:
     """Check that the base install computes, and computes the right thing: two frames of `smoke`, here."""
     remedy = f"{sys.executable} -m pip install --upgrade --upgrade-strategy eager {DISTRIBUTION}"
     try:
-        with tempfile.TemporaryDirectory(prefix="caviar-doctor-") as folder:
-            outcome, abs_y = _two_frames(Path(folder))
+        with PrivateFolder("doctor") as folder:
+            outcome, abs_y = _two_frames(folder.path)
     except Exception as error:  # anything: a dependency that does not fit raises what it likes
         text = str(error) if isinstance(error, CaviarError) else f"{type(error).__name__}: {error}"
         return Check("frames", False, text, remedy)

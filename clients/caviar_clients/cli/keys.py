@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-import tempfile
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +15,7 @@ import typer
 from caviar_protocol import keys as k
 from caviar_protocol.errors import SetupError, suggestion
 from caviar_protocol.messages import Role
+from caviar_protocol.scratch import PrivateFolder
 from caviar_protocol.topics import PAYLOADS
 
 app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")
@@ -162,14 +162,14 @@ class BorrowedKey:
 
     def __init__(self, keys: Path | None) -> None:
         self._keys = keys
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: PrivateFolder | None = None
 
     @cached_property
     def _pair(self) -> tuple[str, Path]:
         """The public key, and the file of the secret one."""
-        self._folder = tempfile.TemporaryDirectory(prefix="caviar-", ignore_cleanup_errors=True)
+        self._folder = PrivateFolder("key")
         pair = k.Pair.new()
-        secret, _ = k.write_pair(Path(self._folder.name), "run", pair)
+        secret, _ = k.write_pair(self._folder.path, "run", pair)
         return pair.public, secret
 
     def environment(self) -> Mapping[str, str]:

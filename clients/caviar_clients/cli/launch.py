@@ -8,7 +8,6 @@ import selectors
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import RunDirectory, file_system_of, open_to_append
 from caviar_protocol.scenario import Scenario, ServiceSpec
+from caviar_protocol.scratch import PrivateFolder
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
 
 KILL_AFTER_S = 1.0
@@ -169,7 +169,7 @@ class Launcher:
     """Address at which the broker listens; empty before it does."""
     _key: BorrowedKey = field(init=False)
     # Where the socket file of the broker is; None where it listens elsewhere.
-    _socket_folder: tempfile.TemporaryDirectory[str] | None = None
+    _socket_folder: PrivateFolder | None = None
     _children: dict[str, Child] = field(default_factory=dict)
     _broker: subprocess.Popen[bytes] | None = None
     # Why the broker was ended by force; "" if it was not.
@@ -209,8 +209,8 @@ class Launcher:
     def _private_address(self) -> str:
         """An ``ipc://`` address in a new directory of mode 0700; "" where its path is too long for one."""
         # A socket file needs no port that another program may take, and no other user reaches it.
-        folder = tempfile.TemporaryDirectory(prefix="caviar-", ignore_cleanup_errors=True)
-        socket = Path(folder.name, "broker")
+        folder = PrivateFolder()
+        socket = folder.path / "broker"
         if len(os.fsencode(socket)) > zmq.IPC_PATH_MAX_LEN:
             folder.cleanup()
             return ""
@@ -302,6 +302,8 @@ class Launcher:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                # The folder of the socket is the broker's as well: it may outlive this process by a moment.
+                pass_fds=() if self._socket_folder is None else (self._socket_folder.fileno(),),
                 bufsize=0,  # orders are given from signal handlers too, where a buffer would not be safe
                 start_new_session=True,
             )

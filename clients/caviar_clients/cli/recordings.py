@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -42,6 +41,7 @@ from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.scenario import Scenario
+from caviar_protocol.scratch import PrivateFolder
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.segment_writer import Persistence, SegmentWriter, stored_products
 
@@ -224,8 +224,8 @@ def replay_run(
     plan = plan_replay(found, request, frames)
     check_implementations(plan.scenario)
     _print_plan(plan, found, console)
-    with tempfile.TemporaryDirectory(prefix="caviar-replay-") as folder:
-        scenario, figures = Path(folder) / f"{plan.scenario.run.name}.toml", Path(folder) / "summary.json"
+    with PrivateFolder("replay") as folder:
+        scenario, figures = folder.path / f"{plan.scenario.run.name}.toml", folder.path / "summary.json"
         scenario.write_text(scenario_text(plan.scenario))
         written = json_file or figures
         ended = run_scenario(scenario, out, console, plan.frames, json_file=written, embedded=embedded)
