@@ -4,6 +4,8 @@
   together by ``gymnasium.make_vec`` (`vector.BeamSelectionVectorEnv`);
 * ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
   reward of comparable parts (`uav_path_v1`);
+* ``caviar/RadioStrike-v0``: a user and a beam in each slot, as in the ITU challenge of 2021
+  (`radio_strike`), also many of them computed together (`radio_strike.vector_env.RadioStrikeVectorEnv`);
 * ``caviar/UavPath-v0``: the same with a reward of |y| and metres (`uav_path`), replaced by version 1.
 
 `pair.UavPairEnv` is one of PettingZoo: one agent flies, another one chooses the beams.
@@ -21,3 +23,8 @@ gymnasium.register(
 )
 gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path_v1:UavPathV1Env")
+gymnasium.register(
+    "caviar/RadioStrike-v0",
+    "caviar_clients.envs.radio_strike.env:RadioStrikeEnv",
+    vector_entry_point="caviar_clients.envs.radio_strike.vector_env:RadioStrikeVectorEnv",
+)
