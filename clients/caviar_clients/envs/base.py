@@ -366,9 +366,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         Returns:
             Observation of the next frame; reward of the decision; whether the goal is reached; whether the
             episode is over; and information: ``abs_y``, ``best_abs_y``, ``baseline_abs_y`` and ``los`` of
-            each user, Shape ``[U]``, beside ``frame`` and ``t_ns``. At a broker also ``late``, whether the
-            decision came after its deadline, so that the agent's late policy stood in for it, and
-            ``missed_frames``, how many frames then went on before the next one that it is asked for.
+            each user, Shape ``[U]``, beside ``frame`` and ``t_ns``; ``late``, whether the decision came
+            after its deadline, so that the agent's late policy stood in for it, and ``missed_frames``, how
+            many frames then went on before the next one that it is asked for (at a broker: a run in this
+            process waits).
 
         Raises:
             PayloadError: The action is none of `action_space`.
@@ -427,13 +428,13 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if now.link is None:
             raise RunError(f"agent {self.agent!r} got no link of frame {before.frame.number}; is there one?")
         reward = self._rewarded(before, now, now.link)
-        info = self._info(now)
-        if self._broker is not None:
-            info |= self._lateness(before.frame, frame)
+        info = self._info(now) | self._lateness(before.frame, frame)
         return self._observation(now), reward, self._terminated(now), now.frame.final, info
 
     def _lateness(self, before: Frame, now: Frame) -> dict[str, Any]:
         """Whether the decision for a frame came too late for it, and how many frames went on without any."""
+        if self._broker is None:
+            return {"late": False, "missed_frames": 0}  # the run waits
         missed = now.number - before.number - 1
         own = (i.provenance for i in now.inputs if i.provenance.topic == "action")
         in_time = any(entry.source == self.agent and entry.status is Status.FRESH for entry in own)

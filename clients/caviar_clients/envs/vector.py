@@ -271,6 +271,8 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
         }
         if self._link is not None:
             known |= link_info(self._link)
+            known["late"] = np.zeros(self.num_envs, np.bool_)  # the run is in this process, and waits
+            known["missed_frames"] = np.zeros(self.num_envs, np.int64)
         return self._masked(known)
 
     def _masked(self, known: Mapping[str, Any]) -> dict[str, Any]:
