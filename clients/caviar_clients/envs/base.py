@@ -1,4 +1,4 @@
-"""Base class of the environments: scenario, session, observation, reward, rendering. The first environment,
+"""Base class of the environments: scenario, session, observation. The first environment,
 ``caviar/BeamSelection-v0``: choose a beam pair for each user, every frame.
 """
 
@@ -6,11 +6,9 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
-from functools import reduce
-from operator import add
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, Protocol, TypeAlias, TypeVar, get_args
+from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium
 import numpy as np
@@ -18,212 +16,19 @@ from gymnasium import spaces
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
-from caviar_clients.plots.style import GREY
+from caviar_clients.envs.rewards import KINDS, Reward, RewardKind, link_info
+from caviar_clients.plots.scene_map import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import agent_of, open_session
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol import observations
-from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
-from caviar_protocol.errors import PayloadError, RunError, ScenarioError, SetupError
-from caviar_protocol.host import install_command
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input, Status
-from caviar_protocol.observations import LinkFigures, Observer, Users
-from caviar_protocol.space.beams import beam_gain
-from caviar_protocol.space.scene import Pair, device_pose
-from caviar_protocol.topics import Action, BeamChoice, Link, Scene
+from caviar_protocol.observations import Observer, Users
+from caviar_protocol.topics import Action, BeamChoice, Link
 from caviar_protocol.topics.link import Command
-
-SIZE_IN, DPI = (6.4, 4.8), 100
-"""640×480 pixels."""
-MARGIN_M = 15.0
-"""Around what was seen so far."""
-
-
-class MapRenderer:
-    """Draws scenes as maps. The view only grows: what stands still in the world stands still in the pictures.
-
-    Raises:
-        SetupError: Matplotlib is not installed; the text has the command.
-    """
-
-    def __init__(self) -> None:
-        try:
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-        except ImportError as error:
-            raise SetupError(f"pictures need Matplotlib; run: {install_command('plot')}") from error
-        self._figure = Figure(SIZE_IN, dpi=DPI, layout="compressed")
-        self._canvas = FigureCanvasAgg(self._figure)
-        self._axes: Any = self._figure.subplots()
-        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
-
-    def draw(self, scene: Scene, link: Link | None, pair: Pair | None, title: str) -> UInt8Array:
-        """Draw a scene.
-
-        Args:
-            scene: What is drawn.
-            link: Has the beams; None: none is drawn.
-            pair: The one whose beam is drawn; None: none.
-            title: Stands above the map.
-
-        Returns:
-            Picture, Shape ``[480, 640, 3]``, red, green and blue, 0 to 255.
-        """
-        user = None
-        if pair is not None and link is not None:
-            users = zip(link.tx, link.rx, link.carrier, strict=True)
-            user = next((u for u in users if u[:2] == (pair.tx.name, pair.rx.name)), None)
-        data = MapData(scene, None, link, None, beam_gain, user, title)
-        axes = self._axes
-        axes.clear()
-        self._widen(scene)
-        axes.set_xlim(self._low[0], self._high[0])
-        axes.set_ylim(self._low[1], self._high[1])
-        axes.set_aspect("equal")
-        axes.grid(color=GREY, alpha=0.2)
-        beam = chosen_beam(data)
-        if beam is not None:
-            draw_beam(axes, beam)
-        draw_objects(axes, data)
-        draw_antennas(axes, data)
-        axes.set_xlabel("x, east [m]")
-        axes.set_ylabel("y, north [m]")
-        axes.set_title(title)
-        self._canvas.draw()
-        return np.array(self._canvas.buffer_rgba())[..., :3].copy()  # the canvas uses its buffer again
-
-    def _widen(self, scene: Scene) -> None:
-        devices = [device_pose(scene, device).position[:2] for device in scene.devices]
-        seen = np.concatenate([scene.position[:, :2], np.array(devices).reshape(-1, 2)])
-        if len(seen):
-            self._low = np.minimum(self._low, seen.min(0) - MARGIN_M)
-            self._high = np.maximum(self._high, seen.max(0) + MARGIN_M)
-
-
-class LinkResult(LinkFigures, Protocol):
-    """What environments say about a link: a `Link`, or one of many episodes."""
-
-    @property
-    def has_path(self) -> BoolArray:
-        """Whether each user has a path, Shape ``[..., U]`` as all below."""
-
-    @property
-    def los(self) -> BoolArray:
-        """Whether the line of sight is free."""
-
-    @property
-    def top_abs_y(self) -> Float64Array:
-        """|y| of the best pairs, best first, Shape ``[..., U, K]``."""
-
-    @property
-    def baseline_abs_y(self) -> Float64Array:
-        """|y| of the pair along the straight line."""
-
-    @property
-    def snr(self) -> Float64Array:
-        """Linear."""
-
-
-def link_info(link: LinkResult) -> dict[str, NDArray[Any]]:
-    """What ``info`` has of a link, by name."""
-    return {
-        "abs_y": link.abs_y,
-        "best_abs_y": link.top_abs_y[..., 0],
-        "baseline_abs_y": link.baseline_abs_y,
-        "los": link.los,
-    }
-
-
-RewardKind: TypeAlias = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
-KINDS: tuple[RewardKind, ...] = get_args(RewardKind)
-
-
-class Reward:
-    """Mean over the users served of one of their figures; users without a path are left out.
-
-    Args:
-        kind: ``abs_y``: |y| of the chosen pair (the paper, section 4); ``normalised``: |y| over that of the
-            best pair; ``snr``: linear; ``spectral_efficiency`` [bit/s/Hz].
-    """
-
-    def __init__(self, kind: RewardKind) -> None:
-        self.kind = kind
-        self._known: tuple[tuple[str, ...], tuple[str, ...], Collection[tuple[str, str]]] | None = None
-        self._served: BoolArray | None = None
-
-    def served(self, link: LinkResult, pairs: Collection[tuple[str, str]]) -> BoolArray | None:
-        """Find the users of a link that are among some pairs.
-
-        Args:
-            link: Has the users.
-            pairs: Names of transmitter and receiver.
-
-        Returns:
-            Whether each user is, Shape ``[U]``; None where all are.
-        """
-        # Users hardly ever change: comparing three tuples costs less than looking up each pair.
-        known = (link.tx, link.rx, pairs)
-        if known != self._known:
-            inside = np.array([pair in pairs for pair in zip(link.tx, link.rx, strict=True)], np.bool_)
-            self._known, self._served = known, None if inside.all() else inside
-        return self._served
-
-    def mean(self, link: Link, pairs: Collection[tuple[str, str]]) -> float:
-        """Work out the reward for a frame.
-
-        Args:
-            link: What the decision led to.
-            pairs: Names of transmitter and receiver of the users that count.
-
-        Returns:
-            The mean over these users; 0 where none of them has a path.
-        """
-        values = self._values(link)
-        counted, served = link.has_path, self.served(link, pairs)
-        if served is not None:
-            counted = counted & served
-        if len(values) == 1:  # without a mask and a mean of NumPy, which take 5 µs more
-            return float(values[0]) if counted[0] else 0.0
-        chosen: list[float] = values[counted].tolist()
-        # One after the other, as `means` adds them: `sum` has an order of its own.
-        return reduce(add, chosen) / len(chosen) if chosen else 0.0
-
-    def means(self, link: LinkResult, pairs: Collection[tuple[str, str]]) -> Float64Array:
-        """Work out the rewards for a frame of many episodes.
-
-        Args:
-            link: What the decisions led to, with M rows of users.
-            pairs: Names of transmitter and receiver of the users that count.
-
-        Returns:
-            What `mean` returns for the link of each episode, Shape ``[M]``.
-        """
-        values = self._values(link)
-        counted, served = link.has_path, self.served(link, pairs)
-        if served is not None:
-            counted = counted & served
-        total, number = np.zeros(len(values)), counted.sum(axis=1)
-        for user in range(values.shape[1]):
-            total += np.where(counted[:, user], values[:, user], 0.0)
-        means: Float64Array = np.divide(total, number, out=np.zeros(len(values)), where=number > 0)
-        return means
-
-    def _values(self, link: LinkResult) -> Float64Array:
-        match self.kind:
-            case "abs_y":
-                return link.abs_y
-            case "snr":
-                return link.snr
-            case "spectral_efficiency":
-                return link.spectral_efficiency
-            case "normalised":
-                best = link.top_abs_y.max(axis=-1, initial=0.0)
-                share: Float64Array = np.divide(link.abs_y, best, out=np.zeros(best.shape), where=best > 0)
-                return share
-
 
 A = TypeVar("A")
 Observation = dict[str, np.ndarray[Any, np.dtype[Any]]]
@@ -250,7 +55,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         agent: Name of the agent whose place is taken; None: the remote one, or the only one.
         users: Receivers served, as names with ``*`` and ``?``.
         observe: Names of the parts of the observation: `caviar_protocol.observations.PARTS`.
-        reward: What the reward is: `caviar_clients.envs.base.Reward`.
+        reward: What the reward is: `caviar_clients.envs.rewards.Reward`.
         directory: Where an embedded run records; None: it does not, which is faster.
         render_mode: ``rgb_array``: a map of the scene.
         key, broker_key: For a broker with keys: files with the agent's secret key and with the broker's
