@@ -26,6 +26,8 @@ MAGIC = b"CAVIAR journal 2\n"
 HEAD = struct.Struct("<QI")
 """Length and CRC-32 of an entry."""
 MAGIC_CRC = zlib.crc32(MAGIC)
+NO_BROKER = 0
+"""Epoch in the journal of a run in one process, which has no broker and no record; brokers count from 1."""
 
 
 class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -311,6 +311,22 @@ class RunDirectory:
         return self.path / "assets"
 
 
+def runs_below(folder: str | Path) -> str:
+    """Say which run is meant where a folder of runs was given in place of one: the end of an error's text.
+
+    Args:
+        folder: That was given.
+
+    Returns:
+        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``; empty where it holds none.
+    """
+    try:
+        newest = newest_run(folder)
+    except (RecordingError, OSError):
+        return ""
+    return f"; it holds runs: give one of them, as {newest}"
+
+
 def newest_run(root: str | Path = "runs", name: str = "*") -> Path:
     """Find the run directory below ``root`` whose recording was written last.
 

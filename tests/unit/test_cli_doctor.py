@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import socket
 import sys
 from pathlib import Path
@@ -12,7 +13,9 @@ from rich.console import Console
 
 from caviar_clients.cli import doctor
 from caviar_clients.cli.doctor import Check
+from caviar_clients.cli.scenarios import extras_of
 from caviar_protocol.errors import SetupError
+from caviar_protocol.scenario import load_scenario, shipped_scenarios
 from caviar_services import drjit_setup
 
 pytestmark = pytest.mark.slow
@@ -77,8 +80,23 @@ def test_a_remedy_is_shown_whole_so_that_it_can_be_copied() -> None:
     remedy = "sudo apt-get install -y " + " ".join(f"package-[{index}]" for index in range(20))
     text = shown([Check("thing", False, "missing", remedy)], width=60)
     assert remedy in text.splitlines()[-1]
-    assert "Everything that the shipped scenarios need" not in text
-    assert "Everything that the shipped scenarios need" in shown([Check("thing", True, "1")])
+    assert "Ready" not in text
+    assert "Ready: all " in shown([Check("thing", True, "1")])
+
+
+def test_what_is_ready_is_told_by_the_scenarios_that_run_with_what_there_is() -> None:
+    """Not «everything is here» beside what is missing: no shipped scenario needs an agent's library."""
+    count = len(shipped_scenarios())
+    lacks = {
+        extra: shown([Check(extra, False, "missing", f"pip install {extra}", extra)], width=200)
+        for extra in ("policy", "sensors")
+    }
+    assert f"Ready: all {count} shipped scenarios run here." in lacks["policy"]
+    cameras = sum("sensors" in extras_of(load_scenario(path)) for path in shipped_scenarios().values())
+    some = f"Ready: {count - cameras} of the {count} shipped scenarios run here; the others need sensors"
+    assert some in lacks["sensors"]
+    for extra, text in lacks.items():
+        assert f"Not installed, and optional: {extra}. To add all of it:" in text
 
 
 def test_a_missing_llvm_comes_with_its_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,9 +173,12 @@ def test_a_base_install_is_whole_and_one_command_adds_every_extra(monkeypatch: p
     monkeypatch.setattr(drjit_setup, "choose_llvm", none)
     checks = [doctor.check_base(), *map(doctor.check_extra, doctor.EXTRAS), doctor.check_sumo()]
     checks.append(doctor.check_llvm())
-    assert [check.extra for check in checks if not check.ok] == [*doctor.EXTRAS, "world"]
+    assert [check.extra for check in checks if not check.ok] == [*doctor.EXTRAS, "world", "channel"]
     assert doctor.exit_status(checks) == 0
     text = shown(checks, width=200)
     assert text.count("pip install") == 1
     assert "install 'caviar-sim[channel,sensors,world,plot,policy,learning]'" in text
-    assert "Everything that the base install needs is here." in text
+    assert f"  {drjit_setup.INSTALL}\n" in text, "pip brings no LLVM"
+    ready, count = re.search(r"Ready: (\d+) of the (\d+) shipped scenarios run here", text).groups()
+    assert 0 < int(ready) < int(count)
+    assert "the others need channel, sensors, world (`caviar scenarios`" in text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
 
@@ -10,9 +11,13 @@ import pytest
 from recording_builders import frame, record, recorder
 from rich.console import Console
 
+from caviar_broker.core.events import Journal
+from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import MAGIC
 from caviar_broker.run_record import RunRecord
 from caviar_clients.cli.recordings import inspect_command, rescue_run
+from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Manifest, Recording, SegmentRecord
 from caviar_protocol.recording.segment import Segment
@@ -95,6 +100,30 @@ def test_a_part_of_which_nothing_can_be_read_is_lost(tmp_path):
 def test_no_run_is_named(tmp_path):
     with pytest.raises(RunError, match="is no directory; give the directory of a run"):
         rescue(tmp_path / "nothing")
+
+
+def test_a_folder_that_is_no_runs_is_refused_with_the_run_in_it(tmp_path):
+    with pytest.raises(RunError, match=r"is no directory of a run: it has neither recording, run\.json nor"):
+        rescue(tmp_path)
+    record(tmp_path / "sample-1", frames=1)
+    with pytest.raises(RunError, match=r"it holds runs: give one of them, as .*sample-1$"):
+        rescue(tmp_path)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_run_in_one_process_lacks_nothing(tmp_path, lost):
+    """It has a journal, and no record; a run of a broker whose record is lost has another epoch."""
+    (tmp_path / "run").mkdir()
+    EmbeddedRun(checked_scenario("smoke", frames=2), tmp_path / "run").run()
+    if lost:
+        file = tmp_path / "run" / "journal.msgpack"
+        file.unlink()
+        with closing(JournalFile(file, epoch=1, run="run")) as journal:
+            journal.write([Journal(1, 0, 0, "", "episode")])
+    status, text = rescue(tmp_path / "run")
+    assert status == (1 if lost else 0), text
+    assert ("there is none, as of every run in one process" in text) is not lost
+    assert (tmp_path / "run-rescued").exists() is lost
 
 
 def test_a_journal_is_saved_up_to_its_damage(tmp_path):

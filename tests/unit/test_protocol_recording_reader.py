@@ -258,6 +258,13 @@ def test_what_is_no_recording_is_refused_by_name(tmp_path):
         Recording(tmp_path / "nothing")
     with pytest.raises(RecordingError, match=r"holds no recording: there is no recording-\*\.mcap"):
         Recording(tmp_path)
+    record(tmp_path / "runs" / "sample-1", frames=1)
+    with pytest.raises(RecordingError, match=r"holds runs: give one of them, as .*/runs/sample-1$"):
+        Recording(tmp_path / "runs")
+    scenario = tmp_path / "mine.toml"
+    scenario.write_text("[run]\n")
+    with pytest.raises(RecordingError, match=r"but a scenario: caviar run .*mine\.toml makes a run of it"):
+        Recording(scenario)
     text = tmp_path / "notes.txt"
     text.write_text("hello, this is text")
     with pytest.raises(RecordingError, match="does not begin as an MCAP file"):

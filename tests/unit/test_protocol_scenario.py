@@ -306,6 +306,23 @@ def test_a_folder_in_place_of_a_scenario_names_those_in_it(folder: Path) -> None
         load_scenario(folder)
 
 
+def test_the_name_of_a_folder_is_told_from_that_of_a_shipped_scenario(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a slash it was taken for a name that is misspelt."""
+    monkeypatch.chdir(folder)
+    for name in ("mine", "empty", "runs"):
+        Path(name).mkdir()
+    (folder / "mine" / "a.toml").write_text(GOOD)
+    (folder / "runs" / "run.json").touch()
+    with pytest.raises(ScenarioError, match=r"has a\.toml: name one of them, as mine/a\.toml"):
+        load_scenario("mine")
+    with pytest.raises(ScenarioError, match="Is a directory; a scenario is a TOML file: caviar new"):
+        load_scenario("empty")
+    with pytest.raises(ScenarioError, match=r"the directory of a run, .* with: caviar replay runs"):
+        load_scenario("runs")
+
+
 @pytest.mark.parametrize(("role", "lacking"), [("tx", "rx"), ("rx", "tx")])
 def test_a_channel_with_antennas_of_one_role_alone_is_refused(folder: Path, role: str, lacking: str) -> None:
     error = failure(GOOD.replace('role = "both"', f'role = "{role}"'), folder)

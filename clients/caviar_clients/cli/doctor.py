@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -25,12 +26,14 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from caviar_broker.core.events import Finished
+from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.cli.shared import print_line
 from caviar_clients.cli.summary import recorded_figures
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.host import DISTRIBUTION, install_command
+from caviar_protocol.scenario import load_scenario, shipped_scenarios
 from caviar_protocol.scratch import PrivateFolder
 from caviar_services import drjit_setup
 
@@ -107,18 +110,33 @@ def render(checks: list[Check], console: Console) -> None:
         table.add_row(mark, check.name, check.found)
     console.print(table)
     wrong = [check for check in checks if not check.ok and not check.extra]
-    lacking = dict.fromkeys(check.extra for check in checks if not check.ok and check.extra)
+    lacking = {check.extra for check in checks if not check.ok and check.extra}
     for check in wrong:
         console.print(f"\n[bold red]{check.name}[/]: mend it with")
         print_line(console, f"  {check.remedy}")
-    if lacking:
-        console.print(
-            f"\noptional: {', '.join(lacking)}; `caviar scenarios` says what needs which. To add them:"
-        )
-        print_line(console, f"  {install_command(*lacking)}")
     if not wrong:
-        needed = "the base install" if lacking else "the shipped scenarios"
-        console.print(f"\nEverything that {needed} needs is here.")
+        console.print(f"\n{_readiness(lacking)}")
+    if lacking:
+        names = [extra for extra in EXTRAS if extra in lacking]
+        console.print(f"\nNot installed, and optional: {', '.join(names)}. To add all of it:")
+        print_line(console, f"  {install_command(*names)}")
+        # What pip does not bring, as the LLVM of the ray tracer.
+        own = {check.remedy for check in checks if not check.ok and check.extra}
+        for remedy in sorted(own - {install_command(extra) for extra in lacking}):
+            print_line(console, f"  {remedy}")
+
+
+def _readiness(lacking: AbstractSet[str]) -> str:
+    """Say which shipped scenarios run without some extras, on a machine where nothing else is wrong."""
+    needs = {name: extras_of(load_scenario(path)) for name, path in shipped_scenarios().items()}
+    short = [extras for extras in needs.values() if lacking & {*extras}]
+    if not short:
+        return f"Ready: all {len(needs)} shipped scenarios run here."
+    extras = ", ".join(extra for extra in EXTRAS if extra in set().union(*short) & {*lacking})
+    return (
+        f"Ready: {len(needs) - len(short)} of the {len(needs)} shipped scenarios run here; the others need "
+        f"{extras} (`caviar scenarios` says which)."
+    )
 
 
 def check_python() -> Check:
@@ -175,7 +193,8 @@ def check_llvm() -> Check:
         library = drjit_setup.choose_llvm()
     except SetupError as error:
         if not tracer:
-            return Check("LLVM", True, f"none; extras channel and sensors need one: {drjit_setup.INSTALL}")
+            found = "none, which the extras channel and sensors need"
+            return Check("LLVM", False, found, drjit_setup.INSTALL, extra="channel")
         return Check("LLVM", False, str(error), drjit_setup.INSTALL)
     if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")

@@ -11,6 +11,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -21,7 +22,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 from rich.text import Text
 
-from caviar_broker.journal_format import JournalReader, run_of_journal
+from caviar_broker.journal_format import NO_BROKER, JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.packet_summary import packet_line
 from caviar_clients.cli.shared import counted, print_line, scaled
@@ -36,7 +37,7 @@ from caviar_clients.cli.summary import (
     summarise,
 )
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import RunDirectory
+from caviar_protocol.files import RunDirectory, runs_below
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
@@ -281,10 +282,16 @@ def rescue_run(run: Path, console: Console) -> int:
         0: all is whole; 1: a part is damaged, and the rest is saved; 2: of a part nothing can be read.
 
     Raises:
-        RunError: It is no directory, or the copy cannot be written.
+        RunError: It is no directory, or none of a run, or the copy cannot be written.
     """
     if not run.is_dir():
         raise RunError(f"{run} is no directory; give the directory of a run")
+    files = RunDirectory(run)
+    if not (any(run.glob("recording*")) or files.journal.exists() or files.record.exists()):
+        raise RunError(
+            f"{run} is no directory of a run: it has neither recording, {files.record.name} nor "
+            f"{files.journal.name}{runs_below(run)}"
+        )
     recording, of_recording = _examine_recording(run)
     journal, of_journal = _examine_journal(run)
     record, of_record = _examine_record(run, recording, journal)
@@ -351,7 +358,7 @@ def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
 def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
     part = Part(name="journal", state="whole", lines=[])
     if not RunDirectory(run).journal.exists():
-        part.state, part.lines = "none", ["there is none: an embedded run has no journal"]
+        part.state, part.lines = "none", ["there is none"]
         return None, part
     try:
         part.run = run_of_journal(RunDirectory(run).journal)
@@ -371,8 +378,13 @@ def _examine_record(
     run: Path, recording: Recording | None, journal: JournalReader | None
 ) -> tuple[RunRecord | None, Part]:
     part = Part(name=RunDirectory(run).record.name, state="whole", lines=[])
-    if journal is None and not RunDirectory(run).record.exists() and not RunDirectory(run).journal.exists():
-        part.state, part.lines = "none", ["there is none: an embedded run has no record"]
+    files = RunDirectory(run)
+    # Read anew: a reader goes through its journal once.
+    entries = JournalReader(journal.path) if journal is not None else ()
+    embedded = any(entry.epoch == NO_BROKER for entry in islice(entries, 1))
+    if not files.record.exists() and (embedded or not files.journal.exists()):
+        part.state = "none"
+        part.lines = ["there is none, as of every run in one process" if embedded else "there is none"]
         return None, part
     try:
         record = read_record(run)

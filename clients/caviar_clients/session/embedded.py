@@ -23,6 +23,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.journal import JournalFile
+from caviar_broker.journal_format import NO_BROKER
 from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.session.base import Frame, Session, declared
@@ -165,7 +166,7 @@ class EmbeddedRun:
         self._now = 0
         self._plan, self._clock = plan, FrameClock(plan, self._now)
         self._journal = (
-            JournalFile(RunDirectory(folder).journal, plan.epoch, run=plan.run) if directory else None
+            JournalFile(RunDirectory(folder).journal, NO_BROKER, run=plan.run) if directory else None
         )
         self._on_notice, self._on_frame = on_notice, on_frame
         self.outcome: ev.Finished | None = None

@@ -13,7 +13,7 @@ import msgspec
 
 from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory
+from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory, runs_below
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,
@@ -285,7 +285,8 @@ def _files(folder: Path) -> list[Path]:
             f"cannot read the folder {folder}: {error.strerror}; check its file system (fsck)"
         ) from error
     if not files:
-        raise RecordingError(f"{folder} holds no recording: there is no {SEGMENT_PATTERN} in it")
+        missing = f"{folder} holds no recording: there is no {SEGMENT_PATTERN} in it"
+        raise RecordingError(f"{missing}{runs_below(folder)}")
     return files
 
 

@@ -185,7 +185,10 @@ class Segment:
         """Find chunks, seals and the end; after a record that does not fit, go on after the next seal."""
         data, position = self._data, len(MAGIC)
         if data[: len(MAGIC)] != MAGIC[: len(data)]:
-            raise RecordingError(f"{self.path} does not begin as an MCAP file: it is not a recording")
+            remedy = "; give the directory of a run"
+            if self.path.suffix == ".toml":
+                remedy = f", but a scenario: caviar run {self.path} makes a run of it"
+            raise RecordingError(f"{self.path} does not begin as an MCAP file: it is not a recording{remedy}")
         while position + _RECORD.size <= len(data) and not self.finished:
             opcode, length = _RECORD.unpack_from(data, position)
             start = position + _RECORD.size

@@ -25,6 +25,7 @@ import msgspec
 
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.fields import MAX_SUBCARRIERS
+from caviar_protocol.files import RunDirectory
 from caviar_protocol.scenario.conversion import Place, Source, convert_table
 from caviar_protocol.scenario.rules import check_scenario, settings_place
 from caviar_protocol.scenario.schema import (
@@ -174,6 +175,8 @@ def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> Scena
 
 def _beside(path: Path) -> str:
     """The scenarios that stand where one was looked for, or those that ship."""
+    if path.is_dir():
+        return _in_folder(path)
     shipped = shipped_scenarios()
     file = path.with_name(path.name + ".toml")
     if file.is_file():
@@ -186,10 +189,19 @@ def _beside(path: Path) -> str:
         return f"{meant}; scenarios that ship: {', '.join(shipped)}"
     if not path.parent.is_dir():
         return ""
-    if path.is_dir():
-        path /= "SCENARIO.toml"
     names = sorted(other.name for other in path.parent.glob("*.toml"))
     return f"; {path.parent.resolve()} has {', '.join(names)}" if names and not path.is_file() else ""
+
+
+def _in_folder(folder: Path) -> str:
+    """What to write in place of a folder: the scenarios in it, or what can be done with a run."""
+    run = RunDirectory(folder)
+    if run.record.exists() or run.manifest.exists():
+        return f"; it is the directory of a run, whose world runs again with: caviar replay {folder}"
+    names = sorted(file.name for file in folder.glob("*.toml"))
+    if not names:
+        return "; a scenario is a TOML file: caviar new NAME writes one"
+    return f"; {folder.resolve()} has {', '.join(names)}: name one of them, as {folder / names[0]}"
 
 
 def _with_numerologies(scenario: Scenario) -> Scenario:
