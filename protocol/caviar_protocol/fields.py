@@ -264,6 +264,7 @@ SINCE: dict[str, str] = {
     "Panel": "1.4",
     "Channel.error_bound_db": "1.4",
     "Channel.error_reference": "1.4",
+    "Link.serving": "1.5",
     "Link.arrived": "1.5",
     "Link.sent": "1.5",
     "Link.dropped": "1.5",

@@ -238,6 +238,7 @@ def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
 
 def _wrong_link(link: Link) -> str:
     found = _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
+    found = found or _negative(link.sinr, "sinr", "1")
     if not found and link.arrived is not None:
         found = next(filter(None, (_negative(getattr(link, key), key, u) for key, u in _PACKETS)), "")
     return found
@@ -252,7 +253,6 @@ _PACKETS = (
     ("delivered", "1"),
     ("delay", "s"),
     ("waiting", "s"),
-    ("sinr", "1"),
     ("throughput", "bit/s"),
     ("blocks", "1"),
     ("block_errors", "1"),

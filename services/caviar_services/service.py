@@ -417,8 +417,12 @@ class Service(ABC, Generic[S]):
         self.run = run
 
     @classmethod
-    def computes_batches(cls) -> bool:
-        """Whether many episodes can be computed at once by this implementation (`batches`)."""
+    def computes_batches(cls, settings: Mapping[str, object]) -> bool:
+        """Whether many episodes can be computed at once by this implementation (`batches`).
+
+        Args:
+            settings: As they stand in the scenario: some of an implementation may be left to single episodes.
+        """
         # What a subclass overrides would be left out: it has to say so itself.
         return bool(vars(cls).get("batches", False))
 

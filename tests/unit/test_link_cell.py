@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import decode_payload, encode_payload
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ProductError, ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
 from caviar_services.link.base import noise_power
@@ -280,3 +280,93 @@ def test_users_of_two_carriers_have_a_buffer_on_each() -> None:
     assert (found.carrier, found.blocks.tolist()) == (("mmwave", "sub6"), [10, 10])
     throughput: Float64Array = found.throughput
     assert throughput.tolist() == pytest.approx([1e6, 1e6])
+
+
+# --- which transmitter serves -----------------------------------------------------------------------------
+
+OTHER = antenna("other", "tx", (1, 4), (200.0, 0.0, 10.0), power_dbm=30.0)
+
+
+def two_cells(
+    number: int, snr: tuple[float, float], *beams: str, tx: tuple[str, ...] = ("bs", "other")
+) -> Frame:
+    """Frame with receiver ``a``, its SNRs from both transmitters, and an agent's beams of those named."""
+    h = {("mmwave", name, "a"): h_of_snr(A, value) for name, value in zip(tx, snr, strict=True)}
+    act = choices("pilot", *((name, "a", 1, 0) for name in beams))
+    scene = scene_of(*(device for device in (BS, OTHER) if device.name in tx), A)
+    inputs = (given("scene", scene), given("channel", channel_of(tx, ("a",), h)), act)
+    return replace(frame_of(*inputs, number=number), previous=number - 1)
+
+
+def servers(links: list[Link]) -> list[str]:
+    return ["".join(tx for tx, serves in zip(x.tx, x.serving, strict=True) if serves) for x in links]
+
+
+COURSE = [(4.0, 1.0), (3.0, 4.0), (2.0, 5.0), (4.0, 3.0), (9.0, 3.0)]
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        ({"association": "best"}, ["bs", "other", "other", "bs", "bs"]),
+        # 3 dB is a factor of 1.995: 4 of 3 is too little, 5 of 2 enough, and so is 9 of 3 back again.
+        ({"association": "sticky"}, ["bs", "bs", "other", "other", "bs"]),
+        ({"association": "sticky", "hysteresis_db": 6.0}, ["bs"] * 5),
+    ],
+)
+def test_a_receiver_changes_its_transmitter_by_rule(rule: dict[str, Any], expected: list[str]) -> None:
+    link = link_of(**rule)
+    results = [link.step(two_cells(n, snr, "bs", "other")) for n, snr in enumerate(COURSE)]
+    links = [result.products["link"] for result in results]
+    assert servers(links) == expected
+    changes = [a != b for a, b in zip(expected, expected[1:], strict=False)]
+    assert [result.counts.get("handovers", 0) for result in results] == [0, *changes]
+
+
+def test_packets_go_along_in_a_handover_and_its_slots_are_lost() -> None:
+    """Three slots without service after each; the buffer is the receiver's, whoever serves it."""
+    link = link_of(association="best", handover_slots=13)
+    links = played(link, [two_cells(n, snr, "bs", "other") for n, snr in enumerate(COURSE[:3])])
+    assert servers(links) == ["bs", "other", "other"]
+    assert [found.blocks.tolist() for found in links] == [[10, 0], [0, 0], [0, 7]]
+    assert [found.buffered.tolist() for found in links] == [[0, 0], [0, 10_000], [0, 0]]
+    sent = np.sum([found.sent for found in links], 0)
+    assert sent.tolist() == [10_000, 20_000]
+    # The first slot after the change carries what waited through it, the oldest packet for 14 slots.
+    assert links[2].delay[1] == pytest.approx(np.mean([*range(1, 15), *[1] * 6]) * 1e-3)
+
+
+def test_an_agent_takes_a_receiver_to_another_transmitter_by_its_beams() -> None:
+    link = link_of(association="agent")
+    beams = [("bs",), ("other",), (), ("other",), ("bs",)]
+    links = played(link, [two_cells(n, (4.0, 1.0), *chosen) for n, chosen in enumerate(beams)])
+    assert servers(links) == ["bs", "other", "other", "other", "bs"]
+    # Without beams it stays where it is, and nothing is sent.
+    assert [int(found.blocks.sum()) for found in links] == [10, 10, 0, 10, 10]
+
+
+def test_beams_of_two_transmitters_are_refused_where_the_agent_associates() -> None:
+    with pytest.raises(
+        ProductError, match=r"'pilot', .*: it chose beams of 'bs' and 'other' for 'a' .*; with association"
+    ):
+        link_of(association="agent").step(two_cells(0, (4.0, 1.0), "bs", "other"))
+
+
+def test_a_transmitter_that_leaves_hands_its_receivers_over() -> None:
+    link = link_of(association="sticky")
+    links = played(
+        link, [two_cells(0, (4.0, 1.0), "bs", "other"), two_cells(1, (1.0,), "other", tx=("other",))]
+    )
+    assert servers(links) == ["bs", "other"]
+    assert links[1].sent.tolist() == [10_000]
+
+
+def test_association_and_lost_slots_outlive_the_process() -> None:
+    granted = [two_cells(n, COURSE[n % 5], "bs", "other") for n in range(15)]
+    rule: dict[str, Any] = {"association": "sticky", "handover_slots": 13}
+    whole = [encode_payload(found) for found in played(link_of(**rule), granted)]
+    link = link_of(**rule)
+    for frame, expected in zip(granted, whole, strict=True):
+        state, link = link.checkpoint(), link_of(**rule)
+        link.restore(state)
+        assert encode_payload(link.step(frame).products["link"]) == expected

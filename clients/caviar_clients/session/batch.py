@@ -58,8 +58,8 @@ def check_batch(scenario: Scenario, agent: str) -> None:
             continue  # recorders are left out, and of sensors nothing is observed
         if spec.remote:
             refuse(name, f"{called} is another program")
-        if not load(spec.role, spec.use).computes_batches():
-            refuse(name, f"{called} is {spec.use!r}, which computes one episode at a time")
+        if not load(spec.role, spec.use).computes_batches(spec.settings):
+            refuse(name, f"{called} is {spec.use!r}, which computes one episode at a time as it is set")
     for role in ("channel", "link"):
         names = [name for name, spec in scenario.services.items() if spec.role == role]
         if len(names) != 1:

@@ -138,6 +138,11 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     fewer pairs. Of pairs with equal |y| the one of lower TX, then RX beam stands first. Means
     over users leave out those without a path and state how many they were.
 
+    Where a link counts interference, the SINR is P·|y|²/(k·T·B·F + I), and the spectral efficiency of a link
+    without packets follows from it. I is what the receiver gets, with its chosen beam, of the other
+    transmitters that serve on its carrier: each spreads its power evenly over those that it serves at once,
+    or, without packets, over all its users with beams.
+
     A link with packets has a buffer for each receiver and carrier. What it did in the frame stands with the
     user of the transmitter that serves the receiver, and 0 with its other users. Over the users of a receiver
     and carrier, from one frame to the next,
@@ -201,7 +206,10 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
         Annotated[Float64Array, array("<f8", "U", unit="bit", doc="waiting in the user's buffer")] | None
     ) = None
     no_path: Annotated[int, quantity("1", "users without a path in this frame", ge=0)] = 0
-    # A link with packets sends all that follow and `buffered`, one without none of them.
+    # A link with packets sends all that follow and `buffered`, one without none of them but `sinr`.
+    serving: (
+        Annotated[BoolArray, array("|b1", "U", unit="1", doc="this transmitter serves the receiver")] | None
+    ) = None
     arrived: (
         Annotated[Int64Array, array("<i8", "U", unit="bit", doc="came for the user in this frame")] | None
     ) = None
@@ -233,7 +241,7 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     sinr: (
         Annotated[
             Float64Array,
-            array("<f8", "U", unit="1", doc="linear, mean over the slots in which the user was served"),
+            array("<f8", "U", unit="1", doc="linear SINR; with packets, mean over the slots that served it"),
         ]
         | None
     ) = None

@@ -418,6 +418,20 @@ class _FrameCommands:
         )
 
 
+def wrong_choice(frame: Frame, user: User, problem: str) -> ProductError:
+    """Make the error about the beams that an agent chose for a user.
+
+    Args:
+        frame: The frame.
+        user: The user, for which one did.
+        problem: What is wrong, and what to write instead.
+    """
+    for action, command in _commands(frame):
+        if isinstance(command, BeamChoice) and (command.tx, command.rx) == (user.tx.name, user.rx.name):
+            return _wrong(action, problem)
+    raise ValueError(f"no agent chose beams for {user}")
+
+
 def _user(tx: str, rx: str) -> str:
     return f"{tx} → {rx}"
 

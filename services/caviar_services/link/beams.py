@@ -8,7 +8,7 @@ no state: what a user gets follows from the channel and the choices of the frame
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
@@ -38,6 +38,7 @@ from caviar_services.link.base import (
 )
 from caviar_services.link.batch import LinkBatch
 from caviar_services.link.beam_sweep import Pairs, Swept, best_pairs, sweep_users
+from caviar_services.link.interference import Interferers
 from caviar_services.service import Frame, StepResult
 
 RewardKind = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
@@ -61,6 +62,9 @@ class BeamLinkSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_
     reward: RewardKind = "abs_y"
     """``abs_y``: |y| (paper, section 4); ``normalised``: |y| over that of the best pair; ``snr``:
     linear; ``spectral_efficiency``."""
+    interference: bool = False
+    """Whether users hear the transmitters that serve others on their carrier in the same frame: each spreads
+    its power evenly over all its users with beams. Spectral efficiency and bit rate follow from the SINR."""
 
 
 B = TypeVar("B", bound=SweepSettings)
@@ -96,8 +100,9 @@ class SweepingLink(LinkModel[B]):
         users = budget.users
         choices = choices_of(frame, users)
         channels = channels_of(channel, users)
-        scores = _score(scene, users, choices, channels, self.settings.top_k)
-        return Scored(channel, scene, budget, choices, channels, scores)
+        swept = sweep_users(users, channels.h)
+        scores = _score(scene, users, choices, swept, self.settings.top_k)
+        return Scored(channel, scene, budget, choices, channels, swept, scores)
 
     def counts(self, scored: Scored) -> dict[str, int]:
         """Events of a frame by name, those that did not happen too."""
@@ -172,6 +177,11 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
     Settings = BeamLinkSettings
     batches = True
 
+    @classmethod
+    def computes_batches(cls, settings: Mapping[str, object]) -> bool:
+        """Whether many episodes can be computed at once: without interference."""
+        return super().computes_batches(settings) and not settings.get("interference", False)
+
     def batch(
         self, channels: ChannelBatch, members: int, frames: int, scene_at: Callable[[int], SceneAt]
     ) -> LinkBatch:
@@ -181,6 +191,8 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
 
         return BeamBatch(self.settings, self.run.carriers, channels, members, frames, scene_at)
 
+    _interferers: tuple[Users, Interferers] | None = None
+
     def step(self, frame: Frame) -> StepResult:
         """Compute the link of a frame.
 
@@ -189,11 +201,32 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
             ProductError: As of `SweepingLink.score`.
         """
         scored = self.score(frame)
+        fields = self.fields(scored, self.settings.reward)
+        if self.settings.interference:
+            self._add_interference(scored, fields)
         return StepResult(
-            products={"link": Link(**self.fields(scored, self.settings.reward))},
+            products={"link": Link(**fields)},
             fidelity=scored.channel.rung,
             counts={name: count for name, count in self.counts(scored).items() if count},
         )
+
+    def _add_interference(self, scored: Scored, fields: dict[str, Any]) -> None:
+        """Put the SINR into the fields, and what follows from it."""
+        users, choices, budget = scored.budget.users, scored.choices, scored.budget
+        if self._interferers is None or self._interferers[0] is not users:
+            self._interferers = users, Interferers.of(users)
+        rise = self._interferers[1].noise_rise(
+            scored.swept, budget.power_over_noise, choices.tx_beam, choices.rx_beam
+        )
+        sinr = fields["snr"] / (1 + rise)
+        efficiency = shannon(sinr, self.settings.max_spectral_efficiency)
+        fields |= {
+            "sinr": sinr,
+            "spectral_efficiency": efficiency,
+            "bit_rate": budget.bandwidth * efficiency,
+        }
+        if self.settings.reward == "spectral_efficiency":
+            fields["reward"] = efficiency
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,6 +290,7 @@ class Scored:
     budget: Budget
     choices: Choices
     channels: UserChannels
+    swept: list[Swept]
     scores: Scores
 
     @cached_property
@@ -270,14 +304,13 @@ class Scored:
         return self.scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
 
 
-def _score(scene: Scene, users: Users, choices: Choices, channels: UserChannels, top_k: int) -> Scores:
-    """Sweep all pairs of all users and read off the chosen, the best and the baseline pairs."""
+def _score(scene: Scene, users: Users, choices: Choices, swept: Sequence[Swept], top_k: int) -> Scores:
+    """Read off the chosen, the best and the baseline pairs of all users."""
     towards_rx, towards_tx = directions(scene, users)
     # Users with fewer pairs than others fill up with −1 (`_listed`), so that the lists are one array.
     k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
     chosen, baseline = [0.0] * len(users), [0.0] * len(users)
     tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
-    swept = sweep_users(users, channels.h)
     for group in swept:
         for u, abs_y in zip(group.users, group.abs_y, strict=True):
             user = users[u]

@@ -1,10 +1,10 @@
 """Link ``cell``: packets, buffers, a scheduler and the slots of a frame, on top of the sweep of ``beams``.
 
 A *terminal* is a receiver on a carrier. It has a buffer, in which packets arrive as the settings ``traffic``
-say, and one transmitter serves it: that from which its best pair of beams brings most power. In each slot a
-transmitter serves, on each of its carriers, some of its terminals that have something to send and beams that
-an agent chose. What the slot carries follows from bandwidth, SINR and rate model; the oldest packets go
-first, and those that are too old are dropped.
+say, and one transmitter serves it (`association`). In each slot a transmitter serves, on each of its
+carriers, some of its terminals that have something to send and beams that an agent chose. What the slot
+carries follows from bandwidth, rate model and SINR, with the interference of all that is sent in the same
+slot (`slot_rates`); the oldest packets go first, and those that are too old are dropped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.buffers import Totals, delays_in_seconds
-from caviar_protocol.cell.rates import HIGHEST_SPECTRAL_EFFICIENCY, slot_bits
+from caviar_protocol.cell.rates import HIGHEST_SPECTRAL_EFFICIENCY
 from caviar_protocol.cell.scheduling import (
     averaged,
     chosen,
@@ -29,58 +29,42 @@ from caviar_protocol.cell.scheduling import (
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Link
 from caviar_services.checkpoint import restored, saved
-from caviar_services.link.base import Users
-from caviar_services.link.beams import SweepingLink
+from caviar_services.link.association import Layout, associate
+from caviar_services.link.base import wrong_choice
+from caviar_services.link.beams import Scored, SweepingLink
 from caviar_services.link.cell_settings import CellSettings, check_cell_settings
+from caviar_services.link.slot_rates import SlotRates, noise_rise
 from caviar_services.link.terminals import Terminals, TerminalState
 from caviar_services.service import Frame, RunInfo, StepResult
-
-
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """Which users are of which terminal, while the same users are there."""
-
-    users: Users
-    rows: Int64Array
-    """Index of the user of each terminal and transmitter, Shape ``[T, X]``; −1: none."""
-    groups: Int64Array
-    """A number for each user, the same for those of one transmitter and carrier, Shape ``[U]``."""
-    group_numbers: Int64Array
-    """All of these, Shape ``[G, 1]``."""
-    names: tuple[tuple[str, str], ...]
-    """Receiver and carrier of each terminal."""
-
-    @classmethod
-    def of(cls, users: Users) -> _Layout:
-        names = list(dict.fromkeys((user.rx.name, user.carrier.name) for user in users))
-        transmitters = list(dict.fromkeys(user.tx.name for user in users))
-        rows = np.full((len(names), len(transmitters)), -1, np.int64)
-        groups: dict[tuple[str, str], int] = {}
-        numbers = []
-        for index, user in enumerate(users):
-            tx, rx, carrier = user.tx.name, user.rx.name, user.carrier.name
-            rows[names.index((rx, carrier)), transmitters.index(tx)] = index
-            numbers.append(groups.setdefault((tx, carrier), len(groups)))
-        return cls(users, rows, np.array(numbers, np.int64), np.arange(len(groups))[:, None], tuple(names))
-
-    def best_servers(self, power: Float64Array) -> Int64Array:
-        """The user of each terminal with the greatest power, of equal ones the first, Shape ``[T]``."""
-        if self.rows.shape[1] <= 1:
-            return self.rows[:, :1].reshape(-1)
-        of_each = np.where(self.rows >= 0, power[self.rows], -1.0)
-        best: Int64Array = self.rows[np.arange(len(self.rows)), of_each.argmax(1)]
-        return best
 
 
 @dataclass(frozen=True, eq=False)
 class _Played:
     """What the slots of a frame gave each terminal, Shape ``[T]`` each."""
 
-    serving: Int64Array
-    """Index of the user by whose transmitter it is served."""
     blocks: Int64Array
     sinr: Float64Array
     """Sum over the slots that served it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Serving:
+    """Who serves whom, while that and the users stay the same."""
+
+    layout: Layout
+    transmitters: Int64Array
+    """Index of the transmitter of each terminal, Shape ``[T]``."""
+    users: Int64Array
+    """Index of the user of each terminal with it, Shape ``[T]``."""
+    members: BoolArray
+    """Terminals of each transmitter and carrier, Shape ``[G, T]``."""
+
+    @classmethod
+    def of(cls, layout: Layout, transmitters: Int64Array) -> _Serving:
+        users = layout.rows[np.arange(len(transmitters)), transmitters]
+        groups = layout.carrier[users] * len(layout.transmitters) + transmitters
+        numbers = np.array(list(dict.fromkeys(groups.tolist())), np.int64)
+        return cls(layout, transmitters, users, groups == numbers[:, None])
 
 
 class CellLink(SweepingLink[CellSettings]):
@@ -103,7 +87,8 @@ class CellLink(SweepingLink[CellSettings]):
 
     Settings = CellSettings
     checkpoints: ClassVar[bool] = True
-    _layout: _Layout | None = None
+    _layout: Layout | None = None
+    _serving: _Serving | None = None
     _terminals: Terminals | None = None
 
     @classmethod
@@ -136,22 +121,26 @@ class CellLink(SweepingLink[CellSettings]):
 
         Raises:
             PayloadError: As of `SweepingLink.score`.
-            ProductError: As of `SweepingLink.score`.
+            ProductError: As of `SweepingLink.score`; or an agent that chooses the transmitter of a receiver
+                chose beams of several.
         """
         scored = self.score(frame)
         reward = self.settings.reward
         fields, counts = self.fields(scored, reward), self.counts(scored)
         layout = self._layout
         if layout is None or layout.users is not scored.budget.users:
-            layout = self._layout = _Layout.of(scored.budget.users)
+            layout = self._layout = Layout.of(scored.budget.users)
         terminals, counts["bits-of-users-that-left"] = self._terminals_of(layout)
         before = terminals.buffers.totals
         # Traffic goes on in frames that were not granted; nothing is served then.
         for missed in range(frame.previous + 1, frame.number) if frame.previous >= 0 else ():
             for packets in terminals.arrivals(frame, missed):
                 terminals.buffers.begin_slot(packets)
-        played = self._play(frame, layout, terminals, fields)
-        fields |= self._outcome(terminals, before, played, len(scored.budget.users))
+        serving, counts["handovers"] = self._associate(frame, layout, terminals, fields)
+        played = self._play(frame, scored, terminals, serving, fields)
+        of_terminals = self._outcome(terminals, before, played)
+        count = len(layout.users)
+        fields |= {name: _with_zeros(found, serving.users, count) for name, found in of_terminals.items()}
         if reward == "throughput":
             fields["reward"] = fields["throughput"]
         elif reward == "delay":
@@ -162,7 +151,7 @@ class CellLink(SweepingLink[CellSettings]):
             counts={name: count for name, count in counts.items() if count},
         )
 
-    def _terminals_of(self, layout: _Layout) -> tuple[Terminals, int]:
+    def _terminals_of(self, layout: Layout) -> tuple[Terminals, int]:
         terminals, left = self._terminals, 0
         if terminals is None:
             terminals = Terminals(layout.names, self.settings, self._slot_s)
@@ -171,31 +160,81 @@ class CellLink(SweepingLink[CellSettings]):
         self._terminals = terminals
         return terminals, left
 
-    def _play(self, frame: Frame, layout: _Layout, terminals: Terminals, fields: dict[str, Any]) -> _Played:
+    def _associate(
+        self, frame: Frame, layout: Layout, terminals: Terminals, fields: dict[str, Any]
+    ) -> tuple[_Serving, int]:
+        """Choose the transmitters that serve in the frame; with them, how many handovers that makes."""
+        settings, before = self.settings, self._serving
+        if before is not None and before.layout is layout and len(layout.transmitters) == 1:
+            terminals.serve_by(layout.transmitters * len(before.users))
+            return before, 0
+        chosen_users = fields["tx_beam"] >= 0
+        if settings.association == "agent":
+            _refuse_several(frame, layout, chosen_users)
+        found = associate(
+            layout,
+            layout.servers(terminals.servers),
+            fields["snr_best"],
+            chosen_users,
+            settings.association,
+            settings.hysteresis_db,
+        )
+        changed = terminals.serve_by([layout.transmitters[x] for x in found.tolist()])
+        terminals.lost[changed] = settings.handover_slots
+        if before is None or before.layout is not layout or (before.transmitters != found).any():
+            before = self._serving = _Serving.of(layout, found)
+        return before, int(changed.sum())
+
+    def _play(
+        self,
+        frame: Frame,
+        scored: Scored,
+        terminals: Terminals,
+        serving: _Serving,
+        fields: dict[str, Any],
+    ) -> _Played:
         """Play the slots of a frame, one after the other."""
         settings, buffers = self.settings, terminals.buffers
-        serving = layout.best_servers(fields["snr_best"])
-        snr = fields["snr"][serving]
-        bits = slot_bits(fields["bit_rate"][serving], self._slot_s)
-        has_beams = (fields["tx_beam"][serving] >= 0) & (bits > 0)
-        members: BoolArray = layout.groups[serving] == layout.group_numbers
-        blocks, sinr = np.zeros(len(serving), np.int64), np.zeros(len(serving))
+        at_once, layout, users, members = (
+            settings.users_per_slot,
+            serving.layout,
+            serving.users,
+            serving.members,
+        )
+        within = settings.sharing == "space" and at_once > 1
+        rise = None
+        if (settings.interference and len(layout.transmitters) > 1) or within:
+            rise = noise_rise(scored, layout, users, settings.interference, within)
+        rates = SlotRates(
+            scored.budget.bandwidth[users],
+            settings.max_spectral_efficiency,
+            self._slot_s,
+            fields["snr"][users],
+            members,
+            settings.sharing,
+            rise,
+        )
+        has_beams = (fields["tx_beam"][users] >= 0) & (rates.alone > 0)
+        blocks, sinr = np.zeros(len(users), np.int64), np.zeros(len(users))
         for packets in terminals.arrivals(frame, frame.number):
             if terminals.has_full:
-                packets = packets + self._refill(terminals, bits)
+                packets = packets + self._refill(terminals, rates.alone)
             buffers.begin_slot(packets)
             # A slot of a user that has little to send carries little, whatever its rate.
-            carried = np.minimum(bits, buffers.waiting)
-            eligible = has_beams & (carried > 0)
-            served = self._schedule(terminals, eligible, members, carried)
-            shared = bits if settings.users_per_slot == 1 else _shared(bits, served, members)
-            sent = buffers.serve(np.where(served, shared, 0))
+            least = np.minimum(rates.alone, buffers.waiting)
+            eligible = has_beams & (least > 0)
+            if terminals.lost.any():
+                eligible &= terminals.lost == 0
+                terminals.lost -= terminals.lost > 0
+            served = self._schedule(terminals, eligible, members, least)
+            carried = rates.carried(served, at_once)
+            sent = buffers.serve(np.where(served, carried.bits, 0))
             terminals.turn = note_turns(terminals.turns, served, terminals.turn)
             if settings.scheduler == "proportional-fair":
                 terminals.average = averaged(terminals.average, sent, settings.average_slots)
             blocks += served
-            sinr += np.where(served, snr, 0.0)
-        return _Played(serving, blocks, sinr)
+            sinr += np.where(served, carried.sinr, 0.0)
+        return _Played(blocks, sinr)
 
     def _refill(self, terminals: Terminals, bits: Int64Array) -> Int64Array:
         """Packets that fill up the buffers of those that always have something to send, Shape ``[T]``."""
@@ -222,12 +261,13 @@ class CellLink(SweepingLink[CellSettings]):
         served: BoolArray = np.logical_or.reduce(of_each, 0)
         return served
 
-    def _outcome(self, terminals: Terminals, before: Totals, played: _Played, users: int) -> dict[str, Any]:
-        """Fields of `Link` about packets."""
+    def _outcome(self, terminals: Terminals, before: Totals, played: _Played) -> dict[str, Any]:
+        """Fields of `Link` about packets, of the terminals."""
         buffers, totals = terminals.buffers, terminals.buffers.totals
         sent = totals.sent - before.sent
         frame_s = self._slot_s * self.settings.slots
-        values: dict[str, Any] = {
+        return {
+            "serving": np.ones(len(sent), np.bool_),
             "buffered": buffers.waiting.astype(np.float64),
             "arrived": totals.arrived - before.arrived,
             "sent": sent,
@@ -240,14 +280,21 @@ class CellLink(SweepingLink[CellSettings]):
             "blocks": played.blocks,
             "block_errors": np.zeros_like(played.blocks),
         }
-        return {name: _with_zeros(array, played.serving, users) for name, array in values.items()}
 
 
-def _shared(bits: Int64Array, served: BoolArray, members: BoolArray) -> Int64Array:
-    """Bits of each terminal where those that a transmitter serves share its bandwidth evenly."""
-    counts = (members & served).sum(1)
-    share: Int64Array = bits // np.maximum((members * counts[:, None]).sum(0), 1)
-    return share
+def _refuse_several(frame: Frame, layout: Layout, chosen_users: BoolArray) -> None:
+    """Refuse beams of several transmitters for one terminal."""
+    several = ((layout.rows >= 0) & chosen_users[layout.rows]).sum(1) > 1
+    if not several.any():
+        return
+    users = [layout.users[row] for row in layout.rows[several][0].tolist() if row >= 0 and chosen_users[row]]
+    names = " and ".join(repr(user.tx.name) for user in users)
+    raise wrong_choice(
+        frame,
+        users[-1],
+        f"it chose beams of {names} for {users[0].rx.name!r} on carrier {users[0].carrier.name!r}; with "
+        'association = "agent" choose those of one transmitter, which is to serve it',
+    )
 
 
 def _with_zeros(values: Any, users: Int64Array, count: int) -> Any:

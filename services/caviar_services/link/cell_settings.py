@@ -10,7 +10,9 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.cell.scheduling import Scheduler
 from caviar_protocol.cell.traffic import Traffic, check_traffic
 from caviar_protocol.scenario.conversion import Place
+from caviar_services.link.association import AssociationRule
 from caviar_services.link.beams import RewardKind, SweepSettings
+from caviar_services.link.slot_rates import Sharing
 
 RateModel = Literal["shannon", "capped"]
 
@@ -35,7 +37,22 @@ class CellSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     longest; ``max-rate``: for whom the slot carries most bits; ``proportional-fair``: this over what each got
     on average."""
     users_per_slot: Annotated[int, quantity("1", "served at once by a transmitter", ge=1, le=1024)] = 1
-    """They share power and bandwidth of the carrier evenly, each with beams of its own."""
+    """They share the power evenly, and the band as ``sharing`` says; each has beams of its own."""
+    sharing: Sharing = "band"
+    """``band``: users served at once have equal parts of the band; ``space``: each has all of it, and hears
+    the beams of the others."""
+    interference: bool = True
+    """Whether users hear transmitters that serve others on their carrier in the same slot."""
+    association: AssociationRule = "best"
+    """Which transmitter serves a receiver on a carrier: ``best``: that whose best pair of beams brings most
+    power; ``sticky``: the one before, until another one brings more by ``hysteresis_db``; ``agent``: that of
+    which the agent chose beams, which may be one only; where it chose none, the one before."""
+    hysteresis_db: Annotated[float, quantity("dB", "that another transmitter has to be better by", ge=0)] = (
+        3.0
+    )
+    """Of ``sticky``."""
+    handover_slots: Annotated[int, quantity("1", "without service after a handover", ge=0, le=10**6)] = 0
+    """A handover is a change of the transmitter; packets stay in the buffer."""
     average_slots: Annotated[float, quantity("slot", "that the average of fairness forgets in", ge=1)] = 100.0
     """Of ``proportional-fair``."""
 

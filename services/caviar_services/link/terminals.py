@@ -32,6 +32,8 @@ class TerminalState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     buffers: dict[str, Packed]
     turns: Packed
     turn: int
+    servers: tuple[str, ...]
+    lost: Packed
     average: Packed
 
 
@@ -62,6 +64,10 @@ class Terminals:
         """Turn in which each was served last; −1: never."""
         self.turn = 0
         """Number of the next turn."""
+        self.servers: tuple[str, ...] = ("",) * len(self.names)
+        """Name of the transmitter that served each in the last frame; empty: none yet."""
+        self.lost: Int64Array = np.zeros(len(self.names), np.int64)
+        """Slots that each has still to wait, after its transmitter changed."""
         self.average: Float64Array = np.zeros(len(self.names))
         """Bits a slot that each was served, on average over the last slots."""
         # Arrivals of a block of frames: number of the block, seeds, and packets, Shape [block slots, T].
@@ -85,8 +91,25 @@ class Terminals:
         kept = sources >= 0
         made.turns[kept] = self.turns[sources[kept]]
         made.turn = self.turn
+        made.lost[kept] = self.lost[sources[kept]]
+        made.servers = tuple(self.servers[source] if source >= 0 else "" for source in sources.tolist())
         made.average[kept] = self.average[sources[kept]]
         return made, left
+
+    def serve_by(self, servers: Sequence[str]) -> BoolArray:
+        """Note the transmitters that serve in this frame.
+
+        Args:
+            servers: Name of that of each terminal.
+
+        Returns:
+            Which were served by another one before, Shape ``[T]``.
+        """
+        before, self.servers = self.servers, tuple(servers)
+        if before == self.servers:
+            return np.zeros(len(servers), np.bool_)
+        changed = [old not in ("", new) for old, new in zip(before, self.servers, strict=True)]
+        return np.array(changed, np.bool_)
 
     def arrivals(self, frame: Frame, number: int) -> Int64Array:
         """Packets that arrive in the slots of a frame; none for terminals that always have something to send.
@@ -129,6 +152,8 @@ class Terminals:
             buffers={name: Packed.of(array, "<i8") for name, array in self.buffers.state().items()},
             turns=Packed.of(self.turns, "<i8"),
             turn=self.turn,
+            servers=self.servers,
+            lost=Packed.of(self.lost, "<i8"),
             average=Packed.of(self.average, "<f8"),
         )
 
@@ -145,6 +170,8 @@ class Terminals:
         made.buffers.restore({name: packed.array(np.int64) for name, packed in state.buffers.items()})
         made.turns = state.turns.array(np.int64)
         made.turn = state.turn
+        made.servers = state.servers
+        made.lost = state.lost.array(np.int64)
         made.average = state.average.array(np.float64)
         return made
 
