@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -319,7 +320,7 @@ def test_a_receiver_changes_its_transmitter_by_rule(rule: dict[str, Any], expect
     results = [link.step(two_cells(n, snr, "bs", "other")) for n, snr in enumerate(COURSE)]
     links = [result.products["link"] for result in results]
     assert servers(links) == expected
-    changes = [a != b for a, b in zip(expected, expected[1:], strict=False)]
+    changes = [a != b for a, b in pairwise(expected)]
     assert [result.counts.get("handovers", 0) for result in results] == [0, *changes]
 
 
