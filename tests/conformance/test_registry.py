@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -25,6 +26,7 @@ EXTRAS = {
     "world:flight": "sionna",
     "channel:sionna-rt": "sionna",
     "sensors:lidar": "mitsuba",
+    "agent:policy": "onnx",
 }
 """Package without which an implementation cannot run; a base install skips it."""
 
@@ -49,6 +51,10 @@ FOLLOWING: dict[str, dict[str, object]] = {
 """With these settings a frame needs those before it."""
 
 
+# Of files that settings name; removed when the process ends.
+_FOLDER = TemporaryDirectory(prefix="caviar-registry-")
+
+
 def _example(role: str, name: str) -> tuple[Scenario, str] | None:
     """The first shipped scenario with this implementation, and the service's name there."""
     for path in sorted(SCENARIOS.glob("*.toml")):
@@ -59,10 +65,33 @@ def _example(role: str, name: str) -> tuple[Scenario, str] | None:
     return None
 
 
+def _first_beams() -> Path:
+    """A policy that chooses the first pair of beams for each user, whatever their number."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    file = Path(_FOLDER.name) / "first-beams.onnx"
+    nodes = [
+        helper.make_node("Sub", ["aod", "aod"], ["zeros"]),
+        helper.make_node("Cast", ["zeros"], ["action"], to=TensorProto.INT64),
+    ]
+    seen = helper.make_tensor_value_info("aod", TensorProto.FLOAT, [1, None])
+    chosen = helper.make_tensor_value_info("action", TensorProto.INT64, [1, None])
+    model = helper.make_model(
+        helper.make_graph(nodes, "first-beams", [seen], [chosen]),
+        opset_imports=[helper.make_opsetid("", 17)],
+        ir_version=8,
+    )
+    onnx.save(model, str(file))
+    return file
+
+
 def _tests_of(key: str) -> type[ServiceConformance]:
     role, _, name = key.partition(":")
     members: dict[str, object] = {"service_class": load(role, name), "__module__": __name__}
     example = _example(role, name)
+    if key == "agent:policy" and importlib.util.find_spec("onnx") is not None:
+        members["settings"] = {"file": f"file:{_first_beams()}", "observe": ["aod"]}
     if example is not None:
         scenario, service = example
         members["settings"] = {**scenario.services[service].settings, **OVERRIDES.get(key, {})}
