@@ -123,7 +123,7 @@ class Router:
                 self.close()
                 remedy = "end what uses that port, or choose" if error.errno == zmq.EADDRINUSE else "choose"
                 raise RunError(
-                    f"cannot listen on {candidate}: {error.strerror}; {remedy} another "
+                    f"cannot listen on {candidate}: {zmq.strerror(error.errno or 0)}; {remedy} another "
                     "with --bind tcp://127.0.0.1:PORT (0: any free one)"
                 ) from error
             return

@@ -25,7 +25,7 @@ from typing import Any, get_args
 
 import msgspec
 
-from caviar_protocol.errors import DeclarationError
+from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
 from caviar_services.service import NoSettings, Service
@@ -102,16 +102,24 @@ def load(role: str, name: str) -> type[Service[Any]]:
     target = name if ":" in name else _registered_target(role, name)
     module_name, _, class_name = target.partition(":")
     try:
-        cls = getattr(import_module(module_name), class_name)
+        module = import_module(module_name)
+        cls = getattr(module, class_name, None)
     except Exception as error:  # whatever a module that is not ours does when it is imported
         known = isinstance(error, ImportError | AttributeError)
         text = str(error) if known else f"{type(error).__name__}: {error}"
-        if isinstance(error, ModuleNotFoundError) and error.name == module_name.partition(".")[0]:
+        if module_name.endswith(".py"):
+            text = f"a module is named without .py: {module_name.removesuffix('.py')}:{class_name}"
+        elif isinstance(error, ModuleNotFoundError) and error.name == module_name.partition(".")[0]:
             text += (
                 "; modules are looked for beside the scenario, in the current folder, among what is "
                 "installed and in PYTHONPATH"
             )
         raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {text}") from error
+    if cls is None:
+        classes = [key for key, value in vars(module).items() if _is_of_role(value, role)]
+        found = suggestion(class_name, classes) if classes else f"it has no class of role {role!r}"
+        place = getattr(module, "__file__", None) or module_name
+        raise DeclarationError(f"{role} {name!r}: {place} has no attribute {class_name!r}; {found}")
     if not (isinstance(cls, type) and issubclass(cls, Service)):
         raise DeclarationError(f"{role} {name!r} is {target}, which is not a Service")
     declared = getattr(cls, "role", None)
@@ -133,6 +141,12 @@ def load(role: str, name: str) -> type[Service[Any]]:
                 f"subclass of {inherited.__name__}, that of {base.__name__}"
             )
     return cls
+
+
+def _is_of_role(value: object, role: str) -> bool:
+    if not (isinstance(value, type) and issubclass(value, Service)) or inspect.isabstract(value):
+        return False
+    return getattr(value, "role", None) == role
 
 
 def registered_names(role: str) -> tuple[str, ...]:
@@ -169,7 +183,11 @@ def _registered_target(role: str, name: str) -> str:
         names = registered_names(role)
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise DeclarationError(f"no {role} is named {name!r}; {hint}known: {', '.join(names)}")
+        text = f"no {role} is named {name!r}; {hint}known: {', '.join(names)}"
+        if not near:
+            module, _, cls = name.rpartition(".")
+            text += f"; a class of your own is named {module or name}:{cls if module else 'CLASS'}"
+        raise DeclarationError(text)
     return target
 
 

@@ -13,7 +13,7 @@ from security_harness import Ring, pair, ring
 from zmq.utils.monitor import recv_monitor_message
 
 from caviar_broker.router import Router
-from caviar_broker.security.access import Access, answer, is_local
+from caviar_broker.security.access import Access, answer, check_bind, is_local
 from caviar_protocol import keys as k
 from caviar_protocol import messages as m
 from caviar_protocol.errors import CaviarError, RunError, SetupError
@@ -248,6 +248,25 @@ def test_an_address_open_to_others_is_refused_without_keys_and_taken_with_them(
         Router(endpoint, 1500 * MS)
     port = Router(endpoint, 1500 * MS, keys.access())
     port.close()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("tcp://127.0.0.1", "has no port; write it as tcp://127.0.0.1:PORT"),
+        ("tcp://[::1]", "has no port"),
+        ("tcp://127.0.0.1:99999", "has the port '99999'; .* with a port from 0 .* to 65535"),
+        ("tcp://127.0.0.1:http", "has the port 'http'"),
+        ("tcp://127.0.0.1:-1", "has the port '-1'"),
+        ("127.0.0.1:5570", "is no address to listen at; write it as tcp://127.0.0.1:5570"),
+    ],
+)
+def test_an_address_without_a_port_that_there_is_is_refused(endpoint: str, words: str) -> None:
+    """Of 99999 libzmq listened at 34463, and said nothing of it."""
+    with pytest.raises(RunError, match=words):
+        check_bind(endpoint, keys=False)
+    with pytest.raises(RunError, match=words):
+        check_bind(endpoint, keys=True)
 
 
 def test_a_service_connects_over_ipv6(tmp_path: Path) -> None:

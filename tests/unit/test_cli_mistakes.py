@@ -103,6 +103,21 @@ def test_an_http_address_that_is_taken_is_refused_before_the_run(tmp_path: Path)
         HttpProcess(tmp_path, address, None, again=True)  # the process of the broker before may still end
 
 
+def test_a_port_that_is_taken_leaves_no_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        assert caviar(monkeypatch, "run", SMOKE, "--frames", "2", "--out", tmp_path, "--bind", bind) == 1
+        assert caviar(monkeypatch, "conform", "--listen", bind) == 1
+    out, err = capsys.readouterr()
+    assert "no frame was simulated" in out
+    assert list(tmp_path.iterdir()) == []
+    for option in ("--bind tcp://127.0.0.1:PORT", "--listen"):
+        remedy = f"end what uses that port, or choose another with {option} (0: any free"
+        assert f"Address already in use; {remedy}" in err
+
+
 def test_an_embedded_run_is_not_resumed_and_says_why(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -287,6 +287,36 @@ def test_broken_toml_is_named_with_its_line(text: str, line: int) -> None:
     assert caught.value.line in (line, line - 1, line + 1)
 
 
+@pytest.mark.parametrize(
+    ("line", "remedy"),
+    [
+        (
+            "frequency_hz = 28GHz  # mmWave",
+            "; a number has no unit: the key's name says it, and 28 GHz is 28e9",
+        ),
+        ("budget_ms = 20 ms", "; a number has no unit: the key's name says it, and 28 GHz is 28e9"),
+        ("use = los-beam", '; a text is quoted: "los-beam", and yes and no are true and false'),
+        ("frames 100", ""),
+        ("x = [1, 2", ""),
+    ],
+)
+def test_a_line_that_is_no_toml_is_shown_with_what_to_write(line: str, remedy: str) -> None:
+    with pytest.raises(ScenarioError, match="not TOML") as caught:
+        parse(f"[run]\n{line}\n")
+    assert caught.value.line in (2, 3)
+    if caught.value.line == 2:
+        assert f": {line}{remedy}" in str(caught.value)
+        assert str(caught.value).endswith(line + remedy)
+    else:
+        assert not remedy
+
+
+def test_a_table_that_is_misspelt_is_named_before_what_it_leaves_out(folder: Path) -> None:
+    """`[services.channel]` is missing then, and `[services.channel.settings]` lacks a role: neither is it."""
+    error = failure(GOOD.replace("[services.channel]", "[service.channel]"), folder)
+    assert "unknown key 'service'; did you mean 'services'?" in str(error)
+
+
 def test_a_file_that_is_not_text_is_named_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "latin.toml"
     path.write_bytes(b"[run]\nname = '\xe9'\n")
@@ -298,6 +328,17 @@ def test_a_missing_scenario_names_those_beside_it(folder: Path) -> None:
     (folder / "smoke.toml").write_text(GOOD)
     with pytest.raises(ScenarioError, match=r"smok\.toml: cannot be read: No such file.*has smoke\.toml"):
         load_scenario(folder / "smok.toml")
+    with pytest.raises(ScenarioError, match=r"No such file or directory; did you mean .*/smoke\.toml\?"):
+        load_scenario(folder / "smok.toml")
+    with pytest.raises(ScenarioError, match=r"No such file or directory; there is no folder .*/nowhere"):
+        load_scenario(folder / "nowhere" / "mine.toml")
+
+
+def test_a_name_of_an_own_scenario_is_found_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "crossing.toml").write_text(GOOD)
+    with pytest.raises(ScenarioError, match=r"did you mean 'crossing\.toml'\?"):
+        load_scenario("crosing")
 
 
 def test_a_folder_in_place_of_a_scenario_names_those_in_it(folder: Path) -> None:

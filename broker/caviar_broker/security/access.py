@@ -68,8 +68,17 @@ def check_bind(endpoint: str, keys: bool) -> None:
         Traceback (most recent call last):
         RunError: tcp://0.0.0.0:5570 can be reached from other machines
     """
-    if "://" not in endpoint:
+    transport, separator, place = endpoint.partition("://")
+    if not separator:
         raise RunError(f"{endpoint!r} is no address to listen at; write it as tcp://127.0.0.1:5570")
+    host, _, port = place.rpartition(":")
+    # Of a larger number libzmq takes the lower 16 bits, which is another port.
+    if transport == "tcp" and not (port == "*" or (port.isdecimal() and int(port) < 1 << 16)):
+        wrong = f"has the port {port!r}" if host and not place.endswith("]") else "has no port"
+        raise RunError(
+            f"{endpoint!r} {wrong}; write it as tcp://127.0.0.1:PORT, with a port from 0 (any free one) "
+            "to 65535"
+        )
     if keys or is_local(endpoint):
         return
     raise RunError(

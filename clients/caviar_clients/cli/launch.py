@@ -167,6 +167,8 @@ class Launcher:
     pace: str | None = None
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
+    refused: bool = False
+    """Whether the broker ended before it listened, with an error that says why."""
     _key: BorrowedKey = field(init=False)
     # Where the socket file of the broker is; None where it listens elsewhere.
     _socket_folder: PrivateFolder | None = None
@@ -444,6 +446,7 @@ class Launcher:
             log = self._log.read_text(errors="replace").strip()
             last = self._verdict or (log.splitlines()[-1] if log else _describe_exit(status))
             own = last.startswith("caviar broker: ")  # its own error, and no crash
+            self.refused = own and not self.endpoint
             raise RunError(last.removeprefix("caviar broker: ") if own else f"the broker died: {last}")
         return {"event": "ended", "status": status}
 

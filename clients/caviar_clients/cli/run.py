@@ -315,6 +315,10 @@ def _follow(
         text = "ended at once, without a summary; what was recorded until then is in"
         print_line(console, f"{text} {directory}", "red")
         raise
+    except RunError:
+        if new and isinstance(launcher, Launcher) and launcher.refused:
+            _remove_without_frames(directory, console)
+        raise
     if outcome.get("disk"):  # the disk does not answer: whatever is read or written there would wait, too
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
@@ -334,10 +338,14 @@ def _follow(
             print_line(console, f"its log: {log}")
     _write_summary(summary, directory, json_file)  # last: a disk that is full leaves the screen
     if new and interrupted.came and not outcome["frames"]:
-        shutil.rmtree(directory, ignore_errors=True)
-        print_line(console, f"no frame was simulated; {directory} is removed")
+        _remove_without_frames(directory, console)
     status = 130 if interrupted.came else 1 if outcome["error"] else 0
     return RunOutcome(directory, status, outcome["error"])
+
+
+def _remove_without_frames(directory: Path, console: Console) -> None:
+    shutil.rmtree(directory, ignore_errors=True)
+    print_line(console, f"no frame was simulated; {directory} is removed")
 
 
 def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path | None) -> None:

@@ -158,8 +158,11 @@ class Wire:
             self._socket.bind(endpoint.removesuffix(":0") + ":*" if endpoint.endswith(":0") else endpoint)
         except zmq.ZMQError as error:
             self.close()
+            remedy = "an address is like tcp://127.0.0.1:5590"
+            if error.errno == zmq.EADDRINUSE:
+                remedy = "end what uses that port, or choose another with --listen (0: any free one)"
             raise RunError(
-                f"cannot listen at {endpoint!r}: {error.strerror}; an address is like tcp://127.0.0.1:5590"
+                f"cannot listen at {endpoint!r}: {zmq.strerror(error.errno or 0)}; {remedy}"
             ) from error
         self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 

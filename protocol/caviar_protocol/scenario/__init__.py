@@ -44,6 +44,8 @@ from caviar_protocol.scenario.toml import MAX_SIZE, dotted, key_lines, parse_tom
 from caviar_protocol.topics.channel import Carrier
 
 # [Hz]; beyond, numbers of noise powers and of taps overflow.
+SHOWN = 80
+"""Letters of a line that an error shows."""
 _BANDWIDTHS_HZ = (1.0, 1e12)
 FILE = "file:"
 """Before a path that is relative to the folder of the scenario."""
@@ -170,7 +172,22 @@ def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> Scena
     message, line, column = found.groups()
     if line is None:
         return ScenarioError(f"not TOML: {message}, at the end of the file", file, line=text.count("\n") + 1)
-    return ScenarioError(f"not TOML: {message}, at column {column}", file, line=int(line))
+    written = text.split("\n")[int(line) - 1].strip()
+    shown = f"not TOML: {message}, at column {column}: {written[:SHOWN]}{_toml_remedy(written)}"
+    return ScenarioError(shown, file, line=int(line))
+
+
+def _toml_remedy(line: str) -> str:
+    """What is mostly wrong with a line that is no TOML; empty where that is not clear."""
+    _, equals, value = line.partition("=")
+    value = value.partition("#")[0].strip()
+    if not equals:
+        return ""
+    if re.fullmatch(r"[-+]?[\d_.]+(e[-+]?\d+)?\s*[A-Za-zµ%°/]+", value, re.IGNORECASE):
+        return "; a number has no unit: the key's name says it, and 28 GHz is 28e9"
+    if re.fullmatch(r"[A-Za-z_][^\"'\[\]{}]*", value):
+        return f'; a text is quoted: "{value}", and yes and no are true and false'
+    return ""
 
 
 def _beside(path: Path) -> str:
@@ -184,13 +201,18 @@ def _beside(path: Path) -> str:
     if not path.exists() and path.stem in shipped and path.suffix in ("", ".toml"):
         return f"; the scenario that ships is called by its name: {path.stem}"
     if path.name == str(path) and not path.suffix:
-        close = difflib.get_close_matches(path.name, shipped, n=1)
-        meant = f"; did you mean {close[0]!r}?" if close else ""
+        own = {other.stem: other.name for other in Path().glob("*.toml")}
+        close = difflib.get_close_matches(path.name, [*own, *shipped], n=1)
+        meant = f"; did you mean {own.get(close[0], close[0])!r}?" if close else ""
         return f"{meant}; scenarios that ship: {', '.join(shipped)}"
     if not path.parent.is_dir():
-        return ""
+        return f"; there is no folder {path.parent}"
     names = sorted(other.name for other in path.parent.glob("*.toml"))
-    return f"; {path.parent.resolve()} has {', '.join(names)}" if names and not path.is_file() else ""
+    if not names or path.is_file():
+        return ""
+    close = difflib.get_close_matches(path.name, names, n=1)
+    meant = f"; did you mean {path.with_name(close[0])}?" if close else ""
+    return f"{meant}; {path.parent.resolve()} has {', '.join(names)}"
 
 
 def _in_folder(folder: Path) -> str:

@@ -216,12 +216,14 @@ def _check_struct(value: object, expected: inspect.StructType, place: Place) -> 
     known = [name for name in fields if name not in hidden]
     if expected.tag_field is not None:
         known.append(expected.tag_field)
-    for name, item in table.items():
+    # Before what is below any of them: a table that is misspelt leaves gaps elsewhere, which are none.
+    for name in table:
         if name not in known:
             hint = getattr(expected.cls, "unknown_key_hint", "")
             raise place.at(name).error(
                 f"unknown key {name!r}; {suggestion(name, known)}" + (f" ({hint})" if hint else "")
             )
+    for name, item in table.items():
         if name in fields:
             _check(item, fields[name].type, place.at(name))
     for name, field in fields.items():
