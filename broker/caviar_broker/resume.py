@@ -1,4 +1,11 @@
-"""What the journal of a run says that a broker needs to resume it (contract, clause 18)."""
+"""What the journal says that a broker needs to resume a run, after ``kill -9`` too (contract, clause 18).
+
+1. `launch` finds the directory of a run that did not end, and calls `read_resumption`.
+2. `journal_format.JournalReader` reads the journal's entries, up to the first one that is damaged.
+3. `read_resumption` makes a `Resumption` of them, with the states that `journal.CheckpointFiles` kept.
+4. `core.checkpoints` gives services their states back, and `core.dispatch` goes on after the last finished
+   frame.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Random generators and seeds: one for each purpose, independent of process and order (clause 19)."""
+"""Random generators and seeds of runs, episodes and frames: one for each purpose, independent of process and
+order (clause 19)."""
 
 from __future__ import annotations
 

@@ -347,7 +347,8 @@ class DecisionTable:
             self._renew(products.values(), task.journal)
 
     def decide_without_answer(self, task: Task, cause: str, outcome: str, now: int) -> None:
-        """Decide for a service (clause 9): under hold its newest earlier product, where there is one."""
+        """Decide for a late service (clause 9): its newest earlier product is held under the policy ``hold``,
+        where there is one; else the product is absent."""
         decisions = {}
         for topic in self._due_topics(task):
             held = self._newest.get((task.service, topic))

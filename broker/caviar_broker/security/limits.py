@@ -73,7 +73,8 @@ CHATTER = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class PeerLimits:
-    """Limits of a peer; far more than any service of a run needs, unless a scenario's ``[limits]`` differ."""
+    """Limits of a peer: of its memory, messages and connections. Far more than any service of a run needs,
+    unless a scenario's ``[limits]`` differ; ``waiting_mib`` there is the memory limit `queued`."""
 
     connections: int = 4096
     """Open connections in all; at most half the descriptors that this process may have."""

@@ -1,6 +1,8 @@
 """Base of the agents that select beams: the users they serve, and what they consume.
 
-Some command more than beams, the motion of an object for instance (`Agent.other_actuators`).
+To add an agent, subclass `Agent`, implement `Agent.choose`, and name the class in a scenario as
+``use = "module:Class"``, or in the registry. Some command more than beams, the motion of an object for
+instance (`Agent.other_actuators`).
 """
 
 from __future__ import annotations

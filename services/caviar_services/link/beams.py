@@ -114,7 +114,7 @@ class SweepingLink(LinkModel[B]):
         }
 
     def fields(self, scored: Scored, reward_kind: str) -> dict[str, Any]:
-        """Fields of `Link` that follow from the sweep.
+        """Fields of `Link` that follow from the sweep: |y|, SNR, spectral efficiency, bit rate, reward.
 
         Args:
             scored: The frame.

@@ -1,1 +1,2 @@
-"""Fields along paths in float64: image method, diffraction (UTD), atmosphere, antenna patterns."""
+"""Fields along paths in float64: image method, diffraction (UTD), Doppler shifts and delays (`geometry`),
+atmosphere, antenna patterns."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from recording_builders import frame, link, product, record, with_packets
 
-from caviar_clients.plots.traffic import POINTS, draw_traffic, packet_series
+from caviar_clients.plots.packets import POINTS, draw_traffic, packet_series
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Link
 
