@@ -11,9 +11,9 @@ import numpy as np
 
 from caviar_clients.files import make_folder_of, require_folder
 from caviar_clients.plots.map import MapData, draw_map
+from caviar_clients.plots.packets import draw_traffic, packet_series
 from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
-from caviar_clients.plots.packets import draw_traffic, packet_series
 from caviar_clients.plots.user_curves import (
     choose_user,
     draw_dispersion,
