@@ -71,38 +71,47 @@ def steering_vector(array: AntennaArray, directions: Float64Array) -> Complex128
         >>> steering_vector(AntennaArray(rows=1, columns=2), to_the_left).round(6).imag.tolist()
         [-1.0, 1.0]
     """
+    return element_phases(array, directions[..., 1], directions[..., 2])
+
+
+def element_phases(array: AntennaArray, y: Float64Array, z: Float64Array) -> Complex128Array:
+    """Compute a `steering_vector` of direction cosines.
+
+    Args:
+        array: A uniform array.
+        y: Cosines along its columns, Shape ``[...]``.
+        z: Cosines along its rows, Shape ``[...]``; not looked at with a single row.
+
+    Returns:
+        Shape ``[..., N]``, each of magnitude 1.
+    """
     if array.size == 1:
-        return np.ones((*directions.shape[:-1], 1), np.complex128)
+        return np.ones((*y.shape, 1), np.complex128)
     # k̂·r separates, so rows + columns exponentials do instead of rows · columns.
-    columns = _progression(directions[..., 1], array.columns, array.horizontal_spacing)
+    columns = _progression(y, array.columns, array.horizontal_spacing)
     if array.rows == 1:
         return columns
-    rows = _progression(directions[..., 2], array.rows, -array.vertical_spacing)  # from +z to −z
-    vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(
-        *directions.shape[:-1], array.size
-    )
+    rows = _progression(z, array.rows, -array.vertical_spacing)  # from +z to −z
+    vector: Complex128Array = (columns[..., :, None] * rows[..., None, :]).reshape(*y.shape, array.size)
     return vector
 
 
-FIRST = 16
-"""Elements along an axis whose phases are exponentials; from there on their number is doubled by one product,
-which costs a twentieth of an exponential."""
+FINE = 8
+"""Elements of a group along an axis of more than twice as many: a phase is that of the group times that
+within it, and a product costs a tenth of an exponential."""
 
 
 def _progression(cosines: Float64Array, size: int, spacing: float) -> Complex128Array:
     """Phases of elements along one axis, centred, with these direction cosines, Shape ``[...]`` to
     ``[..., size]``."""
-    exponents, begins = _anchors(size, spacing)
-    known = np.exp(cosines[..., None] * exponents)
-    if not begins:
+    exponents, groups = _anchors(size, spacing)
+    known: Complex128Array = np.exp(cosines[..., None] * exponents)
+    if not groups:
         return known
-    found = np.empty((*cosines.shape, size), np.complex128)
-    found[..., :FIRST] = known[..., :FIRST]
-    for number, begin in enumerate(begins):
-        count = min(begin, size - begin)
-        turn = known[..., FIRST + number, None]
-        np.multiply(found[..., :count], turn, out=found[..., begin : begin + count])
-    return found
+    found: Complex128Array = (known[..., :groups, None] * known[..., None, groups:]).reshape(
+        *cosines.shape, groups * FINE
+    )
+    return found if groups * FINE == size else found[..., :size]
 
 
 # A scenario has few arrays, and each frame asks for them for every path.
@@ -119,16 +128,13 @@ def _grid(array: AntennaArray) -> tuple[Float64Array, Float64Array]:
 
 
 @lru_cache(maxsize=256)
-def _anchors(size: int, spacing: float) -> tuple[Complex128Array, tuple[int, ...]]:
-    """j2π times the places [wavelengths] of the first elements, then those of the steps that double them, and
-    the elements at which these begin."""
-    places = (np.arange(min(size, FIRST)) - (size - 1) / 2) * spacing
-    begins, begin = [], FIRST
-    while begin < size:
-        begins.append(begin)
-        begin *= 2
-    steps = np.array(begins, np.float64) * spacing
-    return np.multiply(2j * np.pi, np.concatenate([places, steps]), dtype=np.complex128), tuple(begins)
+def _anchors(size: int, spacing: float) -> tuple[Complex128Array, int]:
+    """j2π times places [wavelengths]: of the groups, relative to the first one, and of its elements; and the
+    number of groups. Of a short axis those of all elements, and 0."""
+    groups = -(-size // FINE) if size > 2 * FINE else 0
+    places = (np.arange(FINE if groups else size) - (size - 1) / 2) * spacing
+    steps = np.arange(groups) * (FINE * spacing)
+    return np.multiply(2j * np.pi, np.concatenate([steps, places]), dtype=np.complex128), groups
 
 
 def dft_codebook(array: AntennaArray) -> Complex128Array:

@@ -326,8 +326,10 @@ def choices_of(frame: Frame, users: Users) -> Choices:
 def _commands(frame: Frame) -> Iterator[tuple[GrantInput, object]]:
     """Each command, with the provenance of its action, agents in sorted order."""
     # Sorted, so that an error of two agents names the same one as the first in every run.
-    actions = [item for item in frame if item.provenance.topic == "action" and item.present]
-    for item in sorted(actions, key=lambda entry: entry.provenance.source):
+    actions = [item for item in frame.inputs if item.provenance.topic == "action" and item.present]
+    if len(actions) > 1:
+        actions.sort(key=lambda entry: entry.provenance.source)
+    for item in actions:
         for command in cast(Action, item.payload).commands:
             yield item.provenance, command
 

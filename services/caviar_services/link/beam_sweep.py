@@ -14,6 +14,7 @@ with the phases r_p and t_p of the elements on path p: two numbers a path instea
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import lru_cache
@@ -72,19 +73,40 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
     """
     # Elements are numbered panel by panel, column by column (`antenna_arrays.element_positions`): so the axes
     # of the grid come out of a reshape, and the transform of one axis after the other is that of all.
-    leading = h.shape[:-2]
-    grids = (rx.size // (rx.columns * rx.rows), rx.columns, rx.rows)
-    elements = h.reshape(*leading, *grids, tx.size // (tx.columns * tx.rows), tx.columns, tx.rows)
-    y = elements
-    for axis in (-5, -4, -2, -1):
-        size = elements.shape[axis]
+    leading, grid = h.shape[:-2], _grid(tx, rx)
+    y = h.reshape(*leading, *grid.shape)
+    for axis, size in grid.axes:
         if size > SMALL:
-            y = np.fft.fft(y, axis=axis, norm="ortho")
-        elif size > 1:
+            y = np.fft.fft(y, axis=axis)
+        else:
             y = (y.swapaxes(axis, -1) @ _fourier(size)).swapaxes(axis, -1)
-    y = y.reshape(*leading, rx.size, tx.size)
-    magnitude: Float64Array = np.abs(y.swapaxes(-1, -2))
+    magnitude: Float64Array = np.abs(y.reshape(*leading, rx.size, tx.size).swapaxes(-1, -2))
+    if grid.scale != 1.0:
+        magnitude *= grid.scale
     return magnitude
+
+
+class _Grid(NamedTuple):
+    """How H is transformed."""
+
+    shape: tuple[int, ...]
+    """By panels, columns and rows of RX, then of TX, without those that are 1."""
+    axes: tuple[tuple[int, int], ...]
+    """Axes of it, from the last one on, and their sizes, of columns and rows."""
+    scale: float
+    """What the fast transforms among them lack to be unitary."""
+
+
+@lru_cache(maxsize=256)
+def _grid(tx: AntennaArray, rx: AntennaArray) -> _Grid:
+    sizes: list[tuple[int, bool]] = []
+    for array in (rx, tx):
+        panels = array.size // (array.columns * array.rows)
+        sizes += [(panels, False), (array.columns, True), (array.rows, True)]
+    kept = [(size, transformed) for size, transformed in sizes if size > 1]
+    axes = [(n - len(kept), size) for n, (size, transformed) in enumerate(kept) if transformed]
+    scale = math.prod(1 / math.sqrt(size) for _, size in axes if size > SMALL)
+    return _Grid(tuple(size for size, _ in kept), tuple(axes), scale)
 
 
 @lru_cache(maxsize=SMALL)
@@ -166,7 +188,8 @@ def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept
     swept = []
     for found in groups.values():
         first = users[found[0]]
-        swept.append(Swept(found, sweep(np.array([h[u] for u in found]), first.tx.array, first.rx.array)))
+        stacked = np.array([h[u] for u in found])
+        swept.append(Swept(found, sweep(stacked, first.tx.array, first.rx.array)))
     return swept
 
 

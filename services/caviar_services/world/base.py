@@ -65,6 +65,7 @@ class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 W = TypeVar("W", bound=WorldSettings)
+_Listed = tuple[list[tuple[str, str]], tuple[str, ...], tuple[str, ...], tuple[str, ...]]
 
 
 class World(Service[W]):
@@ -116,6 +117,8 @@ class World(Service[W]):
         super().__init__(settings, run)
         self._mounts = Mounts(run.devices)
         self._t0_ns = 0
+        # Names and classes of the objects of the last frame; their names, classes and assets as published.
+        self._listed: _Listed = ([], (), (), ())
 
     @classmethod
     def placements(cls, settings: W) -> Iterable[tuple[str, str, Sequence[Vector]]]:
@@ -243,17 +246,16 @@ class World(Service[W]):
         # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
         states = sorted(states)
-        # Sorted, so neighbours: consumers look objects up by name, and would take one of the two.
-        names = tuple(state.name for state in states)
-        if len(set(names)) < len(names):
-            twice = next(name for name, following in pairwise(names) if name == following)
-            raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
-        meshes = set(self.mesh_classes())
+        listed = [(state.name, state.kind) for state in states]
+        # Objects hardly ever come and go: what follows from names and classes alone is kept.
+        if listed != self._listed[0]:
+            self._listed = listed, *self._described(listed)
+        _, names, classes, assets = self._listed
         position, orientation, velocity, dimensions = _tables(states)
         return Scene(
             names=names,
-            classes=tuple(state.kind for state in states),
-            assets=tuple(f"objects/{s.kind}.ply" if s.kind in meshes else "" for s in states),
+            classes=classes,
+            assets=assets,
             position=position,
             orientation=orientation,
             velocity=velocity,
@@ -261,6 +263,19 @@ class World(Service[W]):
             devices=devices,
             angular_velocity=_turning(states),
         )
+
+    def _described(
+        self, listed: Sequence[tuple[str, str]]
+    ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+        """Names, classes and assets of objects by name and class, sorted."""
+        # Sorted, so neighbours: consumers look objects up by name, and would take one of the two.
+        names = tuple(name for name, _ in listed)
+        if len(set(names)) < len(names):
+            twice = next(name for name, following in pairwise(names) if name == following)
+            raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
+        meshes = set(self.mesh_classes())
+        assets = tuple(f"objects/{kind}.ply" if kind in meshes else "" for _, kind in listed)
+        return names, tuple(kind for _, kind in listed), assets
 
 
 def _may_begin(on: str, prefix: str) -> bool:

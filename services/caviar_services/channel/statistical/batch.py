@@ -63,15 +63,15 @@ class GeometricBatch(ChannelBatch):
         model, tx, rx = self._model, lines[0].tx, lines[0].rx
         made = model.components(self._drawn(tx.name, rx.name, number, len(lines)), free)
         phase = np.array([line.phase for line in lines])[..., None]
-        parts = times((made.amplitude[..., 0], made.amplitude[..., 1]), (phase.real, phase.imag))
+        parts = times((made.amplitude[..., 0], made.amplitude[..., 1]), (phase[:, :, 0], phase[:, :, 1]))
         amplitude = np.empty(parts[0].shape, np.complex128)
         amplitude.real, amplitude.imag = parts
         turn = np.moveaxis(made.turn, -1, 0)
         outwards, inwards = ([getattr(line, end) for line in lines] for end in ("outwards", "inwards"))
-        departures = _local(outwards, turn[..., 0], [line.tx_pose for line in lines])
+        departures = _local(outwards, turn[:4], [line.tx_pose for line in lines])
         arrivals: Float64Array | None = None
         if rx.array.size > 1 or model.has_path_gain:
-            arrivals = _local(inwards, turn[..., 1], [line.rx_pose for line in lines])
+            arrivals = _local(inwards, turn[4:], [line.rx_pose for line in lines])
         if model.has_path_gain and arrivals is not None:
             patterns = model.pattern_gain(tx.array, departures, rx.array, arrivals)
             # Of two devices at one place there is no gain, and no path.

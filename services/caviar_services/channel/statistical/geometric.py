@@ -30,10 +30,9 @@ Waves have no polarization: arrays of dual polarization, and of several panels, 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
-from itertools import pairwise
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,7 +52,6 @@ from caviar_protocol.seeding import generator
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
-from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.arrays.channel_matrices import (
     Bins,
     Wideband,
@@ -121,6 +119,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         self._obstacles = Boxes.aligned([(box.minimum_m, box.maximum_m) for box in settings.obstacles])
         self._drawn: dict[tuple[str, str], _Drawn] = {}
         self._block = 0
+        self._ends: _Ends | None = None
+        self._constants: dict[tuple[tuple[bool, ...], tuple[bool, ...], int], _Constant] = {}
         self.has_path_gain = settings.normalization != "unit"
         """Whether amplitudes follow from distance, carrier and element patterns."""
         self._nearest = float((SPEED_OF_LIGHT / self._frequency).max()) if self.has_path_gain else 0.0
@@ -156,17 +156,16 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         transmitters: Sequence[AntennaDevice],
         receivers: Sequence[AntennaDevice],
     ) -> Modelled:
-        for device in (*transmitters, *receivers):
-            if not device.array.is_uniform:
-                raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
+        # Lists of devices are those of the frame before as long as devices neither come nor go.
+        if self._ends is None or self._ends[:2] != (transmitters, receivers):
+            self._ends = _Ends.of(transmitters, receivers)
         sight = self.sight(scene, transmitters, receivers)
-        waves, offsets = Waves(len(self._frequencies)), [0]
+        waves = Waves(len(self._frequencies))
         for line, free, near in zip(*sight, strict=True):
             if not near:
                 self._add(waves, frame, line, free)
-            offsets.append(len(waves.tau))
         too_close = sum(sight.near)
-        channel = self._channel(transmitters, receivers, waves, sight, offsets)
+        channel = self._channel(self._ends, waves, sight)
         return Modelled(channel=channel, counts={"too_close": too_close} if too_close else {})
 
     # --- the line of sight -----------------------------------------------------------------------
@@ -181,13 +180,14 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             transmitters: Antennas that send.
             receivers: Antennas that receive.
         """
-        poses = {device.name: device_pose(scene, device) for device in (*transmitters, *receivers)}
-        speeds = {device.name: velocity(scene, device) for device in (*transmitters, *receivers)}
+        sent, taken = (
+            [(device, device_pose(scene, device), velocity(scene, device)) for device in ends]
+            for ends in (transmitters, receivers)
+        )
         blocked, found = self._blocks(scene), Sight([], [], [])
-        for tx in transmitters:
-            for rx in receivers:
-                ends = poses[tx.name], poses[rx.name], speeds[tx.name], speeds[rx.name]
-                line = Line(tx, rx, *ends, self._frequencies)
+        for transmitter in sent:
+            for receiver in taken:
+                line = Line(transmitter, receiver, self._frequencies)
                 near = line.length == 0 or line.length < self._nearest
                 found.lines.append(line)
                 found.free.append(near or not blocked(line))
@@ -207,7 +207,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         # An antenna stands on its own vehicle, whose box must not block it.
 
         def hidden(pair: Line) -> bool:
-            ends = np.array([pair.start, pair.end])[:, None]
+            ends = np.array([pair.tx_pose.position, pair.rx_pose.position])[:, None]
             if self._obstacles.block(*ends).any():
                 return True
             carriers = (pair.tx.parent, pair.rx.parent)
@@ -220,9 +220,10 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     def _add(self, waves: Waves, frame: Frame, line: Line, free: bool) -> None:
         """Add the components of a pair."""
-        amplitude, excess, turns = self._rows(frame, line.tx.name, line.rx.name, free)
-        for late, (at_tx, at_rx) in zip(excess, turns, strict=True):
-            departure, arrival = turned(line.outwards, at_tx), turned(line.inwards, at_rx)
+        numbers, count = self._numbers(frame, line.tx.name, line.rx.name, free), self.settings.components
+        for late, at in zip(numbers[:count], range(count, count * 9, 8), strict=True):
+            departure = turned(line.outwards, numbers[at : at + 4])
+            arrival = turned(line.inwards, numbers[at + 4 : at + 8])
             waves.tau.append(line.delay + late)
             waves.departure.append(departure)
             waves.arrival.append(arrival)
@@ -230,11 +231,12 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             # frequency.
             approach = dot(line.velocity[0], departure) + dot(line.velocity[1], arrival)
             waves.doppler_ratio.append(approach / SPEED_OF_LIGHT)
-        for mine, phase, of_carrier in zip(waves.amplitude, line.phase, amplitude, strict=True):
-            parts = phase.real, phase.imag
-            mine += [complex(*times(a, parts)) for a in of_carrier]
-        waves.id += self._ids[free]
-        waves.length += [line.length] * len(excess)
+        at = count * 9
+        for mine, phase in zip(waves.amplitude, line.phase, strict=True):
+            mine += [complex(*times(numbers[n : n + 2], phase)) for n in range(at, at + 2 * count, 2)]
+            at += 2 * count
+        if self.has_path_gain:
+            waves.length += [line.length] * count
 
     def block_of(self, number: int) -> tuple[int, int]:
         """Find the block of draws that a frame is in, and its row there."""
@@ -263,8 +265,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         """Components of pairs; see `Components.of`."""
         return Components.of(draws, free, self._shares, self._frequency[:, 0])
 
-    def _rows(self, frame: Frame, tx: str, rx: str, free: bool) -> tuple[Any, Any, Any]:
-        """The fields of `Components` of a pair in a frame, as lists."""
+    def _numbers(self, frame: Frame, tx: str, rx: str, free: bool) -> list[float]:
+        """The components of a pair in a frame: excess delays, deviations, then amplitudes by carrier."""
         block, row = self.block_of(frame.number)
         if block != self._block or (self.draws_last and len(self._drawn) >= KEPT):
             # Pairs that have left go with it; the others draw the same again.
@@ -275,57 +277,64 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             drawn = self._drawn[tx, rx] = _Drawn(
                 self.draws(frame.seed, frame.seed_episode, (tx, rx), block), {}
             )
-        rows = drawn.rows.get(free)
-        if rows is None:
+        table = drawn.tables.get(free)
+        if table is None:
             made = self.components(drawn.draws, np.array(free))
-            rows = drawn.rows[free] = tuple(field.tolist() for field in made)
-        amplitude, excess, turn = rows
-        return amplitude[row], excess[row], turn[row]
+            fields = (made.excess, made.turn, made.amplitude)
+            # One row a frame: as lists, a block would be thousands of objects for the garbage collector.
+            table = np.concatenate([field.reshape(len(made.excess), -1) for field in fields], axis=1)
+            drawn.tables[free] = table
+        numbers: list[float] = table[row].tolist()
+        return numbers
 
     # --- the product -----------------------------------------------------------------------------------
 
-    def _channel(
-        self,
-        transmitters: Sequence[AntennaDevice],
-        receivers: Sequence[AntennaDevice],
-        waves: Waves,
-        sight: Sight,
-        offsets: list[int],
-    ) -> Channel:
+    def _channel(self, ends: _Ends, waves: Waves, sight: Sight) -> Channel:
+        constant = self._constant(tuple(sight.free), tuple(sight.near), ends)
         a = np.array(waves.amplitude, np.complex128)
         pairs = [
-            PairWaves(line.tx, line.rx, line.tx_pose, line.rx_pose, slice(*ends))
-            for line, ends in zip(sight.lines, pairwise(offsets), strict=True)
+            PairWaves(line.tx, line.rx, line.tx_pose, line.rx_pose, mine)
+            for line, mine in zip(sight.lines, constant.rows, strict=True)
         ]
         if self.has_path_gain:
             a *= self._path_gain(waves, pairs)
-        # One array for both ends: making an array costs more than its numbers.
-        both = waves.departure + waves.arrival
-        aod, aoa = np.array([x for wave in both for x in angles(wave)], np.float64).reshape(2, -1, 2)
-        shape = (len(transmitters), len(receivers))
-        constant = _constant(tuple(sight.free), tuple(offsets), tuple(waves.id), shape)
-        wideband = self._wideband(a, waves, pairs, constant.offsets, len(receivers))
+        # One array, cut up: making an array costs more than its numbers.
+        both, count = waves.departure + waves.arrival, len(waves.tau)
+        seen = [x for wave in both for x in angles(wave)]
+        numbers = np.array(waves.tau + waves.doppler_ratio + seen, np.float64)
+        aod, aoa = numbers[2 * count :].reshape(2, count, 2)
+        wideband = self._wideband(a, waves, pairs, constant.offsets, len(ends.rx))
         return Channel(
             rung=self.rung,
             options=self.modelled,
             carriers=self.run.carriers,
-            tx=tuple([device.name for device in transmitters]),
-            rx=tuple([device.name for device in receivers]),
+            tx=ends.tx,
+            rx=ends.rx,
             los=constant.los,
             offsets=constant.offsets,
             id=constant.id,
             a=a,
-            tau=np.array(waves.tau, np.float64),
+            tau=numbers[:count],
             aod=aod,
             aoa=aoa,
-            doppler=self._frequency * np.array(waves.doppler_ratio, np.float64),
+            doppler=self._frequency * numbers[count : 2 * count],
             interactions=constant.interactions,
             points=constant.points,
             objects=constant.objects,
-            h=self._matrices(a, waves, pairs, len(receivers)) if self.with_h else (),
+            h=self._matrices(a, waves, pairs, len(ends.rx)) if self.with_h else (),
             hf=wideband.hf,
             taps=wideband.taps,
         )
+
+    def _constant(self, free: tuple[bool, ...], near: tuple[bool, ...], ends: _Ends) -> _Constant:
+        key = free, near, len(ends.rx)
+        known = self._constants.get(key)
+        if known is None:
+            if len(self._constants) >= KEPT_CONSTANTS:
+                self._constants.clear()
+            shape = len(ends.tx), len(ends.rx)
+            known = self._constants[key] = _Constant.of(free, near, self._ids, shape)
+        return known
 
     def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
         """Path gain of all waves, Shape ``[C, P]``."""
@@ -377,10 +386,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         """H of every carrier and pair."""
         of_pair = []
         for pair in pairs:
-            transmit = steering_vector(pair.tx.array, pair.departures(waves))
-            receive = None
-            if pair.rx.array.size > 1:
-                receive = steering_vector(pair.rx.array, pair.arrivals(waves))
+            transmit = pair.transmit(waves)
+            receive = pair.receive(waves) if pair.rx.array.size > 1 else None
             if pair.mine.start == pair.mine.stop:
                 shape = (len(a), pair.rx.array.size, pair.tx.array.size)
                 of_pair.append(np.zeros(shape, np.complex128))
@@ -411,8 +418,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
                 doppler = ratio * asked.carrier.frequency_hz
                 for number, pair in enumerate(pairs):
                     weights = asked.weights(number, tau[pair.mine], doppler[pair.mine])
-                    receive = steering_vector(pair.rx.array, pair.arrivals(waves))
-                    transmit = steering_vector(pair.tx.array, pair.departures(waves))
+                    receive, transmit = pair.receive(waves), pair.transmit(waves)
                     elements = receive[:, :, None] * transmit[:, None, :]
                     yield superposed(weights * a[asked.index, pair.mine], elements)
 
@@ -434,13 +440,37 @@ class _Drawn(NamedTuple):
     """Of a pair, for a block of frames."""
 
     draws: Draws
-    rows: dict[bool, tuple[Any, Any, Any]]
-    """`Components` as lists, by whether the line of sight is free; made where they are asked for."""
+    tables: dict[bool, Float64Array]
+    """Its components, a row a frame, by whether the line of sight is free; made when they are asked for."""
+
+
+class _Ends(NamedTuple):
+    """Antennas, and their names."""
+
+    transmitters: Sequence[AntennaDevice]
+    receivers: Sequence[AntennaDevice]
+    tx: tuple[str, ...]
+    rx: tuple[str, ...]
+
+    @classmethod
+    def of(cls, transmitters: Sequence[AntennaDevice], receivers: Sequence[AntennaDevice]) -> _Ends:
+        """Of some antennas. Raises `PayloadError` for arrays that waves have no polarization for."""
+        for device in (*transmitters, *receivers):
+            if not device.array.is_uniform:
+                raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
+        tx, rx = (tuple(device.name for device in ends) for ends in (transmitters, receivers))
+        return cls(transmitters, receivers, tx, rx)
+
+
+KEPT_CONSTANTS = 64
 
 
 class _Constant(NamedTuple):
-    """Arrays of a product that change only when a line of sight does."""
+    """Arrays of a product that change only when a line of sight does: a scene in which the same lines are
+    free has the same ones, whatever moves."""
 
+    rows: list[slice]
+    """Of each pair, those of its waves."""
     los: BoolArray
     offsets: Int64Array
     id: UInt64Array
@@ -448,24 +478,30 @@ class _Constant(NamedTuple):
     points: Float64Array
     objects: Int32Array
 
-
-@lru_cache(maxsize=64)
-def _constant(
-    los: tuple[bool, ...], offsets: tuple[int, ...], ids: tuple[int, ...], shape: tuple[int, int]
-) -> _Constant:
-    # Keyed by values: a scene in which the same lines are free has the same arrays, whatever moves.
-    paths = offsets[-1]
-    arrays = _Constant(
-        los=np.array(los, np.bool_).reshape(shape),
-        offsets=np.array(offsets, np.int64),
-        id=np.array(ids, np.uint64),
-        interactions=np.zeros((paths, 0), np.uint8),
-        points=np.zeros((paths, 0, 3)),
-        objects=np.zeros((paths, 0), np.int32),
-    )
-    for array in arrays:
-        array.flags.writeable = False  # several products share it
-    return arrays
+    @classmethod
+    def of(
+        cls,
+        free: tuple[bool, ...],
+        near: tuple[bool, ...],
+        ids: Mapping[bool, Sequence[int]],
+        shape: tuple[int, int],
+    ) -> _Constant:
+        """Of pairs by whether their lines are free, and their ends too near to each other for a path."""
+        of_pairs = [[] if close else ids[los] for los, close in zip(free, near, strict=True)]
+        offsets = [0, *accumulate(map(len, of_pairs))]
+        paths = offsets[-1]
+        made = cls(
+            rows=[slice(*ends) for ends in pairwise(offsets)],
+            los=np.array(free, np.bool_).reshape(shape),
+            offsets=np.array(offsets, np.int64),
+            id=np.array([number for of_pair in of_pairs for number in of_pair], np.uint64),
+            interactions=np.zeros((paths, 0), np.uint8),
+            points=np.zeros((paths, 0, 3)),
+            objects=np.zeros((paths, 0), np.int32),
+        )
+        for array in made[1:]:
+            array.flags.writeable = False  # several products share it
+        return made
 
 
 def _id(kind: str) -> int:

@@ -13,18 +13,19 @@ sight at 28 GHz, rounded.
 
 from __future__ import annotations
 
-import cmath
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, quantity
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose, Vector, unrotated
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose, UnitQuaternion, Vector, rotated, unrotated
 from caviar_protocol.space.scene import device_velocity
-from caviar_protocol.topics import AntennaDevice, Scene
+from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
+from caviar_services.antenna_arrays import element_phases
 from caviar_services.channel.arrays.channel_matrices import turn_phase
 from caviar_services.channel.base import ChannelSettings
 
@@ -110,22 +111,44 @@ class PairWaves(msgspec.Struct, frozen=True):
         """Directions of arrival in the axes of RX, Shape ``[L, 3]``."""
         return _in_axes(self.rx_pose, waves.arrival[self.mine])
 
+    def transmit(self, waves: Waves) -> Complex128Array:
+        """Phases of the elements of TX, Shape ``[L, Nt]``."""
+        return _phases(self.tx.array, self.tx_pose, waves.departure[self.mine])
+
+    def receive(self, waves: Waves) -> Complex128Array:
+        """Phases of the elements of RX, Shape ``[L, Nr]``."""
+        return _phases(self.rx.array, self.rx_pose, waves.arrival[self.mine])
+
 
 def _in_axes(pose: Pose, vectors: Sequence[Vector]) -> Float64Array:
     turned = pose.orientation
     return np.array([unrotated(turned, vector) for vector in vectors], np.float64).reshape(-1, 3)
 
 
+def _phases(array: AntennaArray, pose: Pose, vectors: Sequence[Vector]) -> Complex128Array:
+    y_axis, z_axis = _axes(pose.orientation)
+    y = np.array([dot(y_axis, vector) for vector in vectors], np.float64)
+    z = np.array([dot(z_axis, vector) for vector in vectors], np.float64) if array.rows > 1 else y
+    return element_phases(array, y, z)
+
+
+# A base station stands still: of two devices one mostly has the orientation that it had.
+@lru_cache(maxsize=256)
+def _axes(q: UnitQuaternion) -> tuple[Vector, Vector]:
+    """World components of the y and the z axis of a body."""
+    return rotated(q, (0.0, 1.0, 0.0)), rotated(q, (0.0, 0.0, 1.0))
+
+
+Placed: TypeAlias = tuple[AntennaDevice, Pose, Vector]
+"""A device, its pose, and its velocity [m/s]."""
+
+
 class Line:
     """The straight line between the devices of a pair.
 
     Args:
-        tx: The transmitter, with its pose and velocity [m/s]; ``rx`` likewise.
-        rx: See ``tx``.
-        tx_pose: See ``tx``.
-        rx_pose: See ``tx``.
-        tx_speed: See ``tx``.
-        rx_speed: See ``tx``.
+        transmitter: The device, its pose and its velocity [m/s].
+        receiver: Likewise.
         frequencies: Of the carriers [Hz].
     """
 
@@ -133,33 +156,22 @@ class Line:
     __slots__ = (
         "along",
         "delay",
-        "end",
         "inwards",
         "length",
         "outwards",
         "phase",
         "rx",
         "rx_pose",
-        "start",
         "tx",
         "tx_pose",
         "velocity",
     )
 
-    def __init__(
-        self,
-        tx: AntennaDevice,
-        rx: AntennaDevice,
-        tx_pose: Pose,
-        rx_pose: Pose,
-        tx_speed: Vector,
-        rx_speed: Vector,
-        frequencies: Sequence[float],
-    ) -> None:
-        self.tx, self.rx, self.tx_pose, self.rx_pose = tx, rx, tx_pose, rx_pose
-        self.start, self.end = tx_pose.position, rx_pose.position
-        self.velocity = tx_speed, rx_speed
-        (x0, y0, z0), (x1, y1, z1) = self.start, self.end
+    def __init__(self, transmitter: Placed, receiver: Placed, frequencies: Sequence[float]) -> None:
+        self.tx, self.tx_pose, outgoing = transmitter
+        self.rx, self.rx_pose, incoming = receiver
+        self.velocity = outgoing, incoming
+        (x0, y0, z0), (x1, y1, z1) = self.tx_pose.position, self.rx_pose.position
         x, y, z = x1 - x0, y1 - y0, z1 - z0
         self.length = math.hypot(x, y, z)
         scale = 1 / self.length if self.length > 0 else 0.0
@@ -170,10 +182,11 @@ class Line:
         # Seen from the other end: π − zenith, azimuth + π.
         self.outwards, self.inwards = (z, level, cosine, sine), (-z, level, -cosine, -sine)
         self.delay = self.length / SPEED_OF_LIGHT
-        # exp(−j2πfτ) on each carrier. The whole turns of f·τ go first: they are millions, and only the rest
-        # is a phase.
+        # exp(−j2πfτ) on each carrier, real and imaginary part. The whole turns of f·τ go first: they are
+        # millions, and only the rest is a phase.
         turns = [frequency * self.delay for frequency in frequencies]
-        self.phase = [cmath.rect(1.0, -2 * math.pi * (turn - round(turn))) for turn in turns]
+        angles = [-2 * math.pi * (turn - round(turn)) for turn in turns]
+        self.phase = [(math.cos(angle), math.sin(angle)) for angle in angles]
 
     @property
     def azimuth_deg(self) -> float:
@@ -198,9 +211,8 @@ class Waves:
         """Unit vectors in world axes; ``arrival`` from RX towards the wave."""
         self.arrival: list[Vector] = []
         self.doppler_ratio: list[float] = []
-        self.id: list[int] = []
         self.length: list[float] = []
-        """Length of the pair's straight line [m]."""
+        """Length of the pair's straight line [m], where path gain follows from it."""
 
 
 BLOCK = 256
@@ -280,7 +292,7 @@ class Components(NamedTuple):
     excess: Float64Array
     """[s], Shape ``[..., L]``."""
     turn: Float64Array
-    """Cosine and sine of the deviations of zenith and azimuth, at TX and at RX, Shape ``[..., L, 2, 4]``."""
+    """Cosine and sine of the deviations: of zenith and azimuth at TX, then at RX, Shape ``[..., L, 8]``."""
 
     @classmethod
     def of(cls, draws: Draws, free: BoolArray, shares: Shares, frequencies: Float64Array) -> Components:
@@ -300,7 +312,7 @@ class Components(NamedTuple):
         phase = turn_phase(frequencies[:, None] * excess[..., None, :])
         amplitude = np.stack(times((gain.real, gain.imag), (phase.real, phase.imag)), axis=-1)
         turn = np.exp(1j * np.where(straight[..., None], 0.0, draws.deviation)).view(np.float64)
-        return cls(amplitude, excess, turn.reshape(*excess.shape, 2, 4))
+        return cls(amplitude, excess, turn)
 
 
 N = TypeVar("N", float, Float64Array)
