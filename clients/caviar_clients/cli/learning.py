@@ -1,19 +1,126 @@
-"""``caviar export-policy`` and ``caviar evaluate``: trained policies as files, and beside their baselines."""
+"""``caviar train``, ``caviar export-policy`` and ``caviar evaluate``: trained policies."""
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from caviar_clients.cli.shared import print_line, progress_bar, write_json
 from caviar_protocol.errors import ScenarioError, SetupError
 from caviar_protocol.host import install_command
 
+if TYPE_CHECKING:
+    from caviar_clients.learning.experiment import Experiment
+    from caviar_clients.learning.training import Progress, SeedResult
+
 ALGORITHMS = ("dqn", "ppo", "a2c")
+
+
+def train_command(
+    experiment: Annotated[Path, typer.Argument(help="TOML file of the experiment", show_default=False)],
+    out: Annotated[Path, typer.Option(help="folder in which the experiment's own is made")] = Path(
+        "training"
+    ),
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="seeds at a time; by default as many as there are cores")
+    ] = None,
+) -> None:
+    """Train the seeds of an experiment, or go on with what was interrupted: policies, curves, checkpoints."""
+    from caviar_clients.learning.campaign import prepare_folder, reached, train_experiment
+    from caviar_clients.learning.experiment import load_experiment
+
+    console, loaded = Console(), load_experiment(experiment)
+    folder = prepare_folder(loaded, out)
+    if any(reached(loaded, out).values()):
+        print_line(console, f"{folder} goes on: {_steps_of(loaded, out)}")
+    try:
+        with training_bars(console, loaded) as report:
+            results = train_experiment(loaded, out, jobs or cores(), report)
+    except KeyboardInterrupt:
+        print_line(
+            console, f"stopped; caviar train {experiment} --out {out} goes on: {_steps_of(loaded, out)}"
+        )
+        raise
+    console.print(_results_table(loaded, folder, results))
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable[[Progress], None]]:
+    """Show a bar with the time left for each seed, and one for all of them.
+
+    Args:
+        console: Where they are drawn.
+        experiment: What is trained.
+
+    Yields:
+        What takes the progress of a seed.
+    """
+    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+
+    subject, tasks = experiment.experiment, dict[int, Any]()
+    columns = (MofNCompleteColumn(), "steps", TimeRemainingColumn(), "{task.fields[reward]}")
+    with progress_bar(console, *columns) as bar:
+        together: list[Any] = []
+        done, total = dict.fromkeys(subject.seeds, 0), subject.steps * len(subject.seeds)
+
+        def report(progress: Progress) -> None:
+            seed, steps = progress.seed, min(progress.steps, subject.steps)
+            if not together:
+                together.append(bar.add_task(subject.name, total=total, reward=""))
+            if seed not in tasks:
+                tasks[seed] = bar.add_task(f"seed {seed}", total=subject.steps, completed=steps, reward="")
+                # What an earlier call has trained says nothing about the time left.
+                bar.reset(together[0], completed=sum(done.values()) + steps)
+            reward = "" if progress.mean_reward is None else f"reward {progress.mean_reward:.4g}"
+            bar.update(tasks[seed], completed=steps, reward=reward)
+            done[seed] = steps
+            bar.update(together[0], completed=sum(done.values()))
+
+        yield report
+
+
+def _steps_of(experiment: Experiment, root: Path) -> str:
+    """What is left of each seed."""
+    from caviar_clients.learning.campaign import reached
+    from caviar_clients.learning.training import read_result
+
+    folder = root / experiment.experiment.name
+    return ", ".join(
+        f"seed {seed} is done" if read_result(folder, seed) else f"seed {seed} from step {steps:,}"
+        for seed, steps in reached(experiment, root).items()
+    )
+
+
+def _results_table(experiment: Experiment, folder: Path, results: list[SeedResult]) -> Table:
+    from caviar_clients.learning.training import CURVES, MODEL, POLICY, seed_folder
+
+    table = Table(title=f"{experiment.experiment.name}: {experiment.algorithm.called} in {folder}")
+    for name in ("seed", "steps", "time", "reward of an episode"):
+        table.add_column(name, justify="right")
+    table.add_column("files", overflow="fold")
+    for result in results:
+        mine = seed_folder(folder, result.seed).relative_to(folder)
+        table.add_row(
+            str(result.seed),
+            f"{result.steps:,}",
+            f"{result.seconds:.0f} s",
+            "" if result.mean_reward is None else f"{result.mean_reward:.4g}",
+            f"{mine}/: {MODEL if result.policy is None else POLICY}, {CURVES}/",
+        )
+    return table
 
 
 def export_command(
@@ -77,7 +184,6 @@ def evaluate_command(
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:
     """Hold a policy against los-beam, random and the optimum, LOS and NLOS apart."""
-    from caviar_clients.cli.shared import progress_bar, write_json
     from caviar_clients.learning.evaluate import KINDS, METHODS, evaluate
 
     chosen = range(first_seed, first_seed + seeds)

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from caviar_clients.cli.keys import app as keys
-from caviar_clients.cli.learning import evaluate_command, export_command
+from caviar_clients.cli.learning import evaluate_command, export_command, train_command
 from caviar_clients.cli.shared import (
     Embedded,
     FiguresFile,
@@ -470,6 +470,7 @@ def tradeoff(
     trade(source, frames, options, json, out, _console)
 
 
+app.command("train", rich_help_panel=RUN)(train_command)
 app.command("evaluate", rich_help_panel=MEASURE)(evaluate_command)
 app.command("export-policy", rich_help_panel=OPERATE)(export_command)
 

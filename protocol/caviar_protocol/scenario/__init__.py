@@ -130,13 +130,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
             ...
         caviar_protocol.errors.ScenarioError: my.toml:8: run.frames: is 0, write a whole number ≥ 1 [frame]
     """
-    try:
-        table = parse_toml(text)
-    except tomllib.TOMLDecodeError as error:
-        raise _syntax_error(error, text, file) from error
-    # tomllib counts CR LF as one line end, and so must the scanner.
-    lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
-    source = Source(file=file, lines=lines)
+    table, source = read_toml(text, file)
     if isinstance(table.get("run"), dict):
         table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
     # Types first: rules between keys may rely on them.
@@ -146,6 +140,33 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
     # After the rules: what follows from keys is never what an error is about.
     scenario = _with_numerologies(scenario)
     return _with_files(scenario, folder or Path())
+
+
+def read_toml(text: str, file: str = "") -> tuple[dict[str, Any], Source]:
+    """Parse TOML text, and find the lines of its keys, for `caviar_protocol.scenario.conversion`.
+
+    Args:
+        text: TOML.
+        file: What errors call it.
+
+    Returns:
+        The document, and where its keys stand.
+
+    Raises:
+        ScenarioError: It is no TOML; the text has file, line and column.
+
+    Example:
+        >>> table, source = read_toml("[run]\\nframes = 3\\n", "my.toml")
+        >>> table["run"]["frames"], source.line("run.frames")
+        (3, 2)
+    """
+    try:
+        table = parse_toml(text)
+    except tomllib.TOMLDecodeError as error:
+        raise _syntax_error(error, text, file) from error
+    # tomllib counts CR LF as one line end, and so must the scanner.
+    lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
+    return table, Source(file=file, lines=lines)
 
 
 def _with_device_names(source: Source, scenario: Scenario) -> Source:
@@ -294,7 +315,7 @@ def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Pla
 def _with_files(scenario: Scenario, folder: Path) -> Scenario:
     services = {
         name: msgspec.structs.replace(
-            service, settings=_absolute(service.settings, folder, settings_place(scenario, name))
+            service, settings=absolute_paths(service.settings, folder, settings_place(scenario, name))
         )
         for name, service in scenario.services.items()
     }
@@ -313,7 +334,7 @@ def _with_pattern(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
     name, place = device.array.pattern_file, array.at("pattern_file")
     if not name.startswith(FILE) and not Path(name).is_absolute():
         raise place.error(f'is {name!r}, write "file:" and a path relative to the folder of the scenario')
-    path = Path(_absolute(name, folder, place))
+    path = Path(absolute_paths(name, folder, place))
     if name.startswith(FILE):
         # A link keeps its own name: its ending says what the file holds.
         link = folder / name.removeprefix(FILE)
@@ -335,11 +356,25 @@ def _check_patterns(devices: Sequence[DeviceSpec], source: Source) -> None:
             )
 
 
-def _absolute(value: Any, folder: Path, place: Place) -> Any:
+def absolute_paths(value: Any, folder: Path, place: Place) -> Any:
+    """A value in which texts that begin with ``file:`` are absolute paths.
+
+    Args:
+        value: Of a file: a text, or what holds texts at any depth.
+        folder: What the paths are relative to.
+        place: Where the value stands, for the error.
+
+    Raises:
+        ScenarioError: There is no such file.
+
+    Example:
+        >>> absolute_paths(["geometric"], Path(), Place("scenario"))
+        ['geometric']
+    """
     if isinstance(value, dict):
-        return {name: _absolute(item, folder, place.at(name)) for name, item in value.items()}
+        return {name: absolute_paths(item, folder, place.at(name)) for name, item in value.items()}
     if isinstance(value, list):
-        return [_absolute(item, folder, place.at(index)) for index, item in enumerate(value)]
+        return [absolute_paths(item, folder, place.at(index)) for index, item in enumerate(value)]
     if not (isinstance(value, str) and value.startswith(FILE)):
         return value
     path = (folder / value.removeprefix(FILE)).resolve()

@@ -1,0 +1,217 @@
+"""All seeds of an experiment, several at a time, each in a process of its own; and the experiment's folder.
+
+The folder has what the experiment was begun with, and a folder for each seed
+(`caviar_clients.learning.training`). A second call goes on where the first one ended, however it ended.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_clients.files import writing
+from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_clients.learning.experiment import Experiment
+from caviar_clients.learning.training import (
+    CHECKPOINTS,
+    Progress,
+    SeedResult,
+    read_result,
+    seed_folder,
+    train_seed,
+)
+from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.files import replace_file
+from caviar_protocol.scenario.conversion import Source
+
+RECORD = "experiment.json"
+"""What the folder was begun with."""
+_GOODBYE_S = 5.0
+
+Report = Callable[[Progress], None]
+
+
+class _Record(msgspec.Struct, frozen=True):
+    digest: str
+    experiment: dict[str, Any]
+
+
+def train_experiment(
+    experiment: Experiment,
+    root: Path,
+    jobs: int = 1,
+    report: Report = lambda progress: None,
+) -> list[SeedResult]:
+    """Train all seeds of an experiment, or go on with those that are left.
+
+    Args:
+        experiment: What is trained.
+        root: Folder in which that of the experiment is made.
+        jobs: Seeds at a time. 1: in this process; else each in a process of its own.
+        report: Called with the progress of each seed, a few times a second.
+
+    Returns:
+        What each seed led to, in the order of the experiment.
+
+    Raises:
+        RunError: The folder was begun with other values, or a seed failed; the text says which.
+        ScenarioError: Environment or algorithm do not go with the options.
+        SetupError: The extra ``learning`` is not installed.
+    """
+    folder = prepare_folder(experiment, root)
+    seeds = experiment.experiment.seeds
+    left = [seed for seed in seeds if read_result(folder, seed) is None]
+    for seed in seeds:
+        if seed not in left:
+            report(Progress(seed=seed, steps=experiment.experiment.steps))
+    if jobs == 1 or len(left) < 2:
+        for seed in left:
+            train_seed(experiment, seed, folder, report)
+    else:
+        _train_in_processes(experiment, folder, left, jobs, report)
+    found = [read_result(folder, seed) for seed in seeds]
+    return [result for result in found if result is not None]
+
+
+def prepare_folder(experiment: Experiment, root: Path) -> Path:
+    """Make the folder of an experiment, or check that it was begun with the same values.
+
+    Args:
+        experiment: What is trained; seeds may be added to it.
+        root: Where the folder is made.
+
+    Raises:
+        RunError: The folder was begun with other values; the text names those that differ.
+    """
+    folder = root / experiment.experiment.name
+    file = folder / RECORD
+    now = _Record(experiment.digest(), _values(experiment))
+    with writing(file):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            before = msgspec.json.decode(file.read_bytes(), type=_Record)
+        except FileNotFoundError:
+            replace_file(file, msgspec.json.format(msgspec.json.encode(now), indent=1))
+            return folder
+        except msgspec.DecodeError as error:
+            raise RunError(f"{file} cannot be read: {error}; remove {folder} to train anew") from error
+    if before.digest != now.digest:
+        changes = list(_differences(before.experiment, now.experiment))
+        what = "; ".join(changes[:4]) or "the file of the scenario is another one"
+        raise RunError(
+            f"{folder} was begun with other values: {what}. Give the experiment another name, or remove the "
+            "folder to train it anew"
+        )
+    return folder
+
+
+def reached(experiment: Experiment, root: Path) -> dict[int, int]:
+    """Steps from which the training of each seed goes on; 0: from its beginning.
+
+    Args:
+        experiment: What is trained.
+        root: Folder that has that of the experiment.
+    """
+    folder, found = root / experiment.experiment.name, dict[int, int]()
+    for seed in experiment.experiment.seeds:
+        newest = newest_checkpoint(seed_folder(folder, seed) / CHECKPOINTS)
+        found[seed] = 0 if newest is None else int(newest.name)
+    return found
+
+
+def _values(experiment: Experiment) -> dict[str, Any]:
+    """The values of an experiment without its seeds, as plain tables."""
+    # Through JSON, as the file has them: tuples are lists there.
+    plain = msgspec.structs.replace(experiment, source=Source())
+    made: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
+    del made["source"], made["experiment"]["seeds"]
+    return made
+
+
+def _differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
+    """Each value that differs, by its key."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            yield from _differences(before.get(name), now.get(name), f"{key}.{name}" if key else name)
+    elif before != now:
+        yield f"{key} was {before!r} and is {now!r}"
+
+
+# --- processes ------------------------------------------------------------------------------------------
+
+
+def _train_in_processes(
+    experiment: Experiment, folder: Path, seeds: Sequence[int], jobs: int, report: Report
+) -> None:
+    waiting, running = list(seeds), dict[Connection, Any]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                pipe, process = _start(experiment, folder, waiting.pop(0))
+                running[pipe] = process
+            ready = multiprocessing.connection.wait(list(running))
+            for pipe in [pipe for pipe in running if pipe in ready]:
+                if not _take(pipe, report):
+                    process = running.pop(pipe)
+                    process.join()
+                    if process.exitcode:
+                        raise RunError(_cause(process.exitcode))
+    finally:
+        for process in running.values():
+            process.terminate()
+        for process in running.values():
+            process.join(_GOODBYE_S)
+            if process.is_alive():
+                process.kill()
+
+
+def _start(experiment: Experiment, folder: Path, seed: int) -> tuple[Connection, Any]:
+    context = multiprocessing.get_context("spawn")  # what is forked has the threads of PyTorch no more
+    pipe, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(theirs, experiment, seed, folder), daemon=True)
+    process.start()
+    theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
+    return pipe, process
+
+
+def _take(pipe: Connection, report: Report) -> bool:
+    """Take what a process says; False: it has ended."""
+    try:
+        said = pipe.recv()
+    except EOFError:
+        return False
+    if isinstance(said, Progress):
+        report(said)
+    elif isinstance(said, CaviarError):
+        raise said
+    else:
+        warnings.warn(said, stacklevel=2)
+    return True
+
+
+def _cause(code: int) -> str:
+    if code < 0:
+        name = signal.Signals(-code).name
+        return f"the process of a seed ended with signal {name}; was there enough memory?"
+    return f"the process of a seed ended with status {code}; what it printed says why"
+
+
+def _serve(pipe: Connection, experiment: Experiment, seed: int, folder: Path) -> None:
+    """Train a seed, and tell the parent; where the parent is gone, the next report ends this process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    warnings.showwarning = lambda message, *_, **__: pipe.send(str(message))
+    try:
+        train_seed(experiment, seed, folder, pipe.send)
+    except CaviarError as error:
+        pipe.send(error)
+    except BrokenPipeError:
+        os._exit(1)  # there is nobody to tell

@@ -1,0 +1,330 @@
+"""Experiments: TOML files of what is trained, how, and with which seeds.
+
+>>> experiment = parse_experiment('''
+... [experiment]
+... name = "beams"
+... seeds = [1, 2]
+... steps = 50_000
+...
+... [environment]
+... id = "caviar/BeamSelection-v0"
+... members = 8
+...
+... [environment.options]
+... scenario = "geometric"
+... observe = ["position", "last_beam", "last_rate"]
+...
+... [algorithm]
+... name = "dqn"
+... gamma = 0.0
+... ''')
+>>> experiment.algorithm.given()
+{'gamma': 0.0}
+
+A key that does not exist is refused with file, line and the near name, as in scenarios.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import gymnasium
+import msgspec
+
+import caviar_clients.envs as _registered  # noqa: F401
+from caviar_protocol.arrays import described, quantity
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.scenario import absolute_paths, find_scenario, load_scenario, read_toml
+from caviar_protocol.scenario.conversion import Place, Source, convert_table
+
+Count = Annotated[int, quantity("1", "whole number above 0", ge=1, le=2**40)]
+Share = Annotated[float, quantity("1", "from 0 to 1", ge=0, le=1)]
+Rate = Annotated[float, quantity("1", "learning rate", gt=0, le=10)]
+Positive = Annotated[float, quantity("1", "above 0", gt=0)]
+Seed = Annotated[int, quantity("1", "seed", ge=0, le=2**31 - 1)]
+"""Of PyTorch and NumPy, which take 32 bits; those of the environment's episodes follow from it."""
+Name = Annotated[
+    str,
+    described(
+        "name of a folder: letters, digits, dots, dashes and underscores",
+        min_length=1,
+        max_length=64,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
+    ),
+]
+
+
+class Subject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Table ``[experiment]``: its name, its seeds and how long each is trained."""
+
+    name: Name
+    seeds: tuple[Seed, ...]
+    """Each is trained by itself, into a folder of its own."""
+    steps: Count
+    """Steps of the environment, of all members together, for each seed."""
+    checkpoint_steps: Count = 10_000
+    """Steps between checkpoints, at least: an episode has ended between two of them. All episodes begin anew
+    after each, so that a training that goes on from there is the same as one that was never interrupted."""
+
+    def __post_init__(self) -> None:
+        if not self.seeds:
+            raise ValueError("seeds is empty; write at least one: seeds = [1]")
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f"seeds {list(self.seeds)} has one twice; each is trained once")
+
+
+class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Table ``[environment]``: what is learned in."""
+
+    id: str
+    """As ``gymnasium.make`` takes it: ``caviar/BeamSelection-v0``, or ``module:Name-v0`` of your own."""
+    members: Annotated[int, quantity("1", "environments at once", ge=1, le=4096)] = 1
+    options: Mapping[str, Any] = {}
+    """Arguments of the environment; a text ``file:PATH`` is a path relative to the folder of the file."""
+
+
+class _Algorithm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
+    """What algorithms share. A hyper-parameter that is left out is the library's default."""
+
+    own: ClassVar[tuple[str, ...]] = ("library", "final_learning_rate", "policy_network")
+
+    library: Literal["stable-baselines3"] = "stable-baselines3"
+    learning_rate: Rate | None = None
+    final_learning_rate: Rate | None = None
+    """Reached at the last step, in proportion to the steps; without it the rate stays as it is."""
+    gamma: Share | None = None
+    """Discount. A beam has no influence on the next channel: 0 fits beam selection."""
+    max_grad_norm: Positive | None = None
+
+    @property
+    def called(self) -> str:
+        """Name of the class of Stable-Baselines3."""
+        return str(self.__struct_config__.tag).upper()
+
+    def given(self) -> dict[str, Any]:
+        """The hyper-parameters that the file gives, by their names in the library."""
+        found = {name: getattr(self, name) for name in self.__struct_fields__ if name not in self.own}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+class Dqn(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="dqn"):
+    """Deep Q network, for actions that are one choice out of some."""
+
+    buffer_size: Count | None = None
+    """Transitions that are kept; more than ``steps`` take no more memory."""
+    learning_starts: Annotated[int, quantity("1", "steps", ge=0)] | None = None
+    batch_size: Count | None = None
+    tau: Share | None = None
+    train_freq: Count | None = None
+    gradient_steps: Annotated[int, quantity("1", "-1: as many as steps", ge=-1)] | None = None
+    target_update_interval: Count | None = None
+    exploration_fraction: Share | None = None
+    exploration_initial_eps: Share | None = None
+    exploration_final_eps: Share | None = None
+
+
+class _OnPolicy(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What PPO and A2C share."""
+
+    n_steps: Count | None = None
+    gae_lambda: Share | None = None
+    ent_coef: Annotated[float, quantity("1", "weight of the entropy", ge=0)] | None = None
+    vf_coef: Annotated[float, quantity("1", "weight of the value", ge=0)] | None = None
+    normalize_advantage: bool | None = None
+
+
+class Ppo(_OnPolicy, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="ppo"):
+    """Proximal policy optimization."""
+
+    batch_size: Count | None = None
+    n_epochs: Count | None = None
+    clip_range: Share | None = None
+    clip_range_vf: Positive | None = None
+    target_kl: Positive | None = None
+
+
+class A2c(_OnPolicy, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="a2c"):
+    """Advantage actor-critic."""
+
+    rms_prop_eps: Positive | None = None
+    use_rms_prop: bool | None = None
+
+
+class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Table ``[network]``: of the policy; without it, that of the library."""
+
+    layers: tuple[Count, ...] | None = None
+    """Units of each hidden layer."""
+    activation: Literal["relu", "tanh"] | None = None
+
+
+class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Table ``[features.PART]``: what the network gets of a part x of the observation.
+
+    z = (x − offset) / scale, and sin(kπz) and cos(kπz) of k = 1 … waves. A network of two layers can hardly
+    tell two neighbouring beams of 64 apart from one number; from waves as short as a beam is wide it can.
+    """
+
+    offset: float | tuple[float, ...] = 0.0
+    """One for all numbers of the part, or one for each."""
+    scale: float | tuple[float, ...] = 1.0
+    """Above 0; the waves repeat after twice as much."""
+    waves: Annotated[int, quantity("1", "waves", ge=0, le=1024)] = 0
+
+
+class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is trained, how, and with which seeds."""
+
+    not_in_file: ClassVar[tuple[str, ...]] = ("source",)
+
+    experiment: Subject
+    environment: EnvironmentSpec
+    algorithm: Dqn | Ppo | A2c
+    network: Network = Network()
+    features: Mapping[str, Encoding] = {}
+    """By part of the observation; what is not named goes into the network as it is."""
+    source: Source = Source()
+
+    def digest(self) -> str:
+        """SHA-256 of what decides how a seed is trained: all but the list of seeds, and the scenario's file.
+
+        Raises:
+            ScenarioError: The scenario cannot be read, or breaks a rule.
+        """
+        subject = msgspec.structs.replace(self.experiment, seeds=(0,))
+        made = msgspec.structs.replace(self, experiment=subject, source=Source())
+        scenario = self.environment.options.get("scenario")
+        content = b""
+        if isinstance(scenario, str):
+            try:
+                load_scenario(scenario)
+            except ScenarioError as error:
+                raise self.place("environment", "options", "scenario").error(str(error)) from error
+            content = find_scenario(scenario).read_bytes()
+        encoded = msgspec.json.encode(made, order="deterministic")
+        return hashlib.sha256(encoded + b"\n" + content).hexdigest()
+
+    def place(self, *names: str) -> Place:
+        """Where a key stands in the file."""
+        place = Place("", self.source)
+        for name in names:
+            place = place.at(name)
+        return place
+
+
+def load_experiment(path: Path | str) -> Experiment:
+    """Read and check the file of an experiment.
+
+    Args:
+        path: TOML file.
+
+    Raises:
+        ScenarioError: The file cannot be read or breaks a rule; the text has file, line, key, value and what
+            to write instead.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ScenarioError(f"cannot be read: {why}; give a TOML file of an experiment", str(path)) from error
+    return parse_experiment(text, str(path), path.parent)
+
+
+def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> Experiment:
+    """Check an experiment that is given as text.
+
+    Args:
+        text: TOML.
+        file: What errors call it.
+        folder: What its ``file:`` paths are relative to; by default the working directory.
+
+    Raises:
+        ScenarioError: As of `load_experiment`.
+
+    Example:
+        >>> try:
+        ...     parse_experiment("[network]\\nlayer = [64]", "my.toml")
+        ... except ScenarioError as error:
+        ...     print(error)
+        my.toml:2: network.layer: unknown key 'layer'; did you mean 'layers'?
+    """
+    table, source = read_toml(text, file)
+    made = convert_table(Experiment, table, Place("", source))
+    place = Place("environment", source).at("options")
+    options = absolute_paths(dict(made.environment.options), folder or Path(), place)
+    environment = msgspec.structs.replace(made.environment, options=options)
+    made = msgspec.structs.replace(made, environment=environment, source=source)
+    _check_options(made)
+    _check_scales(made)
+    return made
+
+
+def _check_options(experiment: Experiment) -> None:
+    """Refuse an environment that does not exist, and options that it does not take."""
+    place, given = experiment.place("environment"), experiment.environment.options
+    module, separator, _ = experiment.environment.id.rpartition(":")
+    try:
+        if separator:
+            importlib.import_module(module)
+        spec = gymnasium.spec(experiment.environment.id)
+    except ImportError as error:
+        raise place.at("id").error(
+            f"module {module!r} cannot be imported: {error}; is it installed, or in PYTHONPATH?"
+        ) from error
+    except gymnasium.error.Error as error:
+        ids = [name for name in gymnasium.registry if name.startswith("caviar/")]
+        raise place.at("id").error(
+            f"no environment is called {experiment.environment.id!r}; "
+            f"{suggestion(experiment.environment.id, ids)}"
+        ) from error
+    known, takes_any = _arguments(spec.entry_point)
+    for name in given:
+        if name not in known and not takes_any:
+            raise place.at("options").at(name).error(f"unknown option {name!r}; {suggestion(name, known)}")
+    for name, is_required in known.items():
+        if is_required and name not in given:
+            raise place.at("options").error(f"lacks {name!r}, which {experiment.environment.id} needs")
+
+
+def _check_scales(experiment: Experiment) -> None:
+    for name, encoding in experiment.features.items():
+        scales = encoding.scale if isinstance(encoding.scale, tuple) else (encoding.scale,)
+        if not all(scale > 0 for scale in scales):
+            place = experiment.place("features", name, "scale")
+            raise place.error(f"is {encoding.scale}, write numbers > 0")
+
+
+_NOT_OPTIONS = ("self", "render_mode", "num_envs")
+
+
+def _arguments(entry_point: Any) -> tuple[dict[str, bool], bool]:
+    """Arguments of an environment, and whether each is required; and whether it takes any other, too."""
+    made = (
+        gymnasium.envs.registration.load_env_creator(entry_point)
+        if isinstance(entry_point, str)
+        else entry_point
+    )
+    inits = (
+        [vars(cls)["__init__"] for cls in inspect.getmro(made) if "__init__" in vars(cls)]
+        if inspect.isclass(made)
+        else [made]
+    )
+    found: dict[str, bool] = {}
+    for init in inits:
+        parameters = inspect.signature(init).parameters.values()
+        for parameter in parameters:
+            if (
+                parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+                and parameter.name not in _NOT_OPTIONS
+            ):
+                found.setdefault(parameter.name, parameter.default is parameter.empty)
+        # Others go on to the base class, where there is a place for them.
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return found, False
+    return found, True

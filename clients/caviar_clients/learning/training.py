@@ -1,0 +1,448 @@
+"""The training of one seed of an experiment: chunk by chunk, each from one checkpoint to the next.
+
+A chunk is a function of its checkpoint and its number alone: all random numbers begin anew with a seed that
+follows from both, and so do the episodes. A training that goes on after Ctrl-C or a kill is therefore the
+same, step by step, as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import inspect
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import IO, Any
+
+import gymnasium
+import msgspec
+import numpy as np
+
+from caviar_clients.envs.base import BeamSelectionEnv
+from caviar_clients.files import writing
+from caviar_clients.learning import features
+from caviar_clients.learning.checkpoints import load_checkpoint, newest_checkpoint, save_checkpoint
+from caviar_clients.learning.events import EventFile
+from caviar_clients.learning.experiment import Dqn, Experiment
+from caviar_clients.learning.export import export_policy
+from caviar_clients.learning.features import check_encodings
+from caviar_clients.learning.vec_env import stable_baselines3_env
+from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
+from caviar_protocol.files import replace_file
+from caviar_protocol.host import install_command
+
+RESULT, POLICY, MODEL, CURVES, CHECKPOINTS = (
+    "result.json",
+    "policy.onnx",
+    "model.zip",
+    "curves",
+    "checkpoints",
+)
+"""Files and folders of a seed."""
+LOWEST_SEED = 2**30
+"""Episodes of training have seeds from here on: lower ones are free for evaluation."""
+REPORT_S = 0.2
+"""[s] between reports of progress, at least."""
+PATIENCE_S = 3.0
+"""[s] that the process before has to end in, before its seed counts as being trained."""
+
+
+class SeedResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What the training of one seed led to: its file `RESULT`."""
+
+    seed: int
+    steps: int
+    digest: str
+    """Of the experiment (`Experiment.digest`)."""
+    seconds: float
+    """Of training, interruptions left out."""
+    mean_reward: float | None = None
+    """Sum of rewards of an episode, the mean over the last hundred; None: no episode came to its end."""
+    policy: str | None = None
+    """SHA-256 of `POLICY`; None: the environment's actions are no beams, and there is none."""
+
+
+class Progress(msgspec.Struct, frozen=True, kw_only=True):
+    """How far the training of a seed is."""
+
+    seed: int
+    steps: int
+    mean_reward: float | None = None
+
+
+def seed_folder(folder: Path, seed: int) -> Path:
+    """Folder of a seed in that of its experiment."""
+    return folder / f"seed-{seed}"
+
+
+def read_result(folder: Path, seed: int) -> SeedResult | None:
+    """Read what the training of a seed led to.
+
+    Args:
+        folder: Of the experiment.
+        seed: One of its seeds.
+
+    Returns:
+        None where the training has not come to its end.
+
+    Raises:
+        RunError: The file is damaged.
+    """
+    file = seed_folder(folder, seed) / RESULT
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=SeedResult)
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.DecodeError) as error:
+        raise RunError(f"{file} cannot be read: {error}; remove it to train this seed again") from error
+
+
+def make_envs(experiment: Experiment) -> Any:
+    """Make the environments of an experiment.
+
+    Args:
+        experiment: Says which, and how many.
+
+    Returns:
+        A ``VecEnv`` of Stable-Baselines3: computed together where the environment can be, one after the other
+        where not.
+
+    Raises:
+        ScenarioError: The environment does not take these options; the text has file and line.
+        SetupError: Stable-Baselines3 is not installed.
+    """
+    _require()
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+    environment, place = experiment.environment, experiment.place("environment", "options")
+    options = dict(environment.options)
+    spec = gymnasium.spec(environment.id)
+    envs: Any = None
+    try:
+        if environment.members > 1 and spec.vector_entry_point is not None:
+            try:
+                together = gymnasium.make_vec(
+                    environment.id, environment.members, autoreset_mode="SameStep", **options
+                )
+                envs = stable_baselines3_env(together)
+            except (ScenarioError, TypeError):  # those of gymnasium begin episodes in their own way
+                envs = None  # what is wrong with the options is wrong with a single one, too
+        if envs is None:
+            envs = DummyVecEnv([lambda: gymnasium.make(environment.id, **options)] * environment.members)
+    except CaviarError as error:
+        if isinstance(error, ScenarioError) and error.file:
+            raise
+        raise place.error(str(error)) from error
+    except TypeError as error:
+        raise place.error(f"{environment.id} does not take them: {error}") from error
+    check_encodings(envs.observation_space, experiment.features, experiment.place("features"))
+    return VecMonitor(envs)
+
+
+def train_seed(
+    experiment: Experiment,
+    seed: int,
+    folder: Path,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> SeedResult:
+    """Train one seed, or go on with it, to its end.
+
+    Args:
+        experiment: What is trained.
+        seed: One of its seeds.
+        folder: Of the experiment.
+        report: Called with the progress, a few times a second.
+
+    Returns:
+        What it led to; the same at once where it was done before.
+
+    Raises:
+        ScenarioError: Environment or algorithm do not go with the options; the text has file and line.
+        RunError: Another process trains this seed, the disk refuses, or a checkpoint is damaged.
+        SetupError: The extra ``learning`` is not installed.
+
+    Example:
+        >>> from caviar_clients.learning.experiment import parse_experiment
+        >>> experiment = parse_experiment('''
+        ... experiment = { name = "beams", seeds = [1], steps = 200 }
+        ... environment = { id = "caviar/BeamSelection-v0", options = { scenario = "geometric" } }
+        ... algorithm = { name = "dqn", gamma = 0.0 }
+        ... ''')
+        >>> result = train_seed(experiment, 1, Path("training/beams"))
+        >>> result.steps, Path("training/beams/seed-1/policy.onnx").is_file()
+        (200, True)
+    """
+    mine = seed_folder(folder, seed)
+    with writing(mine / RESULT):
+        mine.mkdir(parents=True, exist_ok=True)
+    with _locked(mine / "lock", seed):
+        done = read_result(folder, seed)
+        return _train(experiment, seed, mine, report) if done is None else done
+
+
+def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Progress], None]) -> SeedResult:
+    _require()
+    import torch
+
+    torch.set_num_threads(1)  # sums in one order; and a small network is not worth the waiting of several
+    total = experiment.experiment.steps
+    envs = make_envs(experiment)
+    try:
+        newest = newest_checkpoint(mine / CHECKPOINTS)
+        if newest is None:
+            model = _new_model(experiment, envs, _chunk_seed(seed, 0))
+        else:
+            model = load_checkpoint(newest, _resumable(experiment.algorithm.called), envs)
+        report(_progress(model, seed))
+        with EventFile(mine / CURVES, purge_step=model.num_timesteps or None) as events:
+            model.set_logger(_logger(events))
+            callback = _reporting(lambda: report(_progress(model, seed)))
+            while model.num_timesteps < total:
+                _train_chunk(model, total, seed, callback)
+                save_checkpoint(mine / CHECKPOINTS, model)
+        report(_progress(model, seed))
+        model.save(mine / MODEL)
+        policy = _export(experiment, model, mine / POLICY, seed)
+    finally:
+        envs.close()
+    result = SeedResult(
+        seed=seed,
+        steps=model.num_timesteps,
+        digest=experiment.digest(),
+        seconds=model.trained_s,
+        mean_reward=_mean_reward(model),
+        policy=policy,
+    )
+    with writing(mine / RESULT):
+        replace_file(mine / RESULT, msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n")
+    return result
+
+
+def _train_chunk(model: Any, total: int, seed: int, callback: Any) -> None:
+    """Train up to the next checkpoint, with random numbers and episodes of the chunk's own."""
+    began = time.monotonic()
+    model.chunk_end, model.episodes_in_chunk = model.num_timesteps + model.checkpoint_steps, 0
+    model.set_random_seed(_chunk_seed(seed, model.num_timesteps))  # of the environments, too
+    model._last_obs = None  # so that the next episodes begin
+    every = inspect.signature(model.learn).parameters["log_interval"].default
+    model.learn(total - model.num_timesteps, callback, log_interval=every, reset_num_timesteps=False)
+    model.trained_s += time.monotonic() - began
+
+
+def _chunk_seed(seed: int, steps: int) -> int:
+    """Seed of the chunk that begins after so many steps: 31 bits, of which the highest is set."""
+    (word,) = np.random.SeedSequence([seed, steps]).generate_state(1)
+    return LOWEST_SEED + int(word) % LOWEST_SEED
+
+
+# --- the model ------------------------------------------------------------------------------------------
+
+
+def _require() -> None:
+    try:
+        import onnx  # noqa: F401
+        import stable_baselines3  # noqa: F401
+    except ImportError as error:
+        raise SetupError(f"training needs {error.name}; run: {install_command('learning')}") from error
+
+
+@cache
+def _resumable(called: str) -> Any:
+    """An algorithm that stops training where the chunk is over."""
+    import stable_baselines3
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.type_aliases import RolloutReturn
+
+    algorithm = getattr(stable_baselines3, called)
+    stopped = (
+        RolloutReturn(0, 0, continue_training=False) if issubclass(algorithm, OffPolicyAlgorithm) else False
+    )
+
+    class Resumable(algorithm):  # type: ignore[misc,valid-type]  # Stable-Baselines3 is not looked at
+        """The algorithm, and what is saved with it."""
+
+        checkpoint_steps = 0
+        chunk_end = 0
+        """Steps from which on the chunk is over when an episode has ended in it: the members of a batch may
+        take more steps to the end of an episode than a chunk has, and no chunk may stop short of what comes
+        late in an episode."""
+        episodes_in_chunk = 0
+        trained_s = 0.0
+        """Of all processes that trained it [s]."""
+
+        def collect_rollouts(self, *args: Any, **options: Any) -> Any:
+            # Here all that was collected is stored and trained on, which no callback sees.
+            if self.num_timesteps >= self.chunk_end and self.episodes_in_chunk:
+                return stopped
+            return super().collect_rollouts(*args, **options)
+
+    return Resumable
+
+
+class LinearRate:
+    """A learning rate that falls in proportion to the steps.
+
+    Args:
+        first: At the beginning.
+        last: At the end.
+
+    Example:
+        >>> LinearRate(1e-3, 0.0)(0.25)  # with a quarter of the steps left
+        0.00025
+    """
+
+    def __init__(self, first: float, last: float) -> None:
+        self.first, self.last = first, last
+
+    def __call__(self, remaining: float) -> float:
+        return self.last + (self.first - self.last) * remaining
+
+
+def _new_model(experiment: Experiment, envs: Any, seed: int) -> Any:
+    from torch import nn
+
+    algorithm, network = experiment.algorithm, experiment.network
+    cls, given, kwargs = _resumable(algorithm.called), algorithm.given(), dict[str, Any]()
+    defaults = {name: p.default for name, p in inspect.signature(cls.__init__).parameters.items()}
+    if algorithm.final_learning_rate is not None:
+        rate = given.get("learning_rate", defaults["learning_rate"])
+        given["learning_rate"] = LinearRate(rate, algorithm.final_learning_rate)
+    if isinstance(algorithm, Dqn):
+        # The memory of a buffer is taken at once; more than all steps are never in it.
+        most = experiment.experiment.steps + experiment.environment.members
+        given["buffer_size"] = min(given.get("buffer_size", defaults["buffer_size"]), most)
+    if network.layers is not None:
+        kwargs["net_arch"] = list(network.layers)
+    if network.activation is not None:
+        kwargs["activation_fn"] = {"relu": nn.ReLU, "tanh": nn.Tanh}[network.activation]
+    if experiment.features:
+        kwargs["features_extractor_class"] = features.EncodedParts
+        kwargs["features_extractor_kwargs"] = {"encodings": dict(experiment.features)}
+    policy = "MultiInputPolicy" if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
+    try:
+        model = cls(policy, envs, seed=seed, device="cpu", policy_kwargs=kwargs, **given)
+    except (AssertionError, ValueError) as error:  # as the library refuses spaces and values
+        raise experiment.place("algorithm").error(
+            f"{algorithm.called} of Stable-Baselines3 does not take this: {error}"
+        ) from error
+    model.checkpoint_steps = experiment.experiment.checkpoint_steps
+    return model
+
+
+def _export(experiment: Experiment, model: Any, file: Path, seed: int) -> str | None:
+    """Export the policy where its actions are beams; returns the SHA-256 of the file."""
+    made = gymnasium.make(experiment.environment.id, **experiment.environment.options).unwrapped
+    if not isinstance(made, BeamSelectionEnv):
+        return None
+    mean_reward = _mean_reward(model)
+    export_policy(
+        model,
+        made,
+        file,
+        algorithm=f"Stable-Baselines3 {experiment.algorithm.called}",
+        steps=int(model.num_timesteps),
+        seeds=(seed,),
+        figures={} if mean_reward is None else {"mean_reward": mean_reward},
+    )
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+# --- what is told while it trains -------------------------------------------------------------------------
+
+
+def _progress(model: Any, seed: int) -> Progress:
+    return Progress(seed=seed, steps=int(model.num_timesteps), mean_reward=_mean_reward(model))
+
+
+def _mean_reward(model: Any) -> float | None:
+    ended = model.ep_info_buffer
+    return float(np.mean([episode["r"] for episode in ended])) if ended else None
+
+
+def _logger(events: EventFile) -> Any:
+    """A logger of Stable-Baselines3 that writes event files."""
+    from stable_baselines3.common.logger import KVWriter, Logger
+
+    class Curves(KVWriter):  # type: ignore[misc]  # Stable-Baselines3 is not looked at
+        """Writes the numbers of a training."""
+
+        def write(
+            self, key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], step: int = 0
+        ) -> None:
+            kept = {
+                key: float(value)
+                for key, value in key_values.items()
+                if isinstance(value, int | float | np.number)
+                and "tensorboard" not in (key_excluded[key] or ())
+            }
+            if kept:
+                events.write(step, kept)
+
+        def close(self) -> None:
+            """The file is closed by whoever made it."""
+
+    return Logger(folder=None, output_formats=[Curves()])
+
+
+_BEAMS = {"abs_y": "beams/abs_y", "baseline_abs_y": "beams/los_beam", "best_abs_y": "beams/optimum"}
+
+
+def _reporting(report: Callable[[], None]) -> Any:
+    """A callback of Stable-Baselines3: tells the progress, and has |y| among the curves."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Reporting(BaseCallback):  # type: ignore[misc]  # Stable-Baselines3 is not looked at
+        """Called after every step of the environments."""
+
+        told = 0.0
+
+        def _on_step(self) -> bool:
+            infos = self.locals["infos"]
+            self.model.episodes_in_chunk += int(np.sum(self.locals["dones"]))
+            if _BEAMS.keys() <= infos[0].keys():
+                for name, curve in _BEAMS.items():
+                    self.logger.record_mean(curve, float(np.mean([info[name] for info in infos])))
+            now = time.monotonic()
+            if now - self.told >= REPORT_S:
+                self.told = now
+                report()
+            return True
+
+    return Reporting()
+
+
+# --- one process a seed ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def _locked(file: Path, seed: int) -> Iterator[None]:
+    """Keep other processes from training a seed; the lock ends with the process, however it ends."""
+    with writing(file):
+        stream = file.open("a+")
+    with stream:
+        _lock(stream, file, seed)
+        stream.truncate(0)
+        stream.write(str(os.getpid()))
+        stream.flush()
+        yield
+
+
+def _lock(stream: IO[str], file: Path, seed: int) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            # A child whose parent was killed ends at its next report.
+            if time.monotonic() > until:
+                holder = file.read_text() or "?"
+                raise RunError(
+                    f"seed {seed} is being trained by process {holder}; wait for it, or end it"
+                ) from None
+            time.sleep(0.05)
+        else:
+            return

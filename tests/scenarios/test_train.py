@@ -1,0 +1,115 @@
+"""``caviar train``: seeds in processes of their own, ended by Ctrl-C and by kill -9, and gone on with."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from caviar_clients.cli.main import app
+from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_protocol.scenario import find_scenario
+
+pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
+pytest.importorskip("onnx", reason="needs the extra `learning`")
+
+PATIENCE_S = 120.0
+
+
+def written(folder: Path, steps: int, seeds: str = "[1, 2]", observe: str = "aod") -> Path:
+    """A file of an experiment with episodes of 20 frames."""
+    text = find_scenario("geometric").read_text().replace("frames = 500", "frames = 20")
+    (folder / "short.toml").write_text(text)
+    file = folder / "mine.toml"
+    file.write_text(
+        f"""
+        experiment = {{ name = "beams", seeds = {seeds}, steps = {steps}, checkpoint_steps = 200 }}
+        algorithm = {{ name = "dqn", learning_starts = 20, gamma = 0.0 }}
+        [environment]
+        id = "caviar/BeamSelection-v0"
+        members = 2
+        options = {{ scenario = "file:short.toml", observe = ["{observe}"] }}
+        """
+    )
+    return file
+
+
+def results(folder: Path) -> dict[int, str]:
+    """SHA-256 of the policy of each seed that is done."""
+    found = [json.loads(path.read_text()) for path in folder.glob("beams/*/result.json")]
+    return {result["seed"]: result["policy"] for result in found}
+
+
+def train(file: Path, out: str, jobs: int = 2) -> subprocess.Popen[str]:
+    """Start the command, in a process group of its own, as a terminal has it."""
+    command = [sys.executable, "-m", "caviar_clients", "train", str(file), "--out", out, "--jobs", str(jobs)]
+    return subprocess.Popen(
+        command, cwd=file.parent, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+def wait_for_checkpoint(folder: Path, process: subprocess.Popen[str]) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while newest_checkpoint(folder / "beams" / "seed-1" / "checkpoints") is None:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < until
+        os.sched_yield()
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
+    output, _ = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, output
+
+
+def test_a_killed_command_goes_on_to_the_policy_of_one_that_was_not(tmp_path: Path) -> None:
+    """kill -9 in the middle; the files of the policies are the same bytes."""
+    file = written(tmp_path, steps=3000, seeds="[1]")
+    first = train(file, "killed")
+    wait_for_checkpoint(tmp_path / "killed", first)
+    os.killpg(first.pid, signal.SIGKILL)
+    assert finish(first)[0] == -signal.SIGKILL
+    assert not results(tmp_path / "killed")
+    status, output = finish(train(file, "killed"))
+    assert status == 0, output
+    assert "killed/beams goes on: seed 1 from step " in output
+    whole = CliRunner().invoke(app, ["train", str(file), "--out", str(tmp_path / "whole")])
+    assert whole.exit_code == 0, whole.output
+    assert results(tmp_path / "killed") == results(tmp_path / "whole")
+    assert len(results(tmp_path / "whole")) == 1
+
+
+def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = written(tmp_path, steps=2000)
+    first = train(file, "training")
+    wait_for_checkpoint(tmp_path / "training", first)
+    os.killpg(first.pid, signal.SIGINT)
+    status, output = finish(first)
+    assert status == 130, output
+    assert f"stopped; caviar train {file} --out training goes on: seed 1 from step " in output
+    assert "Traceback" not in output
+    second = CliRunner().invoke(app, ["train", str(file), "--jobs", "2"])
+    assert second.exit_code == 0, second.output
+    policies = results(tmp_path / "training")
+    assert sorted(policies) == [1, 2]
+    # One more seed is all that is left to a third call.
+    file.write_text(file.read_text().replace("[1, 2]", "[1, 2, 3]"))
+    third = CliRunner().invoke(app, ["train", str(file), "--jobs", "2"])
+    assert third.exit_code == 0, third.output
+    assert "seed 1 is done, seed 2 is done, seed 3 from step 0" in third.output
+    assert policies.items() < results(tmp_path / "training").items()
+
+
+def test_what_goes_wrong_in_a_process_is_one_line_of_the_command(tmp_path: Path) -> None:
+    status, output = finish(train(written(tmp_path, steps=100, observe="aodd"), "training"))
+    assert status == 1
+    assert "environment.options: no observation is called 'aodd'; did you mean 'aod'?" in output
+    assert "Traceback" not in output

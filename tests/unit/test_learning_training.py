@@ -1,0 +1,297 @@
+"""Trainings: interrupted anywhere they lead to the same policy; curves, checkpoints, exported policies."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caviar_clients.learning import training
+from caviar_clients.learning.campaign import prepare_folder, reached, train_experiment
+from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_clients.learning.events import EventFile, read_events
+from caviar_clients.learning.experiment import Experiment, parse_experiment
+from caviar_clients.learning.training import LinearRate, Progress, train_seed
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.scenario import find_scenario
+from caviar_services.agent.policy import PolicyModel
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+pytestmark = pytest.mark.slow
+
+FRAMES, STEPS = 10, 160
+
+
+@pytest.fixture(autouse=True)
+def _reports_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "REPORT_S", 0.0)
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """`geometric` with episodes of 10 frames."""
+    path = tmp_path / "short.toml"
+    path.write_text(find_scenario("geometric").read_text().replace("frames = 500", f"frames = {FRAMES}"))
+    return path
+
+
+def experiment(
+    scenario: Path, algorithm: str = 'name = "dqn"\nlearning_starts = 20', members: int = 1
+) -> Experiment:
+    return parse_experiment(
+        f"""
+        [experiment]
+        name = "beams"
+        seeds = [1, 2]
+        steps = {STEPS}
+        checkpoint_steps = 35
+        [environment]
+        id = "caviar/BeamSelection-v0"
+        members = {members}
+        [environment.options]
+        scenario = "{scenario}"
+        observe = ["position", "last_beam"]
+        [algorithm]
+        {algorithm}
+        learning_rate = 1e-3
+        final_learning_rate = 1e-4
+        [features.position]
+        scale = 60.0
+        waves = 3
+        """,
+        "my.toml",
+    )
+
+
+class KilledError(Exception):
+    """What ends a training in a test."""
+
+
+def end_at(wanted: Experiment, folder: Path, steps: int) -> list[int]:
+    """Begin or go on to train seed 1, and end that after so many steps; returns the steps that were told."""
+    told = []
+
+    def report(progress: Progress) -> None:
+        told.append(progress.steps)
+        if progress.steps >= steps:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        train_seed(wanted, 1, folder, report)
+    return told
+
+
+ALGORITHMS = [
+    ('name = "dqn"\nlearning_starts = 20\nbuffer_size = 60', 1),
+    ('name = "dqn"\nlearning_starts = 20', 3),
+    ('name = "ppo"\nn_steps = 16\nbatch_size = 16', 2),
+    ('name = "a2c"', 2),
+]
+
+
+@pytest.mark.parametrize(("algorithm", "members"), ALGORITHMS)
+def test_an_interrupted_training_leads_to_the_same_policy(
+    algorithm: str, members: int, short: Path, tmp_path: Path
+) -> None:
+    """Replay buffer, optimizer, rates and random numbers go on as they were: the exported files are equal."""
+    wanted = experiment(short, algorithm, members)
+    whole = train_seed(wanted, 1, tmp_path / "whole")
+    for steps in (50, 100):
+        end_at(wanted, tmp_path / "parts", steps)
+    parts = train_seed(wanted, 1, tmp_path / "parts")
+    assert whole.steps >= STEPS
+    assert whole.policy
+    assert (parts.policy, parts.steps, parts.mean_reward) == (whole.policy, whole.steps, whole.mean_reward)
+
+
+def test_a_training_goes_on_from_its_checkpoint_and_a_finished_one_is_skipped(
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = experiment(short)
+    assert end_at(wanted, tmp_path / "beams", 60)[0] == 0
+    newest = newest_checkpoint(tmp_path / "beams" / "seed-1" / "checkpoints")
+    assert newest is not None
+    assert int(newest.name) == 36  # after 35 steps, when those of the last four are trained on
+    assert reached(wanted, tmp_path) == {1: 36, 2: 0}
+    with np.load(newest / "replay_buffer.npz") as buffer:
+        assert buffer["rewards"].shape == (36, 1)
+        assert buffer["observations/position"].any()
+    assert end_at(wanted, tmp_path / "beams", 100)[0] == 36
+    train_seed(wanted, 1, tmp_path / "beams")
+    monkeypatch.setattr(training, "make_envs", lambda _: pytest.fail("trained again"))
+    assert train_seed(wanted, 1, tmp_path / "beams").steps == STEPS
+
+
+def test_a_draft_of_a_checkpoint_is_not_read(short: Path, tmp_path: Path) -> None:
+    """As a process leaves one that is killed while it writes."""
+    wanted = experiment(short)
+    checkpoints = tmp_path / "beams" / "seed-1" / "checkpoints"
+    draft = checkpoints / "000000000090.partial"
+    draft.mkdir(parents=True)
+    (draft / "model.zip").write_bytes(b"half")
+    assert newest_checkpoint(checkpoints) is None
+    assert end_at(wanted, tmp_path / "beams", 70)[0] == 0
+    assert train_seed(wanted, 1, tmp_path / "beams").steps == STEPS
+    assert [path.name for path in checkpoints.iterdir()] == [f"{STEPS:012d}"]
+
+
+def test_a_damaged_checkpoint_is_named_with_the_remedy(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short)
+    end_at(wanted, tmp_path, 60)
+    newest = newest_checkpoint(tmp_path / "seed-1" / "checkpoints")
+    assert newest is not None
+    (newest / "replay_buffer.npz").write_bytes(b"PK damaged")
+    with pytest.raises(RunError, match=r"checkpoint .* cannot be read.*remove the folder"):
+        train_seed(wanted, 1, tmp_path)
+
+
+def test_the_policy_has_its_card_and_the_curves_those_of_the_library(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short, members=3)
+    result = train_seed(wanted, 2, tmp_path)
+    mine = tmp_path / "seed-2"
+    model = PolicyModel(mine / "policy.onnx")
+    assert model.digest == result.policy
+    card = model.card
+    assert card is not None
+    assert (set(card.observe), card.codebooks) == ({"position", "last_beam"}, ((64, 1),))
+    assert (card.algorithm, card.seeds, card.steps) == ("Stable-Baselines3 DQN", (2,), result.steps)
+    assert card.figures == {"mean_reward": pytest.approx(result.mean_reward)}
+    (file,) = (mine / "curves").iterdir()
+    curves = {tag: (step, value) for tag, step, value in read_events(file)}
+    assert {"rollout/ep_rew_mean", "train/loss", "beams/abs_y", "beams/los_beam", "beams/optimum"} <= set(
+        curves
+    )
+    assert 0 < curves["beams/abs_y"][1] <= curves["beams/optimum"][1]
+    assert STEPS // 2 < curves["beams/abs_y"][0] <= result.steps
+
+
+def test_seeds_differ_and_episodes_of_training_leave_low_seeds_free(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short, members=5)
+    assert train_seed(wanted, 1, tmp_path).policy != train_seed(wanted, 2, tmp_path).policy
+    seeds = {training._chunk_seed(seed, steps) for seed in range(20) for steps in range(0, 1000, 100)}
+    assert len(seeds) == 200
+    assert min(seeds) >= 2**30
+    assert max(seeds) < 2**31
+
+
+def test_an_environment_without_beams_is_trained_without_a_policy_file(tmp_path: Path) -> None:
+    text = """
+        experiment = { name = "pole", seeds = [1], steps = 128 }
+        environment = { id = "CartPole-v1", members = 2 }
+        algorithm = { name = "ppo", n_steps = 32, batch_size = 32 }
+        """
+    (result,) = train_experiment(parse_experiment(text), tmp_path)
+    assert result.policy is None
+    assert sorted(path.name for path in (tmp_path / "pole" / "seed-1").iterdir()) == [
+        "checkpoints", "curves", "lock", "model.zip", "result.json",
+    ]  # fmt: skip
+
+
+def test_a_folder_of_other_values_is_refused_with_the_values(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short)
+    prepare_folder(wanted, tmp_path)
+    prepare_folder(wanted, tmp_path)
+    changed = experiment(short, 'name = "dqn"\nlearning_starts = 30')
+    with pytest.raises(RunError, match=r"algorithm\.learning_starts was 20 and is 30\. Give the experiment"):
+        prepare_folder(changed, tmp_path)
+    short.write_text(short.read_text().replace("components = 3", "components = 2"))
+    with pytest.raises(RunError, match="the file of the scenario is another one"):
+        prepare_folder(wanted, tmp_path)
+
+
+def test_a_seed_is_trained_by_one_process_at_a_time(
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "PATIENCE_S", 0.0)
+    (tmp_path / "seed-1").mkdir()
+    with (
+        training._locked(tmp_path / "seed-1" / "lock", 1),
+        pytest.raises(RunError, match=f"seed 1 is being trained by process {os.getpid()}"),
+    ):
+        train_seed(experiment(short), 1, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            '"last_beam"',
+            '"last_bean"',
+            "my.toml:10: environment.options: no observation is called 'last_bean'",
+        ),
+        ("features.position", "features.positon", "my.toml:16: features.positon: 'positon' is not observed"),
+        (
+            "scale = 60.0",
+            "scale = [60.0, 1.0]",
+            "features.position.scale: has 2 numbers, and 'position' has 3",
+        ),
+        ("observe =", "reward = 3\nobserve =", "no reward is called 3"),
+    ],
+)
+def test_what_the_environment_does_not_take_is_named_with_its_place(
+    old: str, new: str, expected: str, short: Path, tmp_path: Path
+) -> None:
+    text = f"""
+        [experiment]
+        name = "beams"
+        seeds = [1]
+        steps = 100
+
+        [environment]
+        id = "caviar/BeamSelection-v0"
+        members = 2
+
+        [environment.options]
+
+        scenario = "{short}"
+        observe = ["position", "last_beam"]
+        [algorithm]
+        name = "dqn"
+        [features.position]
+        scale = 60.0
+        """
+    with pytest.raises(ScenarioError) as refused:
+        train_seed(parse_experiment(text.replace(old, new).strip(), "my.toml"), 1, tmp_path)
+    assert expected in str(refused.value)
+
+
+def test_an_algorithm_that_does_not_fit_the_actions_is_refused(tmp_path: Path) -> None:
+    text = """
+        experiment = { name = "pendulum", seeds = [1], steps = 128 }
+        environment = { id = "Pendulum-v1" }
+        algorithm = { name = "dqn" }
+        """
+    with pytest.raises(
+        ScenarioError, match=r"algorithm: DQN of Stable-Baselines3 does not take this: .*Discrete"
+    ):
+        train_seed(parse_experiment(text), 1, tmp_path)
+
+
+def test_events_are_records_with_checksums(tmp_path: Path) -> None:
+    """The checksum of a known text, so that reader and writer are not wrong alike (RFC 3720, B.4)."""
+    from caviar_clients.learning import events
+
+    crc = 0x8A9136AA  # of 32 bytes of zeros
+    masked = ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
+    assert events._checksum(bytes(32)) == masked.to_bytes(4, "little")
+    with EventFile(tmp_path) as written:
+        written.write(7, {"a/b": 0.5, "c": -2.0})
+        written.write(300, {"a/b": 1.5})
+    assert list(read_events(written.file)) == [("a/b", 7, 0.5), ("c", 7, -2.0), ("a/b", 300, 1.5)]
+    content = bytearray(written.file.read_bytes())
+    written.file.write_bytes(content[:-3])  # as a kill leaves it
+    assert len(list(read_events(written.file))) == 2
+    content[30] ^= 1
+    written.file.write_bytes(content)
+    with pytest.raises(ValueError, match="the checksum at byte 0 is wrong"):
+        list(read_events(written.file))
+
+
+def test_the_learning_rate_falls_over_the_whole_experiment() -> None:
+    rate = LinearRate(1e-3, 1e-4)
+    assert [rate(1.0), rate(0.5), rate(0.0)] == pytest.approx([1e-3, 5.5e-4, 1e-4])
