@@ -14,6 +14,7 @@ from rich.text import Text
 
 from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.learning import evaluate_command, export_command, train_command
+from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
     Embedded,
     FiguresFile,
@@ -45,6 +46,7 @@ app = typer.Typer(
 )
 bench = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
 app.add_typer(bench, name="bench", rich_help_panel=MEASURE)
+app.add_typer(paper, name="paper", rich_help_panel=MEASURE)
 app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 # Warnings, errors and progress: what a command prints on standard output can be piped.
