@@ -1,8 +1,8 @@
 """Time of the link ``cell`` a frame, beside that of ``beams`` on the same frames, in one process.
 
-Run as ``python tests/bench/bench_cell.py [--users 10] [--slots 1 5 10 20] [--markdown FILE]``. Both links get
-the same scenes, channels of the geometric model and choices of ``los-beam``, in turn; what a frame takes is
-the median over all frames, encoding and digest of the product included.
+Run as ``python tests/bench/bench_cell.py [--users 10] [--slots 1 5 10 20] [--nr] [--markdown FILE]``. Both
+links get the same scenes, channels of the geometric model and choices of ``los-beam``, in turn; what a frame
+takes is the median over all frames, encoding and digest of the product included.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--slots", type=int, nargs="+", default=[1, 5, 10, 20])
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--load", type=float, default=0.5, help="of traffic, of what a lone user could get")
+    parser.add_argument("--nr", action="store_true", help="also with Sionna SYS (extra `system`)")
     parser.add_argument("--markdown", type=Path, help="where the table is written too")
     options = parser.parse_args()
     frames = list(inputs(options.frames, options.users, options.stations))
@@ -135,11 +136,20 @@ def main() -> None:
         f"cell, shannon, {slots} slot{'s' * (slots > 1)}": CellSettings(traffic=(traffic,), slots=slots)
         for slots in options.slots
     }
+    if options.nr:
+        cells |= {
+            f"cell, nr, {slots} slot{'s' * (slots > 1)}": CellSettings(
+                traffic=(traffic,), slots=slots, rate_model="nr"
+            )
+            for slots in options.slots
+        }
     beams = BeamLink(BeamLinkSettings(), run_info("link"))
     links: list[Service[Any]] = [
         beams,
         *(CellLink(settings, run_info("link")) for settings in cells.values()),
     ]
+    for link in links:
+        link.prepare(Preparation(demand={"link": frozenset()}))
     base, *found = timed(links, frames)
     rows = [("beams", f"{base:.2f}", "")]
     rows += [(name, f"{ms:.2f}", f"{ms - base:.2f}") for name, ms in zip(cells, found, strict=True)]

@@ -61,6 +61,8 @@ def _extras(spec: ServiceSpec) -> set[str]:
     scenery = spec.settings.get("scenery", "")
     if isinstance(scenery, str) and scenery.startswith("sionna:"):
         found.add("world")
+    if spec.settings.get("rate_model") == "nr":  # of the link `cell`
+        found.add("system")
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")
     for rung in (*ladder, *([reference] if reference else [])):  # models that an adaptive channel has
         found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)

@@ -9,6 +9,7 @@ slot (`slot_rates`); the oldest packets go first, and those that are too old are
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -33,9 +34,10 @@ from caviar_services.link.association import Layout, associate
 from caviar_services.link.base import wrong_choice
 from caviar_services.link.beams import Scored, SweepingLink
 from caviar_services.link.cell_settings import CellSettings, check_cell_settings
-from caviar_services.link.slot_rates import SlotRates, noise_rise
+from caviar_services.link.nr import Blocks, NrRates, load_blocks
+from caviar_services.link.slot_rates import ShannonRates, SlotRates, SlotSinr, noise_rise
 from caviar_services.link.terminals import Terminals, TerminalState
-from caviar_services.service import Frame, RunInfo, StepResult
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +45,9 @@ class _Played:
     """What the slots of a frame gave each terminal, Shape ``[T]`` each."""
 
     blocks: Int64Array
+    errors: Int64Array
     sinr: Float64Array
-    """Sum over the slots that served it."""
+    """Mean over the slots that served it; 0 where none did."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +92,7 @@ class CellLink(SweepingLink[CellSettings]):
     checkpoints: ClassVar[bool] = True
     _layout: Layout | None = None
     _serving: _Serving | None = None
+    _blocks: Mapping[str, Blocks]
     _terminals: Terminals | None = None
 
     @classmethod
@@ -101,6 +105,20 @@ class CellLink(SweepingLink[CellSettings]):
             settings = msgspec.structs.replace(settings, max_spectral_efficiency=HIGHEST_SPECTRAL_EFFICIENCY)
         super().__init__(settings, run)
         self._slot_s = run.sampling_period_ns * 1e-9 / settings.slots
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Load the tables of the rate model ``nr``.
+
+        Raises:
+            SetupError: Sionna SYS is not installed.
+        """
+        prepared, settings = super().prepare(preparation), self.settings
+        if settings.rate_model != "nr":
+            return prepared
+        self._blocks = load_blocks(
+            self.run.carriers, self._slot_s, settings.mcs_table, settings.users_per_slot, self.run.progress
+        )
+        return prepared
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Every episode begins with empty buffers."""
@@ -127,6 +145,8 @@ class CellLink(SweepingLink[CellSettings]):
         scored = self.score(frame)
         reward = self.settings.reward
         fields, counts = self.fields(scored, reward), self.counts(scored)
+        if self.settings.rate_model == "nr":
+            self._add_rates(scored, fields)
         layout = self._layout
         if layout is None or layout.users is not scored.budget.users:
             layout = self._layout = Layout.of(scored.budget.users)
@@ -137,7 +157,9 @@ class CellLink(SweepingLink[CellSettings]):
             for packets in terminals.arrivals(frame, missed):
                 terminals.buffers.begin_slot(packets)
         serving, counts["handovers"] = self._associate(frame, layout, terminals, fields)
-        played = self._play(frame, scored, terminals, serving, fields)
+        has_beams = (fields["tx_beam"][serving.users] >= 0) & (fields["snr"][serving.users] > 0)
+        rates = self._rates(frame, scored, terminals, serving, fields)
+        played = self._play(frame, terminals, serving, rates, has_beams)
         of_terminals = self._outcome(terminals, before, played)
         count = len(layout.users)
         fields |= {name: _with_zeros(found, serving.users, count) for name, found in of_terminals.items()}
@@ -150,6 +172,16 @@ class CellLink(SweepingLink[CellSettings]):
             fidelity=scored.channel.rung,
             counts={name: count for name, count in counts.items() if count},
         )
+
+    def _add_rates(self, scored: Scored, fields: dict[str, Any]) -> None:
+        """Put into the fields what a user gets through that is served alone, at its SNR."""
+        snr, rate = fields["snr"], np.zeros(len(scored.budget.users))
+        for name, blocks in self._blocks.items():
+            here = np.array([carrier == name for carrier in scored.budget.carrier], np.bool_) & (snr > 0)
+            rate[here] = blocks.goodput(snr[here], self.settings.target_block_error) / self._slot_s
+        fields |= {"bit_rate": rate, "spectral_efficiency": rate / scored.budget.bandwidth}
+        if self.settings.reward == "spectral_efficiency":
+            fields["reward"] = fields["spectral_efficiency"]
 
     def _terminals_of(self, layout: Layout) -> tuple[Terminals, int]:
         terminals, left = self._terminals, 0
@@ -185,56 +217,72 @@ class CellLink(SweepingLink[CellSettings]):
             before = self._serving = _Serving.of(layout, found)
         return before, int(changed.sum())
 
-    def _play(
+    def _rates(
         self,
         frame: Frame,
         scored: Scored,
         terminals: Terminals,
         serving: _Serving,
         fields: dict[str, Any],
-    ) -> _Played:
-        """Play the slots of a frame, one after the other."""
-        settings, buffers = self.settings, terminals.buffers
-        at_once, layout, users, members = (
-            settings.users_per_slot,
-            serving.layout,
-            serving.users,
-            serving.members,
-        )
-        within = settings.sharing == "space" and at_once > 1
+    ) -> SlotRates:
+        """The rate model in the slots of a frame."""
+        settings, layout, users = self.settings, serving.layout, serving.users
+        within = settings.sharing == "space" and settings.users_per_slot > 1
         rise = None
         if (settings.interference and len(layout.transmitters) > 1) or within:
             rise = noise_rise(scored, layout, users, settings.interference, within)
-        rates = SlotRates(
-            scored.budget.bandwidth[users],
-            settings.max_spectral_efficiency,
-            self._slot_s,
-            fields["snr"][users],
-            members,
-            settings.sharing,
-            rise,
-        )
-        has_beams = (fields["tx_beam"][users] >= 0) & (rates.alone > 0)
-        blocks, sinr = np.zeros(len(users), np.int64), np.zeros(len(users))
-        for packets in terminals.arrivals(frame, frame.number):
+        snr = fields["snr"][users][None, :, None]
+        sinr = SlotSinr(snr, serving.members, settings.users_per_slot, settings.sharing, rise)
+        if settings.rate_model == "nr":
+            return NrRates(
+                sinr,
+                [self._blocks[carrier] for _, carrier in layout.names],
+                terminals.adaptation,
+                settings.target_block_error,
+                settings.outer_loop_db,
+                frame.generator("blocks"),
+            )
+        bandwidth = scored.budget.bandwidth[users]
+        return ShannonRates(sinr, bandwidth, settings.max_spectral_efficiency, self._slot_s)
+
+    def _play(
+        self,
+        frame: Frame,
+        terminals: Terminals,
+        serving: _Serving,
+        rates: SlotRates,
+        has_beams: BoolArray,
+    ) -> _Played:
+        """Play the slots of a frame, one after the other."""
+        settings, buffers = self.settings, terminals.buffers
+        slots, blocks, errors = np.zeros((3, len(has_beams)), np.int64)
+        sinr = np.zeros(len(has_beams))
+        for slot, packets in enumerate(terminals.arrivals(frame, frame.number)):
+            offered = rates.offered(slot)
             if terminals.has_full:
-                packets = packets + self._refill(terminals, rates.alone)
+                packets = packets + self._refill(terminals, offered)
             buffers.begin_slot(packets)
             # A slot of a user that has little to send carries little, whatever its rate.
-            least = np.minimum(rates.alone, buffers.waiting)
+            waiting = buffers.waiting
+            least = np.minimum(offered, waiting)
             eligible = has_beams & (least > 0)
             if terminals.lost.any():
                 eligible &= terminals.lost == 0
                 terminals.lost -= terminals.lost > 0
-            served = self._schedule(terminals, eligible, members, least)
-            carried = rates.carried(served, at_once)
+            served = self._schedule(terminals, eligible, serving.members, least)
+            carried = rates.carried(slot, served, waiting)
             sent = buffers.serve(np.where(served, carried.bits, 0))
             terminals.turn = note_turns(terminals.turns, served, terminals.turn)
             if settings.scheduler == "proportional-fair":
                 terminals.average = averaged(terminals.average, sent, settings.average_slots)
-            blocks += served
+            slots += served
             sinr += np.where(served, carried.sinr, 0.0)
-        return _Played(blocks, sinr)
+            if settings.rate_model == "nr":
+                blocks += np.where(served, carried.blocks, 0)
+                errors += np.where(served, carried.errors, 0)
+        if settings.rate_model != "nr":
+            blocks = slots
+        return _Played(blocks, errors, sinr / np.maximum(slots, 1))
 
     def _refill(self, terminals: Terminals, bits: Int64Array) -> Int64Array:
         """Packets that fill up the buffers of those that always have something to send, Shape ``[T]``."""
@@ -275,10 +323,10 @@ class CellLink(SweepingLink[CellSettings]):
             "delivered": totals.delivered - before.delivered,
             "delay": delays_in_seconds(totals, before, self._slot_s),
             "waiting": buffers.oldest * self._slot_s,
-            "sinr": played.sinr / np.maximum(played.blocks, 1),
+            "sinr": played.sinr,
             "throughput": sent / frame_s,
             "blocks": played.blocks,
-            "block_errors": np.zeros_like(played.blocks),
+            "block_errors": played.errors,
         }
 
 

@@ -14,7 +14,7 @@ from caviar_services.link.association import AssociationRule
 from caviar_services.link.beams import RewardKind, SweepSettings
 from caviar_services.link.slot_rates import Sharing
 
-RateModel = Literal["shannon", "capped"]
+RateModel = Literal["shannon", "capped", "nr"]
 
 CellReward = RewardKind | Literal["throughput", "delay"]
 
@@ -30,7 +30,14 @@ class CellSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     slots: Annotated[int, quantity("1", "of a frame, evenly long", ge=1, le=10_000)] = 1
     rate_model: RateModel = "shannon"
     """Spectral efficiency of a user: ``shannon``: log2(1 + SINR); ``capped``: this up to
-    ``max_spectral_efficiency``, by default 7.4063 bit/s/Hz of 256-QAM (3GPP TS 38.214)."""
+    ``max_spectral_efficiency``, by default 7.4063 bit/s/Hz of 256-QAM (3GPP TS 38.214); ``nr``: transport
+    blocks of 5G NR that fail at random, from the tables of Sionna SYS (extra ``system``)."""
+    mcs_table: Annotated[int, quantity("1", "of modulation and coding schemes", ge=1, le=2)] = 2
+    """Of ``nr``: 1: up to 64-QAM, 2: up to 256-QAM (3GPP TS 38.214, tables 5.1.3.1-1 and -2)."""
+    target_block_error: Annotated[float, quantity("1", "share of blocks that may fail", gt=0, lt=1)] = 0.1
+    """Of ``nr``: schemes are chosen so that no more blocks are expected to."""
+    outer_loop_db: Annotated[float, quantity("dB", "step after a failed block", ge=0, le=20)] = 1.0
+    """Of ``nr``: by as much schemes are chosen more carefully after a failed block; 0: no outer loop."""
     scheduler: Scheduler = "round-robin"
     """Which users of a transmitter are served in a slot, of those with something to send and beams that an
     agent chose; where an agent schedules receivers, of these alone. ``round-robin``: who was not served for

@@ -14,6 +14,7 @@ from caviar_protocol.cell.traffic import Offered, Traffic, arrivals, is_random
 from caviar_protocol.seeding import generator
 from caviar_services.checkpoint import Packed
 from caviar_services.link.cell_settings import CellSettings
+from caviar_services.link.nr import Adaptation
 from caviar_services.service import Frame
 
 Terminal = tuple[str, str]
@@ -34,6 +35,8 @@ class TerminalState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     turn: int
     servers: tuple[str, ...]
     lost: Packed
+    offset_db: Packed
+    rise: Packed
     average: Packed
 
 
@@ -70,6 +73,8 @@ class Terminals:
         """Slots that each has still to wait, after its transmitter changed."""
         self.average: Float64Array = np.zeros(len(self.names))
         """Bits a slot that each was served, on average over the last slots."""
+        self.adaptation = Adaptation(np.zeros(len(self.names)), np.ones(len(self.names)))
+        """What link adaptation knows of each."""
         # Arrivals of a block of frames: number of the block, seeds, and packets, Shape [block slots, T].
         self._drawn: tuple[tuple[int, int, int], Int64Array] | None = None
         self._frames = max(1, BLOCK // settings.slots)
@@ -84,14 +89,16 @@ class Terminals:
             The terminals, and the bits that waited for those that left.
         """
         made = Terminals(names, self._settings, self._slot_s)
-        before = {name: index for index, name in enumerate(self.names)}
-        sources = np.array([before.pop(name, -1) for name in made.names], np.int64)
-        left = int(self.buffers.waiting[list(before.values())].sum())
+        gone = {name: index for index, name in enumerate(self.names)}
+        sources = np.array([gone.pop(name, -1) for name in made.names], np.int64)
+        left = int(self.buffers.waiting[list(gone.values())].sum())
         made.buffers = self.buffers.rearranged(sources, made.buffers)
         kept = sources >= 0
         made.turns[kept] = self.turns[sources[kept]]
         made.turn = self.turn
         made.lost[kept] = self.lost[sources[kept]]
+        for values, before in zip(made.adaptation, self.adaptation, strict=True):
+            values[kept] = before[sources[kept]]
         made.servers = tuple(self.servers[source] if source >= 0 else "" for source in sources.tolist())
         made.average[kept] = self.average[sources[kept]]
         return made, left
@@ -154,6 +161,8 @@ class Terminals:
             turn=self.turn,
             servers=self.servers,
             lost=Packed.of(self.lost, "<i8"),
+            offset_db=Packed.of(self.adaptation.offset_db, "<f8"),
+            rise=Packed.of(self.adaptation.rise, "<f8"),
             average=Packed.of(self.average, "<f8"),
         )
 
@@ -172,6 +181,7 @@ class Terminals:
         made.turn = state.turn
         made.servers = state.servers
         made.lost = state.lost.array(np.int64)
+        made.adaptation = Adaptation(state.offset_db.array(np.float64), state.rise.array(np.float64))
         made.average = state.average.array(np.float64)
         return made
 
