@@ -108,16 +108,26 @@ DISTRIBUTION = "caviar-sim"
 """Name under which pip knows this project."""
 
 # A module that each extra brings and the base install does not.
-_MODULES = {"channel": "sionna", "sensors": "mitsuba", "world": "libsumo", "plot": "matplotlib"}
+_MODULES = {
+    "channel": "sionna",
+    "sensors": "mitsuba",
+    "world": "libsumo",
+    "plot": "matplotlib",
+    "system": "sionna.sys",
+}
 
 
 def has_extra(extra: str) -> bool:
     """Whether the libraries of an extra can be imported; they are not imported for that.
 
     Args:
-        extra: Name of an extra: ``channel``, ``sensors``, ``world`` or ``plot``.
+        extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``plot`` or ``system``.
     """
-    return importlib.util.find_spec(_MODULES[extra]) is not None
+    package, _, inner = _MODULES[extra].partition(".")
+    spec = importlib.util.find_spec(package)
+    # Looking for a module inside would import its package, a ray tracer.
+    places = [] if spec is None else spec.submodule_search_locations or []
+    return spec is not None and (not inner or any(Path(place, inner).is_dir() for place in places))
 
 
 def install_command(*extras: str) -> str:

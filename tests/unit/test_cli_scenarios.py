@@ -75,6 +75,20 @@ def test_what_a_scenario_needs_follows_from_its_services(name: str, needed: tupl
     assert scenarios.extras_of(load_scenario(name)) == needed
 
 
+def test_the_rate_model_of_a_link_may_need_an_extra() -> None:
+    text = shipped_scenarios()["cell"].read_text().replace('rate_model = "capped"', 'rate_model = "nr"')
+    assert scenarios.extras_of(parse_scenario(text)) == ("system",)
+    # `sionna` alone is the ray tracer; it is looked for without being imported.
+    assert host.has_extra("system") == bool(metadata_of("sionna"))
+
+
+def metadata_of(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
 def test_a_run_without_its_extras_is_refused_with_one_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared, "has_extra", lambda extra: extra == "world")
     with pytest.raises(SetupError, match=re.escape("'caviar-sim[channel,sensors]'")):
