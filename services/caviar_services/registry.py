@@ -44,9 +44,16 @@ BUILT_IN: dict[str, str] = {
     "link:cell": "caviar_services.link.cell:CellLink",
     "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
     "agent:random": "caviar_services.agent.baselines:RandomAgent",
-    "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
-    "agent:policy": "caviar_services.agent.policy:PolicyAgent",
     "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
+    "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
+    "agent:exhaustive-sweep": "caviar_services.agent.sweeps:ExhaustiveSweepAgent",
+    "agent:hierarchical-sweep": "caviar_services.agent.sweeps:HierarchicalSweepAgent",
+    "agent:last-sweep": "caviar_services.agent.sweeps:LastSweepAgent",
+    "agent:fingerprint": "caviar_services.agent.fingerprint:FingerprintAgent",
+    "agent:out-of-band": "caviar_services.agent.out_of_band:OutOfBandAgent",
+    "agent:ucb": "caviar_services.agent.bandits:UcbAgent",
+    "agent:thompson": "caviar_services.agent.bandits:ThompsonAgent",
+    "agent:policy": "caviar_services.agent.policy:PolicyAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
 }
 """``role:name`` to ``module:Class``. To add an implementation: one file, one line here."""

@@ -11,11 +11,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from msgspec.structs import replace
 
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.scenario.rules import world_of
+from caviar_services.recorder.mcap import McapRecorder
 from caviar_services.registry import BUILT_IN, load
-from caviar_services.testing import CONFORMANCE, ServiceConformance
+from caviar_services.testing import CONFORMANCE, ServiceConformance, samples
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 
@@ -86,12 +88,25 @@ def _first_beams() -> Path:
     return file
 
 
+def _recorded_street() -> Path:
+    """A run of the sample street, with products of all topics."""
+    tests = type("Recorded", (CONFORMANCE["recorder"],), {"service_class": McapRecorder})
+    directory: Path = tests.play(Path(_FOLDER.name)).directory  # type: ignore[attr-defined]
+    return directory
+
+
 def _tests_of(key: str) -> type[ServiceConformance]:
     role, _, name = key.partition(":")
     members: dict[str, object] = {"service_class": load(role, name), "__module__": __name__}
     example = _example(role, name)
     if key == "agent:policy" and importlib.util.find_spec("onnx") is not None:
         members["settings"] = {"file": f"file:{_first_beams()}", "observe": ["aod"]}
+    if key == "agent:fingerprint":
+        members["settings"] = {"file": f"file:{_recorded_street()}"}
+    if key == "agent:out-of-band":  # the street's channel has one carrier, of which it takes the spectrum
+        members["settings"] = {"aid": samples.CARRIERS[0].name}
+        higher = replace(samples.CARRIERS[0], name="higher", frequency_hz=60e9)
+        members["carriers"] = (*samples.CARRIERS, higher)
     if example is not None:
         scenario, service = example
         members["settings"] = {**scenario.services[service].settings, **OVERRIDES.get(key, {})}

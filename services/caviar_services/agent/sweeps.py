@@ -1,0 +1,305 @@
+"""Agents that sweep the codebooks: ``exhaustive-sweep``, ``hierarchical-sweep`` and ``last-sweep``.
+
+They find beams as radio systems do, by pilots (`caviar_services.agent.pilots`), and pay for it in air time.
+An exhaustive sweep of Nt TX and Nr RX beams takes Nt·Nr pilots and finds the best pair (paper, eq. 2). A
+hierarchical sweep first tries wide beams, then the narrower ones within the best of them: for N beams and b
+children of each about b·log_b(N) pilots an end, but it may go astray where a wide beam has several paths
+in it, or too little gain. ``last-sweep`` sweeps every ``period`` frames and keeps to what it found.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
+from typing import Annotated, ClassVar
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from caviar_protocol.arrays import Complex128Array, Int64Array, quantity
+from caviar_protocol.topics import AntennaArray
+from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
+from caviar_services.checkpoint import restored, saved
+from caviar_services.link.base import User
+from caviar_services.link.beam_sweep import best_pairs, sweep, sweep_users
+from caviar_services.service import RunInfo
+
+
+def sweep_all(sounding: Sounding, indices: Iterable[int]) -> Iterator[Measured]:
+    """Try all pairs of some users, and take the best of each.
+
+    Args:
+        sounding: Users and channels; the pilots are counted in it.
+        indices: The users.
+
+    Returns:
+        The pair of each user that has a path: without one there is nothing to measure but noise.
+    """
+    users, chosen = sounding.users, set(indices)
+    sounding.count_shared((users[u], users[u].tx.array.size * users[u].rx.array.size) for u in sorted(chosen))
+    h = [sounding.h[u] if u in chosen else None for u in range(len(users))]
+    for group in sweep_users(users, h):
+        for u, abs_y in zip(group.users, group.abs_y, strict=True):
+            best = best_pairs(sounding.measured(users[u], abs_y)[None], 1)
+            yield Measured(u, int(best.tx_beam[0, 0]), int(best.rx_beam[0, 0]))
+
+
+class ExhaustiveSweepAgent(PilotAgent[PilotSettings]):
+    """Tries all pairs in every frame: the best choice, at the highest price.
+
+    Example:
+        >>> from caviar_services.testing.samples import CARRIERS, granted
+        >>> agent = ExhaustiveSweepAgent(PilotSettings(), RunInfo(name="agent", carriers=CARRIERS))
+        >>> agent.step(granted(agent.inputs, 0, "agent")).counts["pilots"]  # 16 TX beams, 3 or 2 RX beams
+        48
+    """
+
+    def select(self, sounding: Sounding) -> Iterator[Measured]:
+        """The pair of greatest |y|, as measured."""
+        return sweep_all(sounding, range(len(sounding.users)))
+
+
+class LastSweepSettings(PilotSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the agent ``last-sweep``."""
+
+    period: Annotated[int, quantity("frame", "from one sweep to the next", ge=1, le=1_000_000)] = 10
+
+
+class _Kept(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """The pair that the last sweep found for a user."""
+
+    carrier: str
+    tx: str
+    rx: str
+    tx_beam: int
+    rx_beam: int
+
+
+class _LastSweepState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    swept: int
+    """Frame of the last sweep of all users; −1: there was none."""
+    kept: tuple[_Kept, ...]
+
+
+class LastSweepAgent(PilotAgent[LastSweepSettings]):
+    """Keeps to the best pairs of the last sweep, which age as users move.
+
+    A user that comes between two sweeps, or had no path in the last one, is swept by itself.
+
+    Args:
+        settings: Users, pilots and the period.
+        run: What the agent knows about the run.
+    """
+
+    Settings = LastSweepSettings
+    checkpoints: ClassVar[bool] = True
+
+    def __init__(self, settings: LastSweepSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._swept = -1
+        self._kept: dict[tuple[str, str, str], tuple[int, int]] = {}
+
+    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
+        """Every episode begins with a sweep."""
+        self._swept, self._kept = -1, {}
+
+    def checkpoint(self) -> bytes:
+        """What the last sweep found, and when it was."""
+        kept = tuple(_Kept(*key, *beams) for key, beams in sorted(self._kept.items()))
+        return saved(self, 1, _LastSweepState(self._swept, kept))
+
+    def restore(self, state: bytes) -> None:
+        """See `checkpoint`."""
+        found = restored(self, 1, _LastSweepState, state)
+        self._swept = found.swept
+        self._kept = {(k.carrier, k.tx, k.rx): (k.tx_beam, k.rx_beam) for k in found.kept}
+
+    def select(self, sounding: Sounding) -> Iterator[Measured]:
+        """What the last sweep found, or finds now."""
+        users, frame = sounding.users, sounding.frame.number
+        if self._swept < 0 or frame - self._swept >= self.settings.period:
+            # Of users that left nothing is kept; one without a path now has no pair that is worth keeping.
+            self._swept, self._kept = frame, {}
+        missing = [u for u, user in enumerate(users) if _key(user) not in self._kept]
+        for found in sweep_all(sounding, missing):
+            self._kept[_key(users[found.user])] = found.tx_beam, found.rx_beam
+        for u, user in enumerate(users):
+            if (pair := self._kept.get(_key(user))) is not None:
+                yield Measured(u, *pair)
+
+
+def _key(user: User) -> tuple[str, str, str]:
+    return user.carrier.name, user.tx.name, user.rx.name
+
+
+class HierarchicalSettings(PilotSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the agent ``hierarchical-sweep``."""
+
+    branching: Annotated[
+        int, quantity("1", "narrower beams within a wide one, along each axis of an array", ge=2, le=64)
+    ] = 4
+
+
+class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
+    """Narrows the beams of both ends level by level, in every frame.
+
+    A wide beam is a DFT beam of fewer elements, the others are switched off (the DEACT codebook of Xiao et
+    al., "Hierarchical codebook design for beamforming training in millimeter-wave communication", IEEE Trans.
+    Wireless Commun. 15(5), 2016). At each level the pairs of the beams within the best pair so far are tried.
+    All users of a transmitter listen to the pilots of the first level; those of the others are of one user.
+
+    Example:
+        >>> from caviar_services.testing.samples import CARRIERS, granted
+        >>> agent = HierarchicalSweepAgent(HierarchicalSettings(), RunInfo(name="agent", carriers=CARRIERS))
+        >>> agent.step(granted(agent.inputs, 0, "agent")).counts["pilots"]  # 4·3, then 4 for each user
+        20
+    """
+
+    Settings = HierarchicalSettings
+
+    def select(self, sounding: Sounding) -> Iterator[Measured]:
+        """The pair that the levels lead to; no choice for a user without a path."""
+        users, branching = sounding.users, self.settings.branching
+        levels = {u: _levels_of(user, branching) for u, user in enumerate(users)}
+        first = ((users[u], ends[0].tx.size * ends[0].rx.size) for u, ends in levels.items())
+        sounding.count_shared(first)
+        for u, ends in levels.items():
+            matrix = sounding.h[u]
+            if matrix is not None:
+                yield Measured(u, *_descend(sounding, users[u], matrix, ends))
+
+
+class Ends(msgspec.Struct, frozen=True):
+    """The arrays of both ends with the elements that a level uses, and which elements these are."""
+
+    tx: AntennaArray
+    rx: AntennaArray
+    tx_elements: Int64Array
+    rx_elements: Int64Array
+
+
+def _descend(
+    sounding: Sounding, user: User, matrix: Complex128Array, levels: Sequence[Ends]
+) -> tuple[int, int]:
+    tx_beam = rx_beam = 0
+    before: Ends | None = None
+    for number, ends in enumerate(levels):
+        abs_y = sweep(matrix[np.ix_(ends.rx_elements, ends.tx_elements)], ends.tx, ends.rx)
+        if before is None:
+            tx_beams, rx_beams = np.arange(ends.tx.size), np.arange(ends.rx.size)
+        else:
+            tx_beams = children(before.tx, ends.tx)[tx_beam]
+            rx_beams = children(before.rx, ends.rx)[rx_beam]
+            if len(tx_beams) * len(rx_beams) == 1:
+                tx_beam, rx_beam, before = int(tx_beams[0]), int(rx_beams[0]), ends
+                continue  # there is nothing to choose
+            sounding.count(user, len(tx_beams) * len(rx_beams))
+        tried = sounding.measured(user, abs_y[np.ix_(tx_beams, rx_beams)], str(number))
+        best = best_pairs(tried[None], 1)
+        tx_beam, rx_beam = int(tx_beams[best.tx_beam[0, 0]]), int(rx_beams[best.rx_beam[0, 0]])
+        before = ends
+    return tx_beam, rx_beam
+
+
+def _levels_of(user: User, branching: int) -> tuple[Ends, ...]:
+    return _levels(user.tx.array, user.rx.array, branching)
+
+
+# Arrays are few and frozen, and asked for in every frame.
+@lru_cache(maxsize=256)
+def _levels(tx: AntennaArray, rx: AntennaArray, branching: int) -> tuple[Ends, ...]:
+    """From the widest beams to the codebook itself; an end that is through keeps its beam."""
+    of_tx, of_rx = narrowing(tx, branching), narrowing(rx, branching)
+    depth = max(len(of_tx), len(of_rx))
+    of_tx += of_tx[-1:] * (depth - len(of_tx))
+    of_rx += of_rx[-1:] * (depth - len(of_rx))
+    return tuple(
+        Ends(wide_tx, wide_rx, used_elements(tx, wide_tx), used_elements(rx, wide_rx))
+        for wide_tx, wide_rx in zip(of_tx, of_rx, strict=True)
+    )
+
+
+def narrowing(array: AntennaArray, branching: int) -> list[AntennaArray]:
+    """List the arrays of a hierarchical sweep, each at most ``branching`` times as long as the one before.
+
+    Args:
+        array: The whole array, which is the last of them.
+        branching: Of each axis.
+
+    Returns:
+        Arrays with fewer rows and columns in each panel and polarization, the smallest first.
+
+    Example:
+        >>> [(a.rows, a.columns) for a in narrowing(AntennaArray(rows=2, columns=64), 4)]
+        [(2, 4), (2, 16), (2, 64)]
+    """
+    rows, columns = _sizes(array.rows, branching), _sizes(array.columns, branching)
+    depth = max(len(rows), len(columns))
+    # The shorter axis is whole from its end on: its beams are told apart while those of the other are wide.
+    rows += rows[-1:] * (depth - len(rows))
+    columns += columns[-1:] * (depth - len(columns))
+    return [replace(array, rows=r, columns=c) for r, c in zip(rows, columns, strict=True)]
+
+
+def _sizes(size: int, branching: int) -> list[int]:
+    sizes = [size]
+    while sizes[0] > branching:
+        sizes.insert(0, -(-sizes[0] // branching))
+    return sizes
+
+
+def used_elements(whole: AntennaArray, part: AntennaArray) -> Int64Array:
+    """Elements of an array that a smaller one has: the first rows and columns of each block.
+
+    Args:
+        whole: The array.
+        part: The same with fewer rows and columns.
+
+    Example:
+        >>> used_elements(AntennaArray(rows=2, columns=3), AntennaArray(rows=1, columns=2)).tolist()
+        [0, 2]
+    """
+    blocks = whole.size // (whole.rows * whole.columns)
+    grid = np.arange(whole.size).reshape(blocks, whole.columns, whole.rows)
+    return grid[:, : part.columns, : part.rows].reshape(-1)
+
+
+@lru_cache(maxsize=256)
+def children(wide: AntennaArray, narrow: AntennaArray) -> tuple[Int64Array, ...]:
+    """The beams of a codebook within each beam of a wider one.
+
+    Beam k of n elements points to k/n, as a share of what an axis tells apart: beam j of m elements is within
+    the one whose k/n is nearest to j/m.
+
+    Args:
+        wide: Array of the wider beams.
+        narrow: The same with more rows or columns.
+
+    Returns:
+        Of each beam of ``wide`` those of ``narrow``; each of these is within one.
+
+    Example:
+        >>> [beams.tolist() for beams in children(AntennaArray(columns=2), AntennaArray(columns=4))]
+        [[0, 3], [1, 2]]
+    """
+    blocks = wide.size // (wide.rows * wide.columns)
+    # Beam k has p = k % rows and q = k // rows, block by block (`caviar_protocol.topics.Link`).
+    within = np.empty((blocks, narrow.columns, narrow.rows), np.int64)
+    rows, columns = _parents(wide.rows, narrow.rows), _parents(wide.columns, narrow.columns)
+    for block in range(blocks):
+        within[block] = (block * wide.columns + columns[:, None]) * wide.rows + rows
+    flat = within.reshape(-1)
+    found: dict[int, list[int]] = defaultdict(list)
+    for beam, parent in enumerate(flat.tolist()):
+        found[parent].append(beam)
+    return tuple(np.array(found[parent], np.int64) for parent in range(wide.size))
+
+
+def _parents(wide: int, narrow: int) -> Int64Array:
+    """The beam of ``wide`` elements along an axis that each one of ``narrow`` is within."""
+    # In whole numbers: j·n/m rounded half up.
+    beams = np.arange(narrow)
+    parents: Int64Array = (2 * beams * wide + narrow) // (2 * narrow) % wide
+    return parents
