@@ -255,14 +255,21 @@ class ThompsonAgent(BanditAgent):
     Example:
         >>> agent = ThompsonAgent(BanditSettings(exploration=0.0), RunInfo(name="agent"))
         >>> bandit = Bandit(3)
-        >>> bandit.learn(2, 5.0, 1.0)
+        >>> bandit.learn(0, 5.0, 1.0)
+        >>> bandit.learn(1, 2.0, 1.0)
+        >>> bandit.learn(2, 1.0, 1.0)
         >>> agent.pick(bandit, np.random.default_rng(0))  # without exploration: the best so far
-        2
+        0
     """
 
     def pick(self, bandit: Bandit, generator: np.random.Generator) -> int:
-        """The pair of the greatest draw from N(S/(n + 1), (c·B)²/(n + 1)), with B the highest feedback."""
+        """The pair of the greatest draw from N((S + B)/(n + 1), (c·B)²/(n + 1)): B is the highest feedback.
+
+        The prior of each pair is as good as the best feedback so far. With one of 0, pairs that never served
+        would hardly be drawn once another one has.
+        """
         weight = bandit.plays + 1.0
-        spread = self.settings.exploration * bandit.highest / np.sqrt(weight)
-        drawn = bandit.sums / weight + spread * generator.standard_normal(len(weight))
+        highest = bandit.highest or 1.0  # as long as nothing came back, anything may
+        spread = self.settings.exploration * highest / np.sqrt(weight)
+        drawn = (bandit.sums + highest) / weight + spread * generator.standard_normal(len(weight))
         return int(drawn.argmax())

@@ -145,8 +145,8 @@ class HierarchicalSettings(PilotSettings, frozen=True, kw_only=True, forbid_unkn
 class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
     """Narrows the beams of both ends level by level, in every frame.
 
-    A wide beam is a DFT beam of fewer elements, the others are switched off (the DEACT codebook of Xiao et
-    al., "Hierarchical codebook design for beamforming training in millimeter-wave communication", IEEE Trans.
+    A wide beam is one of fewer elements, the others are off (the DEACT codebook of Xiao, He, Xia and Xia,
+    "Hierarchical codebook design for beamforming training in millimeter-wave communication", IEEE Trans.
     Wireless Commun. 15(5), 2016). At each level the pairs of the beams within the best pair so far are tried.
     All users of a transmitter listen to the pilots of the first level; those of the others are of one user.
 
@@ -163,62 +163,88 @@ class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
         """The pair that the levels lead to; no choice for a user without a path."""
         users, branching = sounding.users, self.settings.branching
         levels = {u: _levels_of(user, branching) for u, user in enumerate(users)}
-        first = ((users[u], ends[0].tx.size * ends[0].rx.size) for u, ends in levels.items())
+        first = ((users[u], of[0].tx.array.size * of[0].rx.array.size) for u, of in levels.items())
         sounding.count_shared(first)
-        for u, ends in levels.items():
+        for u, of_user in levels.items():
             matrix = sounding.h[u]
             if matrix is not None:
-                yield Measured(u, *_descend(sounding, users[u], matrix, ends))
+                yield Measured(u, *_descend(sounding, users[u], matrix, of_user))
 
 
-class Ends(msgspec.Struct, frozen=True):
-    """The arrays of both ends with the elements that a level uses, and which elements these are."""
+class End(msgspec.Struct, frozen=True):
+    """The beams of one end at one level of a hierarchical sweep."""
 
-    tx: AntennaArray
-    rx: AntennaArray
-    tx_elements: Int64Array
-    rx_elements: Int64Array
+    array: AntennaArray
+    """With the elements that are on."""
+    elements: Int64Array
+    """Which of the whole array these are."""
+    turn: Complex128Array
+    """Phases that turn the beams of the codebook to the middle of the narrow ones within them."""
+
+
+class Level(msgspec.Struct, frozen=True):
+    """Both ends at one level."""
+
+    tx: End
+    rx: End
 
 
 def _descend(
-    sounding: Sounding, user: User, matrix: Complex128Array, levels: Sequence[Ends]
+    sounding: Sounding, user: User, matrix: Complex128Array, levels: Sequence[Level]
 ) -> tuple[int, int]:
     tx_beam = rx_beam = 0
-    before: Ends | None = None
-    for number, ends in enumerate(levels):
-        abs_y = sweep(matrix[np.ix_(ends.rx_elements, ends.tx_elements)], ends.tx, ends.rx)
+    before: Level | None = None
+    for number, level in enumerate(levels):
+        tx, rx = level.tx, level.rx
         if before is None:
-            tx_beams, rx_beams = np.arange(ends.tx.size), np.arange(ends.rx.size)
+            tx_beams, rx_beams = np.arange(tx.array.size), np.arange(rx.array.size)
         else:
-            tx_beams = children(before.tx, ends.tx)[tx_beam]
-            rx_beams = children(before.rx, ends.rx)[rx_beam]
-            if len(tx_beams) * len(rx_beams) == 1:
-                tx_beam, rx_beam, before = int(tx_beams[0]), int(rx_beams[0]), ends
-                continue  # there is nothing to choose
+            tx_beams = children(before.tx.array, tx.array)[tx_beam]
+            rx_beams = children(before.rx.array, rx.array)[rx_beam]
             sounding.count(user, len(tx_beams) * len(rx_beams))
-        tried = sounding.measured(user, abs_y[np.ix_(tx_beams, rx_beams)], str(number))
-        best = best_pairs(tried[None], 1)
+        heard = matrix[np.ix_(rx.elements, tx.elements)] * rx.turn[:, None] * tx.turn
+        abs_y = sweep(heard, tx.array, rx.array)[np.ix_(tx_beams, rx_beams)]
+        best = best_pairs(sounding.measured(user, abs_y, str(number))[None], 1)
         tx_beam, rx_beam = int(tx_beams[best.tx_beam[0, 0]]), int(rx_beams[best.rx_beam[0, 0]])
-        before = ends
+        before = level
     return tx_beam, rx_beam
 
 
-def _levels_of(user: User, branching: int) -> tuple[Ends, ...]:
+def _levels_of(user: User, branching: int) -> tuple[Level, ...]:
     return _levels(user.tx.array, user.rx.array, branching)
 
 
 # Arrays are few and frozen, and asked for in every frame.
 @lru_cache(maxsize=256)
-def _levels(tx: AntennaArray, rx: AntennaArray, branching: int) -> tuple[Ends, ...]:
+def _levels(tx: AntennaArray, rx: AntennaArray, branching: int) -> tuple[Level, ...]:
     """From the widest beams to the codebook itself; an end that is through keeps its beam."""
     of_tx, of_rx = narrowing(tx, branching), narrowing(rx, branching)
     depth = max(len(of_tx), len(of_rx))
     of_tx += of_tx[-1:] * (depth - len(of_tx))
     of_rx += of_rx[-1:] * (depth - len(of_rx))
-    return tuple(
-        Ends(wide_tx, wide_rx, used_elements(tx, wide_tx), used_elements(rx, wide_rx))
-        for wide_tx, wide_rx in zip(of_tx, of_rx, strict=True)
-    )
+    return tuple(Level(end_of(tx, a), end_of(rx, b)) for a, b in zip(of_tx, of_rx, strict=True))
+
+
+def end_of(whole: AntennaArray, part: AntennaArray) -> End:
+    """Describe the beams of an array of which only a part is on.
+
+    A beam of n of N elements is N/n times as wide as those of the codebook. Turned by (N/n − 1)/2 of their
+    spacing it has as many of them on one side as on the other: unturned, some would lie on the border of two.
+
+    Args:
+        whole: The array.
+        part: The same with fewer rows and columns.
+
+    Example:
+        >>> end = end_of(AntennaArray(columns=4), AntennaArray(columns=2))
+        >>> end.elements.tolist(), np.angle(end.turn, deg=True).round(6).tolist()  # half of 90° an element
+        ([0, 1], [0.0, -45.0])
+    """
+    blocks = whole.size // (whole.rows * whole.columns)
+    q, p = np.meshgrid(np.arange(part.columns), np.arange(part.rows), indexing="ij")
+    cycles = q * (1 / part.columns - 1 / whole.columns) / 2 + p * (1 / part.rows - 1 / whole.rows) / 2
+    turn = np.exp(-2j * np.pi * np.tile(cycles.reshape(-1), blocks))
+    return End(part, used_elements(whole, part), turn)
 
 
 def narrowing(array: AntennaArray, branching: int) -> list[AntennaArray]:
@@ -226,7 +252,7 @@ def narrowing(array: AntennaArray, branching: int) -> list[AntennaArray]:
 
     Args:
         array: The whole array, which is the last of them.
-        branching: Of each axis.
+        branching: Of each axis; one of which no number up to that is a divisor stays whole.
 
     Returns:
         Arrays with fewer rows and columns in each panel and polarization, the smallest first.
@@ -244,9 +270,13 @@ def narrowing(array: AntennaArray, branching: int) -> list[AntennaArray]:
 
 
 def _sizes(size: int, branching: int) -> list[int]:
+    # Whole ratios alone: else beams lie on the border of wider ones, and the sweep goes astray there.
     sizes = [size]
     while sizes[0] > branching:
-        sizes.insert(0, -(-sizes[0] // branching))
+        divisor = next((d for d in range(branching, 1, -1) if sizes[0] % d == 0), 0)
+        if not divisor:
+            break
+        sizes.insert(0, sizes[0] // divisor)
     return sizes
 
 
@@ -270,8 +300,7 @@ def used_elements(whole: AntennaArray, part: AntennaArray) -> Int64Array:
 def children(wide: AntennaArray, narrow: AntennaArray) -> tuple[Int64Array, ...]:
     """The beams of a codebook within each beam of a wider one.
 
-    Beam k of n elements points to k/n, as a share of what an axis tells apart: beam j of m elements is within
-    the one whose k/n is nearest to j/m.
+    Along an axis, beam j of m elements is within beam ⌊j·n/m⌋ of n.
 
     Args:
         wide: Array of the wider beams.
@@ -282,7 +311,7 @@ def children(wide: AntennaArray, narrow: AntennaArray) -> tuple[Int64Array, ...]
 
     Example:
         >>> [beams.tolist() for beams in children(AntennaArray(columns=2), AntennaArray(columns=4))]
-        [[0, 3], [1, 2]]
+        [[0, 1], [2, 3]]
     """
     blocks = wide.size // (wide.rows * wide.columns)
     # Beam k has p = k % rows and q = k // rows, block by block (`caviar_protocol.topics.Link`).
@@ -299,7 +328,5 @@ def children(wide: AntennaArray, narrow: AntennaArray) -> tuple[Int64Array, ...]
 
 def _parents(wide: int, narrow: int) -> Int64Array:
     """The beam of ``wide`` elements along an axis that each one of ``narrow`` is within."""
-    # In whole numbers: j·n/m rounded half up.
-    beams = np.arange(narrow)
-    parents: Int64Array = (2 * beams * wide + narrow) // (2 * narrow) % wide
+    parents: Int64Array = np.arange(narrow) * wide // narrow
     return parents
