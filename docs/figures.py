@@ -132,8 +132,8 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         },
     ),
     "cell": Measurement(
-        "python tests/bench/bench_cell.py --frames 200 --markdown {out}/cell.md",
-        "python tests/bench/bench_cell.py --frames 2000 --markdown {out}/cell.md",
+        "python tests/bench/bench_cell.py --nr --selective --frames 200 --markdown {out}/cell.md",
+        "python tests/bench/bench_cell.py --nr --selective --frames 1000 --markdown {out}/cell.md",
         "cell.md",
         {"cell-times": "Times"},
     ),

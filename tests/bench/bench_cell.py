@@ -1,8 +1,8 @@
 """Time of the link ``cell`` a frame, beside that of ``beams`` on the same frames, in one process.
 
-Run as ``python tests/bench/bench_cell.py [--users 10] [--slots 1 5 10 20] [--nr] [--markdown FILE]``. Both
-links get the same scenes, channels of the geometric model and choices of ``los-beam``, in turn; what a frame
-takes is the median over all frames, encoding and digest of the product included.
+Run as ``python tests/bench/bench_cell.py [--users 10] [--slots 1 10 20] [--nr] [--selective]
+[--markdown FILE]``. All links get the same scenes, channels of the geometric model and choices of
+``los-beam``, in turn; what a frame takes is the median over all frames, encoding and digest included.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -124,10 +124,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--users", type=int, default=10)
     parser.add_argument("--stations", type=int, default=1)
-    parser.add_argument("--slots", type=int, nargs="+", default=[1, 5, 10, 20])
+    parser.add_argument("--slots", type=int, nargs="+", default=[1, 10, 20])
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--load", type=float, default=0.5, help="of traffic, of what a lone user could get")
     parser.add_argument("--nr", action="store_true", help="also with Sionna SYS (extra `system`)")
+    parser.add_argument("--selective", action="store_true", help="also with H of each slot")
     parser.add_argument("--markdown", type=Path, help="where the table is written too")
     options = parser.parse_args()
     frames = list(inputs(options.frames, options.users, options.stations))
@@ -136,6 +137,13 @@ def main() -> None:
         f"cell, shannon, {slots} slot{'s' * (slots > 1)}": CellSettings(traffic=(traffic,), slots=slots)
         for slots in options.slots
     }
+    if options.selective:
+        cells |= {
+            f"cell, shannon, {slots} slot{'s' * (slots > 1)}, H of each": CellSettings(
+                traffic=(traffic,), slots=slots, selective=("time",)
+            )
+            for slots in options.slots
+        }
     if options.nr:
         cells |= {
             f"cell, nr, {slots} slot{'s' * (slots > 1)}": CellSettings(

@@ -27,6 +27,7 @@ from caviar_protocol.cell.scheduling import (
     proportional_fair,
     round_robin,
 )
+from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Link
 from caviar_services.checkpoint import restored, saved
@@ -35,7 +36,15 @@ from caviar_services.link.base import wrong_choice
 from caviar_services.link.beams import Scored, SweepingLink
 from caviar_services.link.cell_settings import CellSettings, check_cell_settings
 from caviar_services.link.nr import Blocks, NrRates, load_blocks
-from caviar_services.link.slot_rates import ShannonRates, SlotRates, SlotSinr, noise_rise
+from caviar_services.link.slot_channel import band_points, responses
+from caviar_services.link.slot_rates import (
+    Gains,
+    ShannonRates,
+    SlotRates,
+    SlotSinr,
+    noise_rise,
+    swept_gains,
+)
 from caviar_services.link.terminals import Terminals, TerminalState
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
@@ -111,8 +120,13 @@ class CellLink(SweepingLink[CellSettings]):
 
         Raises:
             SetupError: Sionna SYS is not installed.
+            ScenarioError: The band is to be looked at, and no carrier has subcarriers; names the key.
         """
         prepared, settings = super().prepare(preparation), self.settings
+        if "frequency" in settings.selective and band_points(self.run.carriers).shape[1] == 1:
+            key = self.run.settings_place.at("selective").key
+            text = "'frequency' needs a carrier with 24 subcarriers or more; write `subcarriers` of a carrier"
+            raise ScenarioError(text, key=key)
         if settings.rate_model != "nr":
             return prepared
         self._blocks = load_blocks(
@@ -228,10 +242,18 @@ class CellLink(SweepingLink[CellSettings]):
         """The rate model in the slots of a frame."""
         settings, layout, users = self.settings, serving.layout, serving.users
         within = settings.sharing == "space" and settings.users_per_slot > 1
+        snr = fields["snr"][users][None, :, None]
+        gains = swept_gains(scored)
+        if settings.selective:
+            gains = self._gains(scored)
+            served = fields["tx_beam"][users] >= 0
+            beams = (fields[name][users][served].astype(np.int64) for name in ("tx_beam", "rx_beam"))
+            power = gains(users[served], *beams) * scored.budget.power_over_noise[users][served, None, None]
+            snr = np.zeros((power.shape[1], len(users), power.shape[2]))
+            snr[:, served] = np.moveaxis(power, 1, 0)
         rise = None
         if (settings.interference and len(layout.transmitters) > 1) or within:
-            rise = noise_rise(scored, layout, users, settings.interference, within)
-        snr = fields["snr"][users][None, :, None]
+            rise = noise_rise(scored, layout, users, gains, settings.interference, within)
         sinr = SlotSinr(snr, serving.members, settings.users_per_slot, settings.sharing, rise)
         if settings.rate_model == "nr":
             return NrRates(
@@ -244,6 +266,23 @@ class CellLink(SweepingLink[CellSettings]):
             )
         bandwidth = scored.budget.bandwidth[users]
         return ShannonRates(sinr, bandwidth, settings.max_spectral_efficiency, self._slot_s)
+
+    def _gains(self, scored: Scored) -> Gains:
+        """Gains of beams in each slot, and over the band, from the paths of the frame."""
+        channel, selective = scored.channel, self.settings.selective
+        count = self.settings.slots if "time" in selective else 1
+        instants = np.arange(count, dtype=np.float64) * self._slot_s
+        points = np.zeros((len(channel.carriers), 1))
+        if "frequency" in selective:
+            points = band_points(channel.carriers)
+
+        def gains(users: Int64Array, tx_beams: Int64Array, rx_beams: Int64Array) -> Float64Array:
+            known, scene = scored.budget.users, scored.scene
+            y = responses(channel, scene, known, users, tx_beams, rx_beams, instants, points)
+            power: Float64Array = y.real**2 + y.imag**2
+            return power
+
+        return gains
 
     def _play(
         self,

@@ -32,6 +32,10 @@ class CellSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Spectral efficiency of a user: ``shannon``: log2(1 + SINR); ``capped``: this up to
     ``max_spectral_efficiency``, by default 7.4063 bit/s/Hz of 256-QAM (3GPP TS 38.214); ``nr``: transport
     blocks of 5G NR that fail at random, from the tables of Sionna SYS (extra ``system``)."""
+    selective: tuple[Literal["time", "frequency"], ...] = ()
+    """What of the channel changes within a frame, as its paths say: ``time``: H of each slot, by the Doppler
+    shifts; ``frequency``: H over the band, by the delays, of ``nr`` only. Without, H is that of the frame's
+    instant and of the carrier. For channels with plane waves."""
     mcs_table: Annotated[int, quantity("1", "of modulation and coding schemes", ge=1, le=2)] = 2
     """Of ``nr``: 1: up to 64-QAM, 2: up to 256-QAM (3GPP TS 38.214, tables 5.1.3.1-1 and -2)."""
     target_block_error: Annotated[float, quantity("1", "share of blocks that may fail", gt=0, lt=1)] = 0.1
@@ -84,6 +88,11 @@ def check_cell_settings(settings: CellSettings, place: Place) -> None:
     """
     for index, entry in enumerate(settings.traffic):
         check_traffic(entry, place.at("traffic").at(index))
+    if "frequency" in settings.selective and settings.rate_model != "nr":
+        raise place.at("selective").error(
+            f"'frequency' has no effect with rate_model {settings.rate_model!r}, for which the band is flat; "
+            'write rate_model = "nr", or selective = ["time"]'
+        )
     if settings.max_spectral_efficiency is not None and settings.rate_model != "capped":
         raise place.at("max_spectral_efficiency").error(
             f'has no effect with rate_model {settings.rate_model!r}; write rate_model = "capped"'

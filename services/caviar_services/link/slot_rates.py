@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -153,21 +154,43 @@ class ShannonRates(SlotRates):
         return slot_bits(self._bandwidth * shannon(sinr, self._highest), self._slot_s)
 
 
+Gains = Callable[[Int64Array, Int64Array, Int64Array], Float64Array]
+"""``gains(users, tx_beams, rx_beams)``: |y|² of these K in each slot and part of the band, Shape
+``[K, S, F]``."""
+
+
+def swept_gains(scored: Scored) -> Gains:
+    """Gains that are the same in all slots and over the band, from the sweep of the frame."""
+
+    def gains(users: Int64Array, tx_beams: Int64Array, rx_beams: Int64Array) -> Float64Array:
+        found = amplitudes(scored.swept, len(scored.budget.users), users, tx_beams, rx_beams)
+        power: Float64Array = found[:, None, None] ** 2
+        return power
+
+    return gains
+
+
 def noise_rise(
-    scored: Scored, layout: Layout, serving: Int64Array, between_transmitters: bool, within_one: bool
+    scored: Scored,
+    layout: Layout,
+    serving: Int64Array,
+    gains: Gains,
+    between_transmitters: bool,
+    within_one: bool,
 ) -> Float64Array | None:
-    """Interference over noise between terminals.
+    """Interference over noise between terminals, on average over the band.
 
     Args:
         scored: The frame.
         layout: Terminals and transmitters.
         serving: Index of the user of each terminal with the transmitter that serves it, Shape ``[T]``.
+        gains: Of beams.
         between_transmitters: Whether terminals hear beams of other transmitters.
         within_one: Whether terminals of one transmitter hear each other's beams.
 
     Returns:
         At each terminal (row) of the beam towards each other one (column), with all power of its
-        transmitter, Shape ``[1, T, T]``; None where no terminal can hear another.
+        transmitter, Shape ``[S, T, T]``; None where no terminal can hear another.
     """
     tx, carrier = layout.tx[serving], layout.carrier[serving]
     same = tx[:, None] == tx
@@ -181,7 +204,7 @@ def noise_rise(
     victims, culprits = heard.nonzero()
     rows = between[heard]
     beams = tx_beam[culprits].astype(np.int64), rx_beam[victims].astype(np.int64)
-    gain = amplitudes(scored.swept, len(layout.users), rows, *beams) ** 2
-    rise = np.zeros(heard.shape)
-    rise[heard] = scored.budget.power_over_noise[rows] * gain
-    return rise[None]
+    gain = gains(rows, *beams).mean(-1)
+    rise = np.zeros((gain.shape[1], *heard.shape))
+    rise[:, heard] = (scored.budget.power_over_noise[rows][:, None] * gain).T
+    return rise
