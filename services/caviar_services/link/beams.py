@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -102,7 +101,8 @@ class SweepingLink(LinkModel[B]):
         channels = channels_of(channel, users)
         swept = sweep_users(users, channels.h)
         scores = _score(scene, users, choices, swept, self.settings.top_k)
-        return Scored(channel, scene, budget, choices, channels, swept, scores)
+        without_path = sum([h is None for h in channels.h])
+        return Scored(channel, scene, budget, choices, channels, swept, scores, without_path)
 
     def counts(self, scored: Scored) -> dict[str, int]:
         """Events of a frame by name, those that did not happen too."""
@@ -121,7 +121,7 @@ class SweepingLink(LinkModel[B]):
             reward_kind: What the field ``reward`` is, one of `RewardKind`; |y| for any other.
         """
         settings, budget, scores = self.settings, scored.budget, scored.scores
-        best = scored.best
+        best = scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
         # Beams have unit norm, so |y|² is the power gain of the pair; one RF chain an end carries one stream,
         # whose Shannon bound this is.
         snr = budget.power_over_noise * scores.abs_y**2
@@ -281,8 +281,7 @@ class Scores(msgspec.Struct, frozen=True):
     top_abs_y: Float64Array
 
 
-@dataclass(frozen=True, eq=False)
-class Scored:
+class Scored(NamedTuple):
     """A frame with all beam pairs swept."""
 
     channel: Channel
@@ -292,16 +291,8 @@ class Scored:
     channels: UserChannels
     swept: list[Swept]
     scores: Scores
-
-    @cached_property
-    def without_path(self) -> int:
-        """Users that no path reaches."""
-        return sum([h is None for h in self.channels.h])
-
-    @cached_property
-    def best(self) -> Float64Array:
-        """|y| of the best pair, Shape ``[U]``."""
-        return self.scores.top_abs_y[:, :1].reshape(-1)  # no column where there is no user
+    without_path: int
+    """Users that no path reaches."""
 
 
 def _score(scene: Scene, users: Users, choices: Choices, swept: Sequence[Swept], top_k: int) -> Scores:
