@@ -219,6 +219,21 @@ def test_the_command_prints_and_writes_the_figures(tmp_path: Path) -> None:
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["frames"]["all"] == 1000
     assert figures["abs_y"]["policy"]["LOS"]["episodes"] == 2
+    assert figures["pilots"]["exhaustive-sweep"] == BEAMS
+    assert figures["pilots"]["hierarchical-sweep"] == 12
+    left = figures["spectral_efficiency"]
+    assert left["exhaustive-sweep"]["mean"] < left["optimum"]["mean"]
+
+
+def test_the_agents_to_compare_with_can_be_named_and_set(tmp_path: Path) -> None:
+    file = made(tmp_path, Straight())
+    asked = ["evaluate", str(file), "--on", "geometric", "--seeds", "1", "--json", str(tmp_path / "f.json")]
+    more = ["--against", "ucb", "--set", "ucb.discount=0.9", "--set", "last-sweep.period=250"]
+    ended = CliRunner().invoke(app, [*asked, *more])
+    assert ended.exit_code == 0, ended.output
+    pilots = json.loads((tmp_path / "f.json").read_text())["pilots"]
+    assert list(pilots) == ["policy", "los-beam", "random", "optimum", "ucb", "last-sweep"]
+    assert pilots["last-sweep"] == 2 * BEAMS / 500
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -181,25 +181,62 @@ def evaluate_command(
     first_seed: Annotated[int, typer.Option(min=0, help="the first; none of training's")] = 1000,
     episodes: Annotated[int, typer.Option(min=1, help="of each seed")] = 1,
     users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
+    against: Annotated[
+        list[str] | None,
+        typer.Option(help="agent to compare with, may be repeated; by default all that need no settings"),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="AGENT.SETTING=VALUE, as in --set fingerprint.file=runs/RUN"),
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:
-    """Hold a policy against los-beam, random and the optimum, LOS and NLOS apart."""
-    from caviar_clients.learning.evaluate import KINDS, METHODS, evaluate
+    """Hold a policy against los-beam, random, the optimum and other agents, LOS and NLOS apart."""
+    from caviar_clients.learning.evaluate import BASELINES, KINDS, evaluate
 
+    rivals: dict[str, dict[str, Any]] = {name: {} for name in (BASELINES if against is None else against)}
+    rivals |= _settings_of(settings or [])
     chosen = range(first_seed, first_seed + seeds)
     console = Console()
     with progress_bar(console, "{task.completed}/{task.total} episodes", transient=True) as bar:
         task = bar.add_task("", total=seeds * episodes)
         made = evaluate(
-            policy, on, chosen, episodes, lambda done: bar.update(task, completed=done), users=users
+            policy, on, chosen, episodes, lambda done: bar.update(task, completed=done), rivals, users
         )
     table = Table(title=f"mean |y| of {made.policy} on {made.scenario}, {seeds * episodes} episodes")
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for kind in KINDS:
         table.add_column(f"{kind} ({made.frames[kind]:,})", justify="right")
-    for method in METHODS:
-        table.add_row(method, *(str(made.found[method][kind]) for kind in KINDS))
+    table.add_column("pilots a frame", justify="right")
+    table.add_column("bit/s/Hz left", justify="right")
+    for method, means in made.found.items():
+        cost = f"{made.pilots[method]:.4g}", str(made.efficiency[method])
+        table.add_row(method, *(str(means[kind]) for kind in KINDS), *cost)
     console.print(table)
     if json is not None:
-        figures = {m: {k: vars(made.found[m][k]) for k in KINDS} for m in METHODS}
-        write_json(json, {"frames": dict(made.frames), "abs_y": figures})
+        write_json(
+            json,
+            {
+                "frames": dict(made.frames),
+                "abs_y": {m: {k: vars(means[k]) for k in KINDS} for m, means in made.found.items()},
+                "spectral_efficiency": {m: vars(mean) for m, mean in made.efficiency.items()},
+                "pilots": dict(made.pilots),
+            },
+        )
+
+
+def _settings_of(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Settings of agents, from ``AGENT.SETTING=VALUE`` each."""
+    from caviar_clients.replay.plan import typed
+    from caviar_services.registry import load
+
+    found: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        path, equals, value = text.partition("=")
+        agent, dot, key = path.strip().partition(".")
+        if not (equals and dot and agent and key and value.strip()):
+            raise ScenarioError(
+                f"--set {text}: write agent, setting and value, as in --set ucb.discount=0.98"
+            )
+        found.setdefault(agent, {})[key] = value.strip()
+    return {agent: typed(changes, load("agent", agent).Settings) for agent, changes in found.items()}

@@ -1,7 +1,7 @@
 """A policy beside its baselines: |y| on episodes of many seeds, with intervals, LOS and NLOS apart.
 
-All of them are judged in the same frames: the beams of the straight line (``los-beam``) and of the best pair
-(``optimum``) are in the link's product, ``random`` draws from the same codebooks.
+All of them play the same frames (`caviar_clients.learning.contest`). Baselines that measure beams pay for it:
+their pilots are counted, and the spectral efficiency is what these leave of each frame.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from caviar_clients.envs.base import BeamSelectionEnv
-from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.errors import ScenarioError
+from caviar_clients.learning.contest import Contest, Player, PolicyPlayer, episodes_of, made_player
+from caviar_clients.session.checks import checked_scenario
+from caviar_protocol.arrays import Float64Array
 from caviar_services.agent.policy import PolicyModel
 
 METHODS = ("policy", "los-beam", "random", "optimum")
+"""What every evaluation has."""
+BASELINES = ("exhaustive-sweep", "hierarchical-sweep", "last-sweep", "ucb", "thompson")
+"""Agents that can be compared with in any scenario, as they need no settings."""
 KINDS = ("all", "LOS", "NLOS")
-
-Choose = Callable[[Mapping[str, NDArray[Any]]], Any]
+_AGENTS = {"los-beam": "los-beam", "random": "random", "optimum": "oracle"}
 
 
 @dataclass(frozen=True)
@@ -86,14 +87,18 @@ def student_95(degrees: int) -> float:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured: |y| by method and kind of frame."""
+    """What was measured, by method: those of `METHODS`, and the agents that were compared with."""
 
     policy: str
     scenario: str
     found: Mapping[str, Mapping[str, Interval]]
-    """By method (`METHODS`), then by kind of frame (`KINDS`)."""
+    """|y| by method, then by kind of frame (`KINDS`)."""
     frames: Mapping[str, int]
     """Users and frames of each kind."""
+    efficiency: Mapping[str, Interval]
+    """Spectral efficiency [bit/s/Hz] that pilots leave, by method."""
+    pilots: Mapping[str, float]
+    """Of a frame, on average, by method."""
 
     def ratio(self, method: str, kind: str = "all") -> float:
         """Mean |y| of the policy over that of a method."""
@@ -106,7 +111,9 @@ def evaluate(
     seeds: Iterable[int],
     episodes: int = 1,
     progress: Callable[[int], None] = lambda done: None,
-    **options: Any,
+    against: Mapping[str, Mapping[str, Any]] | None = None,
+    users: str | Sequence[str] = "*",
+    agent: str | None = None,
 ) -> Evaluation:
     """Evaluate a policy beside the baselines.
 
@@ -116,75 +123,46 @@ def evaluate(
         seeds: Of the episodes; none of them should be one of training.
         episodes: That follow each other from each seed on.
         progress: Called with the number of episodes that are done.
-        options: Of `BeamSelectionEnv`, such as ``users``.
+        against: Agents to compare with, beside those of `METHODS`, with their settings as in a scenario;
+            ``dict.fromkeys(BASELINES, {})`` for those that need none.
+        users: Receivers that are served, and count, as names with ``*`` and ``?``.
+        agent: Of the scenario, whose place is taken; None: the only one.
 
     Raises:
-        ScenarioError: The file is no policy, has no card, or was trained for another codebook.
+        ScenarioError: The file is no policy, has no card, or was trained for another codebook; or an agent to
+            compare with does not fit the scenario.
     """
     model = PolicyModel(file, f"policy {file.name}")
-    if model.card is None:
-        raise ScenarioError(f"policy {file.name} has no card; export it with caviar export-policy")
-    env = BeamSelectionEnv(scenario, observe=model.card.observe, **options)
-    sizes = tuple((place.tx.size, place.rx.size) for place in env.users.places)
-    if sizes != model.card.codebooks:
-        raise ScenarioError(
-            f"policy {file.name} was trained for {list(model.card.codebooks)}, TX × RX beams of each user, "
-            f"and {env.scenario.run.name!r} has {list(sizes)}; evaluate it where it was trained, or train it "
-            "there"
-        )
-    means: dict[tuple[str, str], list[float]] = {(m, k): [] for m in METHODS for k in KINDS}
+    known = checked_scenario(Path(scenario))
+    served = (users,) if isinstance(users, str) else tuple(users)
+    players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, f"policy {file.name}")}
+    for name, use in _AGENTS.items():
+        players[name] = made_player(known, use, {}, served, agent)
+    for name, settings in (against or {}).items():
+        if name not in players:
+            players[name] = made_player(known, name, settings, served, agent)
+    means: dict[tuple[str, str], list[float]] = {(m, k): [] for m in players for k in KINDS}
+    efficiency: dict[str, list[float]] = {method: [] for method in players}
+    pilots: dict[str, list[float]] = {method: [] for method in players}
     counts = dict.fromkeys(KINDS, 0)
-    rng, done = np.random.default_rng(0), 0
-    highest = [tx * rx for tx, rx in sizes]
-    ways: Mapping[str, Choose] = {"policy": model.act, "random": lambda seen: rng.integers(highest)}
-    try:
-        for seed in seeds:
-            for method, choose in ways.items():
-                for episode in range(episodes):
-                    played = _episode(env, choose, None if episode else seed)
-                    for kind in KINDS:
-                        mine = played.of(kind)
-                        means[method, kind].append(_mean(played.chosen[mine]))
-                        if method == "policy":
-                            counts[kind] += int(mine.sum())
-                            means["los-beam", kind].append(_mean(played.straight[mine]))
-                            means["optimum", kind].append(_mean(played.best[mine]))
-            done += episodes
+    with Contest(known, players, served, agent) as contest:
+        for done, seed in enumerate(episodes_of(seeds, episodes), 1):
+            for method, played in contest.play(seed).items():
+                efficiency[method].append(_mean(played.net_efficiency))
+                pilots[method].append(played.pilots)
+                for kind in KINDS:
+                    mine = played.of(kind)
+                    means[method, kind].append(_mean(played.abs_y[mine]))
+                    counts[kind] += int(mine.sum()) if method == "policy" else 0
             progress(done)
-    finally:
-        env.close()
-    found = {m: {k: mean_of(means[m, k]) for k in KINDS} for m in METHODS}
-    return Evaluation(file.name, env.scenario.run.name, found, counts)
-
-
-@dataclass(frozen=True)
-class _Played:
-    """|y| of an episode, by user and frame; those without a path are left out. Shape ``[N]`` each."""
-
-    chosen: Float64Array
-    straight: Float64Array
-    best: Float64Array
-    los: BoolArray
-
-    def of(self, kind: str) -> BoolArray:
-        """Which of them are of a kind."""
-        if kind == "all":
-            return np.ones(len(self.los), np.bool_)
-        return self.los if kind == "LOS" else ~self.los
-
-
-def _episode(env: BeamSelectionEnv, choose: Choose, seed: int | None) -> _Played:
-    rows = []
-    observation, _ = env.reset(seed=seed)
-    over = False
-    while not over:
-        action = choose(observation)
-        observation, _, terminated, truncated, info = env.step(action if len(action) > 1 else action[0])
-        columns = (info["abs_y"], info["baseline_abs_y"], info["best_abs_y"], info["los"])
-        rows.append(np.stack(columns, axis=1)[info["best_abs_y"] > 0])
-        over = terminated or truncated
-    found = np.concatenate(rows)
-    return _Played(found[:, 0], found[:, 1], found[:, 2], found[:, 3] > 0)
+    return Evaluation(
+        policy=file.name,
+        scenario=known.run.name,
+        found={m: {k: mean_of(means[m, k]) for k in KINDS} for m in players},
+        frames=counts,
+        efficiency={method: mean_of(values) for method, values in efficiency.items()},
+        pilots={method: float(np.mean(values)) for method, values in pilots.items()},
+    )
 
 
 def _mean(values: Float64Array) -> float:

@@ -31,14 +31,14 @@ from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.checkpoint import Packed, restored, saved
 from caviar_services.service import Frame, RunInfo
 
-Feedback = Literal["spectral_efficiency", "abs_y"]
+Feedback = Literal["abs_y", "spectral_efficiency"]
 
 
 class BanditSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the agents ``ucb`` and ``thompson``."""
 
-    feedback: Feedback = "spectral_efficiency"
-    """What a receiver feeds back of the frame before: ``spectral_efficiency`` or ``abs_y``."""
+    feedback: Feedback = "abs_y"
+    """What a receiver feeds back of the frame before: ``abs_y`` or ``spectral_efficiency``."""
     discount: Annotated[
         float, quantity("1", "weight that feedback keeps from one to the next", gt=0, le=1)
     ] = 0.99
