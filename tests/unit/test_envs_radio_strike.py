@@ -102,6 +102,15 @@ def test_legacy_plays_the_trajectory_of_a_published_run(shared_data: Path) -> No
         assert observation[:3].tolist() == [float(row[axis]) for axis in "xyz"]
 
 
+def test_users_straight_beside_the_base_station_have_the_channel_of_the_original() -> None:
+    """It moves them by a millimetre where x is 0, and the straight line turns."""
+    ways = Episode("beside", np.array([[[0.0, 10.0, 2.0], [0.0, -15.0, 7.0], [-20.0, 0.0, 0.0]]] * 30))
+    env, reference = RadioStrikeEnv("legacy", episodes=ways), Legacy(ways.position.swapaxes(0, 1).tolist(), 6)
+    env.reset(seed=6)
+    for user, beam in actions(30, seed=8):
+        assert_same(env.step([user, beam]), reference.play(user, beam))
+
+
 def test_only_the_scheduled_user_moves_in_legacy() -> None:
     episode = short_episode(1)
     env = RadioStrikeEnv("legacy", episodes=episode)

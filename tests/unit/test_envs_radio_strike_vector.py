@@ -154,6 +154,15 @@ def test_without_a_seed_members_differ_from_each_other_and_from_run_to_run() -> 
     assert len(set(np.concatenate(rewards))) == 4
 
 
+def test_stable_baselines3_trains_on_it() -> None:
+    learners = pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
+    from caviar_clients.learning.vec_env import stable_baselines3_env
+
+    made = stable_baselines3_env(batch(4, AutoresetMode.SAME_STEP, steps=5))
+    assert learners.A2C("MlpPolicy", made, n_steps=4, device="cpu").learn(64).num_timesteps == 64
+    made.close()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

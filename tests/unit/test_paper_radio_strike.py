@@ -160,6 +160,7 @@ def test_intervals_are_of_means_and_ranges_of_single_runs() -> None:
     assert with_interval(values, 2) == "2.50 ± 2.05"
     assert with_range(values, 2) == "2.50 ± 4.59"
     assert with_interval([2.0]) == "2.000"
+    assert "| \\|y\\| | 1 |" in Comparison("Bars", ("what", "value"), [("|y|", "1")]).markdown()
     assert Comparison("Only words", (), (), ["one"]).markdown() == "## Only words\n\n* one\n"
 
 

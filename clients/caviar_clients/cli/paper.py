@@ -29,15 +29,22 @@ def _paper() -> None:
 
 
 def report(
-    console: Console, found: Sequence[Comparison], files: Sequence[Path], name: str, out: Path, figures: Any
+    console: Console,
+    title: str,
+    found: Sequence[Comparison],
+    pictures: Sequence[Path],
+    name: str,
+    out: Path,
+    figures: Any,
 ) -> None:
     """Show tables, and write them beside the pictures of an experiment: NAME.md and NAME.json.
 
     Args:
         console: Where tables and the names of files are shown.
+        title: Heading of the page of tables.
         found: The tables.
-        files: Pictures, which are written already.
-        name: Of the experiment.
+        pictures: Which are written already.
+        name: Of the experiment, in the names of its files.
         out: Folder.
         figures: What goes into the JSON file.
     """
@@ -46,11 +53,11 @@ def report(
 
     for one in found:
         one.show(console)
-    pictures = "".join(f"\n![{file.stem}]({file.name})\n" for file in files)
+    shown = "".join(f"\n![{file.stem}]({file.name})\n" for file in pictures)
     text = "\n".join(one.markdown() for one in found)
-    write_file(out / f"{name}.md", f"# {name}\n{pictures}\n{text}")
+    write_file(out / f"{name}.md", f"# {title}\n{shown}\n{text}")
     write_json(out / f"{name}.json", figures)
-    for file in (*files, out / f"{name}.md", out / f"{name}.json"):
+    for file in (*pictures, out / f"{name}.md", out / f"{name}.json"):
         print_line(console, file)
 
 
@@ -98,4 +105,5 @@ def radio_strike(
                 settings, lambda what, share: bar.update(task, description=what, completed=share)
             )
         picture = draw(found, out / "radiostrike.png")
-    report(console, comparisons(found, settings), [picture], "radiostrike", out, figures_of(found))
+    tables = comparisons(found, settings)
+    report(console, "Radio-Strike", tables, [picture], "radiostrike", out, figures_of(found))

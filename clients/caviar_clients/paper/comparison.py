@@ -37,7 +37,9 @@ class Comparison:
     def markdown(self) -> str:
         """As Markdown, below a heading of its own."""
         lines = [self.columns, ("---",) * len(self.columns), *self.rows]
-        table = "".join(f"| {' | '.join(cells)} |\n" for cells in lines) if self.rows else ""
+        # A bar within a cell would end it.
+        cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+        table = "".join(f"| {' | '.join(line)} |\n" for line in cells) if self.rows else ""
         notes = "".join(f"* {note}\n" for note in self.notes)
         parts = (f"## {self.title}\n", table, notes)
         return "\n".join(part for part in parts if part)

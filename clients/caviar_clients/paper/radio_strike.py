@@ -22,7 +22,7 @@ from caviar_clients.envs.radio_strike.rules import (
 from caviar_clients.envs.radio_strike.sources import Source, episode_loaders
 from caviar_clients.envs.radio_strike.trajectories import Episode
 from caviar_clients.paper.radio_strike_published import PublishedRun, Run, made_again, read_run
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.seeding import derive_seed
 
 AgentName = Literal["B-Dummy", "straight line", "B-A2C", "B-BeamOracle"]
@@ -64,12 +64,18 @@ class Played:
     """[bit/s]."""
     sent: Float64Array
     dropped: Float64Array
+    beam: Int64Array
 
     @property
     def delivered(self) -> float:
         """Share of the packets that were sent, of those that were sent or dropped."""
         gone = float(self.sent.sum() + self.dropped.sum())
         return float(self.sent.sum()) / gone if gone else 0.0
+
+    @property
+    def favourite(self) -> float:
+        """Share of the steps that use the beam that is used most."""
+        return float(np.bincount(self.beam).max()) / len(self.beam)
 
 
 @dataclass(frozen=True)
@@ -190,32 +196,33 @@ def _play(rules: RulesName, agent: AgentName, model: Any, episode: Episode, step
     observation, _ = env.reset(seed=seed)
     if agent == "B-A2C":
         model.set_random_seed(seed)
-    rows = np.zeros((min(steps, episode.steps), 4))
-    for row, returned in zip(rows, _steps(env, rules, agent, model, observation, seed), strict=False):
+    rows, beams = np.zeros((min(steps, episode.steps), 4)), []
+    for row, (beam, returned) in zip(rows, _steps(env, rules, agent, model, observation, seed), strict=False):
         _, reward, _, _, info = returned
         row[:] = reward, info["bit_rate"], info["pkts_transmitted"], info["pkts_dropped"]
-    return Played(*rows.T)
+        beams.append(beam)
+    rewards, rates, sent, dropped = rows.T
+    return Played(rewards, rates, sent, dropped, np.array(beams))
 
 
 def _steps(
     env: RadioStrikeEnv, rules: RulesName, agent: AgentName, model: Any, observation: Float64Array, seed: int
-) -> Iterator[Returned]:
-    """Steps of an agent, one after the other, without an end."""
+) -> Iterator[tuple[int, Returned]]:
+    """Beams and steps of an agent, one after the other, without an end."""
     random, straight = np.random.default_rng(seed), StraightLine(rules)
     step = 0
     while True:
         user = step % len(USERS)
+        action = np.array([user, straight.beam(user)])
         match agent:
             case "B-Dummy":
-                returned = env.step(random.integers([len(USERS), BEAMS]))
-            case "straight line":
-                returned = env.step([user, straight.beam(user)])
-                straight.seen(user, returned[0][:3])
+                action = random.integers([len(USERS), BEAMS])
             case "B-A2C":
                 # As the challenge plays it: actions are drawn from the policy.
-                returned = env.step(model.predict(observation)[0])
-            case "B-BeamOracle":
-                returned = env.best_beam_step(user)
+                action = model.predict(observation)[0]
+        returned = env.best_beam_step(user) if agent == "B-BeamOracle" else env.step(action)
         observation = returned[0]
+        if agent == "straight line":
+            straight.seen(user, observation[:3])
         step += 1
-        yield returned
+        yield int(returned[4].get("best_beam", action[1])), returned

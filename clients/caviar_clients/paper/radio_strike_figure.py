@@ -68,8 +68,8 @@ def _rates(axes: Any, report: Report) -> None:
         again = np.concatenate([run.bit_rate[mine] for run in report.again])
         _shares(axes, again, color=color, linewidth=4.0, alpha=0.6, label=_USERS[name])
         # On top: where both agree, one line covers the other.
-        label = "published" if user == 0 else ""
-        _shares(axes, published.bit_rate[mine], color=BLACK, linewidth=1.0, linestyle="--", label=label)
+        _shares(axes, published.bit_rate[mine], color=BLACK, linewidth=1.0, linestyle="--")
+    axes.plot([], [], color=BLACK, linewidth=1.0, linestyle="--", label="published")
     axes.grid()
     axes.legend(loc="lower right")
     axes.set_title("published run, played again", loc="left")
