@@ -20,8 +20,9 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, BinaryIO
@@ -95,6 +96,7 @@ class Forked:
         bufsize: int = -1,
         start_new_session: bool = False,
         env: Mapping[str, str] | None = None,
+        pass_fds: Sequence[int] = (),
     ) -> None:
         self.returncode: int | None = None
         self.stdin: BinaryIO | None = None
@@ -108,7 +110,7 @@ class Forked:
             self.stdout = os.fdopen(outer, "rb", 0)
         self.pid = os.fork()
         if self.pid == 0:
-            _become(command, inner, start_new_session, env)
+            _become(command, inner, start_new_session, env, pass_fds)
         for fd, given in zip(inner, (stdin, stdout, stderr), strict=True):
             if given in (subprocess.PIPE, subprocess.DEVNULL):
                 os.close(fd)
@@ -151,7 +153,13 @@ def _inner(given: Any, default: int) -> int:
     return default if given is None or given == subprocess.PIPE else int(given.fileno())
 
 
-def _become(command: list[str], fds: list[int], session: bool, env: Mapping[str, str] | None) -> None:
+def _become(
+    command: list[str],
+    fds: list[int],
+    session: bool,
+    env: Mapping[str, str] | None,
+    passed: Sequence[int],
+) -> None:
     """In the child: what ``python -m MODULE ARGUMENTS`` would do."""
     status = 1
     try:
@@ -159,7 +167,8 @@ def _become(command: list[str], fds: list[int], session: bool, env: Mapping[str,
             os.setsid()
         for target, fd in enumerate([os.dup(fd) for fd in fds]):
             os.dup2(fd, target)
-        os.closerange(3, 1 << 12)
+        for low, high in pairwise([2, *sorted(passed), 1 << 12]):
+            os.closerange(low + 1, high)
         if env is not None:
             os.environ.clear()
             os.environ.update(env)

@@ -106,7 +106,7 @@ def test_the_user_is_told_who_is_awaited_where_and_what_to_type(monkeypatch: pyt
     )
     told = remote.waiting_text("link", spec("link"), ENDPOINT, 30.0)
     assert told.endswith(
-        f"caviar service link --use link:IMPLEMENTATION --broker {ENDPOINT} (IMPLEMENTATION: beams)"
+        f"caviar service link --use link:IMPLEMENTATION --broker {ENDPOINT} (IMPLEMENTATION: beams, cell)"
     )
     monkeypatch.setattr(remote, "MINIMAL", Path("/nowhere"))
     assert "caviar service agent --use agent:IMPLEMENTATION" in remote.start_command(
