@@ -110,7 +110,9 @@ def load(role: str, name: str) -> type[Service[Any]]:
     module_name, _, class_name = target.partition(":")
     try:
         module = import_module(module_name)
-        cls = getattr(module, class_name, None)
+        # A module that makes attributes says itself which there are.
+        makes = "__getattr__" in vars(module)
+        cls = getattr(module, class_name) if makes else getattr(module, class_name, None)
     except Exception as error:  # whatever a module that is not ours does when it is imported
         known = isinstance(error, ImportError | AttributeError)
         text = str(error) if known else f"{type(error).__name__}: {error}"

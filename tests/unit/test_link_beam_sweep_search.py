@@ -71,3 +71,10 @@ def test_best_pairs_are_sorted_and_ties_go_to_the_lowest_index(
     best = Pairs(*(found[0] for found in best_pairs(grid[None], k)))
     assert list(zip(best.tx_beam.tolist(), best.rx_beam.tolist(), strict=True)) == expected
     assert best.abs_y.tolist() == [grid[pair] for pair in expected]
+
+
+def test_a_single_element_at_each_end_is_a_sweep_of_one_pair() -> None:
+    """For one channel matrix, and for several at once."""
+    single = AntennaArray()
+    assert sweep(np.full((1, 1), 3.0 - 4.0j), single, single).tolist() == [[5.0]]
+    assert sweep(np.full((2, 1, 1), 2.0j), single, single).tolist() == [[[2.0]], [[2.0]]]

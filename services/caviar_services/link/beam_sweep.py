@@ -74,7 +74,7 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
     # Elements are numbered panel by panel, column by column (`antenna_arrays.element_positions`): so the axes
     # of the grid come out of a reshape, and the transform of one axis after the other is that of all.
     leading, grid = h.shape[:-2], _grid(tx, rx)
-    y = h.reshape(*leading, *grid.shape)
+    y = h.reshape((*leading, *grid.shape))  # one element at each end: an array without axes
     for axis, size in grid.axes:
         if size > SMALL:
             y = np.fft.fft(y, axis=axis)
