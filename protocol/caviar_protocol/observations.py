@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import reduce
 from operator import add
@@ -49,6 +49,14 @@ class KnownScenario(Protocol):
     @property
     def services(self) -> Mapping[str, ServiceSpec]:
         """Services with their settings; empty where they are not known."""
+
+
+@dataclass(frozen=True)
+class KnownDevices:
+    """What a run says to its agents about the scenario."""
+
+    devices: Sequence[DeviceSpec]
+    services: Mapping[str, ServiceSpec] = field(default_factory=dict)
 
 
 class Bounds(NamedTuple):

@@ -44,7 +44,7 @@ class BanditSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     ] = 0.99
     exploration: Annotated[
         float, quantity("1", "width of the bounds, in multiples of the highest feedback so far", ge=0, le=100)
-    ] = 0.2
+    ] = 0.05
     cell_m: Annotated[float, quantity("m", "edge of a cell of positions", gt=0, le=1e6)] | None = None
     """Absent: a bandit for each receiver, wherever it is."""
 

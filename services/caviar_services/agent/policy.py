@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
-from caviar_protocol.observations import Moment, Observer, Users
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scenario.schema import ServiceSpec
+from caviar_protocol.observations import KnownDevices, Moment, Observer, Users
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
@@ -83,14 +81,6 @@ def read_card(text: str) -> PolicyCard:
         msgspec.DecodeError: It is no card.
     """
     return msgspec.json.decode(text, type=PolicyCard)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Known:
-    """What an agent knows of the scenario."""
-
-    devices: Sequence[DeviceSpec]
-    services: Mapping[str, ServiceSpec]
 
 
 class PolicyModel:
@@ -192,7 +182,7 @@ class PolicyAgent(Agent[PolicySettings]):
                 f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
                 key=key,
             )
-        known = _Known(self.run.devices, {})
+        known = KnownDevices(self.run.devices)
         self._places = Users(known, self.settings.users, self.settings.except_users)
         sizes = tuple((place.tx.size, place.rx.size) for place in self._places.places)
         if card is not None and card.codebooks != sizes:
