@@ -298,6 +298,25 @@ class AngleOfDeparture(_PerUser):
         return [math.atan2(y, x) for x, y, _ in at_tx]
 
 
+class Departure(_PerUser):
+    """Direction of the receiver from the transmitter along the straight line, a unit vector in the
+    transmitter's axes, place by place. Beams of a row of elements are evenly spaced over its y. Shape
+    ``[3·U]``."""
+
+    width = 3
+    bound = 1.0
+
+    def _values(self, moment: Moment) -> Iterable[float | Vector | Float64Array]:
+        at_tx, _ = directions(moment.scene, [pair for _, pair in moment.users])
+        return [_within_one(direction) for direction in at_tx]
+
+
+def _within_one(direction: Vector) -> Vector:
+    # The length of a unit vector is 1 but for rounding, and a box has no room for more.
+    x, y, z = (min(1.0, max(-1.0, value)) for value in direction)
+    return x, y, z
+
+
 class Position(_PerUser):
     """Position [m] of the receiver in the world, x, y, z place by place. Shape ``[3·U]``."""
 
@@ -453,6 +472,7 @@ class CameraImage(DepthImage):
 PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "aoa": AngleOfArrival,
     "aod": AngleOfDeparture,
+    "departure": Departure,
     "position": Position,
     "velocity": Velocity,
     "last_abs_y": LastMagnitude,
@@ -463,6 +483,20 @@ PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "camera": CameraImage,
 }
 """Parts by name. One of a sensor may name it after a colon: ``camera:dash``."""
+
+
+def is_feedback(name: str) -> bool:
+    """Whether a part is read from the link of the frame before alone, and from nothing of the scene.
+
+    Args:
+        name: Of the part, as in `PARTS`.
+
+    Example:
+        >>> is_feedback("last_beam"), is_feedback("position")
+        (True, False)
+    """
+    cls = PARTS.get(name.partition(":")[0])
+    return isinstance(cls, type) and issubclass(cls, _OfLink)
 
 
 def part(scenario: KnownScenario, users: Users, name: str) -> Part:

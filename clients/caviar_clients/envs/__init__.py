@@ -2,6 +2,8 @@
 
 * ``caviar/BeamSelection-v0``: a beam pair for each user (`base.BeamSelectionEnv`), and many of them computed
   together by ``gymnasium.make_vec`` (`vector.BeamSelectionVectorEnv`);
+* ``caviar/RecordedBeams-v0``: a beam pair for one recorded user after the other, single and many together
+  (`caviar_clients.learning.recorded`);
 * ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
   reward of comparable parts (`uav_path_v1`);
 * ``caviar/RadioStrike-v0``: a user and a beam in each slot, as in the ITU challenge of 2021
@@ -20,6 +22,11 @@ gymnasium.register(
     "caviar/BeamSelection-v0",
     "caviar_clients.envs.base:BeamSelectionEnv",
     vector_entry_point="caviar_clients.envs.vector:BeamSelectionVectorEnv",
+)
+gymnasium.register(
+    "caviar/RecordedBeams-v0",
+    "caviar_clients.learning.recorded:RecordedBeamsEnv",
+    vector_entry_point="caviar_clients.learning.recorded:RecordedBeamsVectorEnv",
 )
 gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path_v1:UavPathV1Env")

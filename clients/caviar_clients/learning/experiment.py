@@ -174,7 +174,8 @@ class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """One for all numbers of the part, or one for each."""
     scale: float | tuple[float, ...] = 1.0
     """Above 0; the waves repeat after twice as much."""
-    waves: Annotated[int, quantity("1", "waves", ge=0, le=1024)] = 0
+    waves: int | tuple[int, ...] = 0
+    """From 0 to 1024."""
 
 
 class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -261,7 +262,7 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
     environment = msgspec.structs.replace(made.environment, options=options)
     made = msgspec.structs.replace(made, environment=environment, source=source)
     _check_options(made)
-    _check_scales(made)
+    _check_encodings(made)
     return made
 
 
@@ -292,12 +293,16 @@ def _check_options(experiment: Experiment) -> None:
             raise place.at("options").error(f"lacks {name!r}, which {experiment.environment.id} needs")
 
 
-def _check_scales(experiment: Experiment) -> None:
+def _check_encodings(experiment: Experiment) -> None:
     for name, encoding in experiment.features.items():
         scales = encoding.scale if isinstance(encoding.scale, tuple) else (encoding.scale,)
         if not all(scale > 0 for scale in scales):
             place = experiment.place("features", name, "scale")
             raise place.error(f"is {encoding.scale}, write numbers > 0")
+        waves = encoding.waves if isinstance(encoding.waves, tuple) else (encoding.waves,)
+        if not all(0 <= count <= 1024 for count in waves):
+            place = experiment.place("features", name, "waves")
+            raise place.error(f"is {encoding.waves}, write whole numbers from 0 to 1024")
 
 
 _NOT_OPTIONS = ("self", "render_mode", "num_envs")

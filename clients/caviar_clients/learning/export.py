@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from caviar_clients.envs.base import BeamSelectionEnv
+from caviar_clients.learning.recorded import RecordedBeamsEnv
 from caviar_protocol.errors import SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
@@ -31,9 +32,10 @@ TRIALS = 200
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "onnx", "numpy", "caviar-sim")
 
 Observation = Mapping[str, NDArray[Any]]
+BeamEnv = BeamSelectionEnv | RecordedBeamsEnv
 
 
-def card_of(env: BeamSelectionEnv, **facts: Any) -> PolicyCard:
+def card_of(env: BeamEnv, **facts: Any) -> PolicyCard:
     """Make the card of a policy that was trained in an environment.
 
     Args:
@@ -53,14 +55,14 @@ def card_of(env: BeamSelectionEnv, **facts: Any) -> PolicyCard:
     made = PolicyCard(
         observe=tuple(env.observation_space.spaces),
         codebooks=tuple((place.tx.size, place.rx.size) for place in env.users.places),
-        environment="caviar/BeamSelection-v0",
+        environment=f"caviar/{type(env).__name__.removesuffix('Env')}-v0",
         scenario=env.scenario.run.name,
         versions=versions,
     )
     return replace(made, **facts)
 
 
-def export_policy(model: Any, env: BeamSelectionEnv, file: Path, **facts: Any) -> PolicyCard:
+def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyCard:
     """Export a model of Stable-Baselines3: its deterministic choice.
 
     Args:

@@ -37,7 +37,8 @@ def check_encodings(observation_space: Any, encodings: Mapping[str, Encoding], p
         if name not in parts:
             raise place.at(name).error(f"{name!r} is not observed; {suggestion(name, parts)}")
         size = math.prod(parts[name].shape)
-        for what, values in (("offset", encoding.offset), ("scale", encoding.scale)):
+        for what in ("offset", "scale", "waves"):
+            values = getattr(encoding, what)
             if isinstance(values, tuple) and len(values) != size:
                 text = (
                     f"has {len(values)} numbers, and {name!r} has {size}; write one for all, or one for each"
@@ -67,6 +68,10 @@ def encoded_parts(observation_space: Any, encodings: Mapping[str, Encoding]) -> 
     return _encoded_parts_class()(observation_space, encodings)
 
 
+def _each(values: Any, size: int) -> tuple[Any, ...]:
+    return values if isinstance(values, tuple) else (values,) * size
+
+
 def __getattr__(name: str) -> Any:
     # The class is made when PyTorch is there; by this name a saved model finds it again.
     if name == "EncodedParts":
@@ -85,24 +90,29 @@ def _encoded_parts_class() -> Any:
         def __init__(self, observation_space: Any, encodings: Mapping[str, Encoding]) -> None:
             sizes = {name: math.prod(box.shape) for name, box in observation_space.spaces.items()}
             of = {name: encodings.get(name, Encoding()) for name in sizes}
-            super().__init__(
-                observation_space, sum(n * (1 + 2 * of[name].waves) for name, n in sizes.items())
-            )
+            waves = {name: _each(of[name].waves, size) for name, size in sizes.items()}
+            super().__init__(observation_space, sum(len(w) + 2 * sum(w) for w in waves.values()))
             self._parts = tuple(sizes)
             for name, size in sizes.items():
                 for what, values in (("offset", of[name].offset), ("scale", of[name].scale)):
-                    each = values if isinstance(values, tuple) else (values,) * size
-                    self.register_buffer(f"{name}_{what}", torch.tensor(each, dtype=torch.float32))
-                numbers = torch.arange(1, of[name].waves + 1, dtype=torch.float32)
-                self.register_buffer(f"{name}_waves", math.pi * numbers)
+                    each = torch.tensor(_each(values, size), dtype=torch.float32)
+                    self.register_buffer(f"{name}_{what}", each)
+                # Of each wave the number that it is of, and how often it comes round.
+                numbers = [(i, k) for i, count in enumerate(waves[name]) for k in range(1, count + 1)]
+                self.register_buffer(f"{name}_of", torch.tensor([i for i, _ in numbers], dtype=torch.int64))
+                k = torch.tensor([k for _, k in numbers], dtype=torch.float32)
+                self.register_buffer(f"{name}_waves", math.pi * k)
 
         def forward(self, observations: Mapping[str, Any]) -> Any:
             found = []
             for name in self._parts:
                 x = observations[name].flatten(1).to(torch.float32)
                 z = (x - getattr(self, f"{name}_offset")) / getattr(self, f"{name}_scale")
-                phase = (z[:, :, None] * getattr(self, f"{name}_waves")).flatten(1)
-                found += [z, torch.sin(phase), torch.cos(phase)]
+                found.append(z)
+                k = getattr(self, f"{name}_waves")
+                if len(k):  # ONNX gives a product of nothing a type of its own
+                    phase = k * z[:, getattr(self, f"{name}_of")]
+                    found += [torch.sin(phase), torch.cos(phase)]
             return torch.cat(found, dim=1)
 
     EncodedParts.__qualname__ = EncodedParts.__name__  # found in this module, and not in this function

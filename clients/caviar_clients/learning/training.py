@@ -22,13 +22,12 @@ import gymnasium
 import msgspec
 import numpy as np
 
-from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.files import writing
 from caviar_clients.learning import features
 from caviar_clients.learning.checkpoints import load_checkpoint, newest_checkpoint, save_checkpoint
 from caviar_clients.learning.events import EventFile
 from caviar_clients.learning.experiment import Dqn, Experiment
-from caviar_clients.learning.export import export_policy
+from caviar_clients.learning.export import BeamEnv, export_policy
 from caviar_clients.learning.features import check_encodings
 from caviar_clients.learning.vec_env import stable_baselines3_env
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
@@ -336,7 +335,7 @@ def _new_model(experiment: Experiment, envs: Any, seed: int) -> Any:
 def _export(experiment: Experiment, model: Any, file: Path, seed: int) -> str | None:
     """Export the policy where its actions are beams; returns the SHA-256 of the file."""
     made = gymnasium.make(experiment.environment.id, **experiment.environment.options).unwrapped
-    if not isinstance(made, BeamSelectionEnv):
+    if not isinstance(made, BeamEnv):
         return None
     mean_reward = _mean_reward(model)
     export_policy(
