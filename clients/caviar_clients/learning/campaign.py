@@ -214,4 +214,4 @@ def _serve(pipe: Connection, experiment: Experiment, seed: int, folder: Path) ->
     except CaviarError as error:
         pipe.send(error)
     except BrokenPipeError:
-        os._exit(1)  # there is nobody to tell
+        os._exit(1)  # the caller's process is gone

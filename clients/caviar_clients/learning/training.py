@@ -350,7 +350,7 @@ def _export(experiment: Experiment, model: Any, file: Path, seed: int) -> str | 
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-# --- what is told while it trains -------------------------------------------------------------------------
+# --- reports while it trains ------------------------------------------------------------------------------
 
 
 def _progress(model: Any, seed: int) -> Progress:
@@ -382,7 +382,7 @@ def _logger(events: EventFile) -> Any:
                 events.write(step, kept)
 
         def close(self) -> None:
-            """The file is closed by whoever made it."""
+            """The training that made the file closes it."""
 
     return Logger(folder=None, output_formats=[Curves()])
 

@@ -49,7 +49,7 @@ class Draws(Protocol):
 
         Args:
             members: K members.
-            users: Whom each schedules, Shape ``[K]``.
+            users: User that each member schedules, Shape ``[K]``.
             steps: That each has played, Shape ``[K]``.
             left: Slots of its episode that each has to play, this one included, Shape ``[K]``.
         """
@@ -134,7 +134,7 @@ class BlockDraws:
         return int(self._random[member].integers(episodes))
 
     def draw(self, members: Int64Array, users: Int64Array, steps: Int64Array, left: Int64Array) -> Drawn:
-        """See `Draws.draw`. The numbers do not depend on whom a member schedules."""
+        """See `Draws.draw`. The numbers do not depend on the user that a member schedules."""
         used = self._next[members] >= self._size[members]
         if used.any():
             rows = (members[used].tolist(), steps[used].tolist(), left[used].tolist())
