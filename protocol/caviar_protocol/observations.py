@@ -356,14 +356,20 @@ class _OfLink(Part):
             self._known, self._taken = known, _taken_places(*known)
         values = np.zeros((*link.abs_y.shape[:-1], len(self.users)), np.float32)
         for place, pair, users in self._taken:
-            # One after the other, so that a mean does not depend on how many are worked out at once.
-            values[..., place] = reduce(add, [self._of_user(link, u, pair) for u in users]) / len(users)
+            # A bound that a number exceeds is far beyond what a policy tells apart.
+            values[..., place] = np.minimum(
+                self._together([self._of_user(link, u, pair) for u in users]), self.high
+            )
         return values
 
     @abstractmethod
     def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
-        """The number of one user, Shape ``[...]`` as the link has beside its users; that of a place is the
-        mean over carriers."""
+        """The number of one user, Shape ``[...]`` as the link has beside its users."""
+
+    def _together(self, numbers: Sequence[Float64Array]) -> Float64Array:
+        """What the numbers of a pair's carriers make: their mean."""
+        # One after the other, so that a mean does not depend on how many are worked out at once.
+        return reduce(add, numbers) / len(numbers)
 
 
 def _taken_places(
@@ -405,6 +411,70 @@ class LastBeam(_OfLink):
         tx_beam, receive = link.tx_beam[..., user], pair.rx.array.size
         share = (tx_beam * receive + link.rx_beam[..., user] + 1) / (pair.tx.array.size * receive)
         return np.where(tx_beam < 0, 0.0, share)
+
+
+def require_packets(scenario: KnownScenario, what: str) -> None:
+    """Raise `ScenarioError` for a scenario whose links are known to send no packets.
+
+    Args:
+        scenario: Has the links.
+        what: Needs packets, for the error.
+    """
+    links = {name: spec.use for name, spec in scenario.services.items() if spec.role == "link"}
+    if links and all(use == "beams" for use in links.values()):
+        raise ScenarioError(
+            f"{what} is of packets, and link {next(iter(links))!r} is 'beams', which sends none; "
+            'write use = "cell" and its traffic'
+        )
+
+
+class _OfPackets(_OfLink):
+    """A number of the packets of each place; 0 with a transmitter that does not serve the receiver."""
+
+    field: ClassVar[str]
+    """Of `Link`."""
+    unit: ClassVar[float] = 1.0
+    """What 1 is, in the unit of the field."""
+
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
+        super().__init__(scenario, users, sensor)
+        require_packets(scenario, f"observation {self.field!r}")
+
+    def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
+        figure = getattr(link, self.field, None)
+        if figure is None:
+            raise ScenarioError(
+                f"observation {self.field!r} is of packets, and the link of the run sends none"
+            )
+        found: Float64Array = figure[..., user] / self.unit
+        return found
+
+    def _together(self, numbers: Sequence[Float64Array]) -> Float64Array:
+        return reduce(add, numbers)
+
+
+class Buffered(_OfPackets):
+    """What waits in the buffer after the frame before [Mbit], all carriers together; 0 in frame 0. Shape
+    ``[U]``."""
+
+    field, unit = "buffered", 1e6
+
+
+class Waiting(_OfPackets):
+    """Age of the oldest packet that waits after the frame before [s], on any carrier; 0 in frame 0. Shape
+    ``[U]``."""
+
+    field = "waiting"
+
+    def _together(self, numbers: Sequence[Float64Array]) -> Float64Array:
+        return reduce(np.maximum, numbers)
+
+
+class LastThroughput(_OfPackets):
+    """What came through in the frame before [Mbit/s], on all carriers together; 0 in frame 0. Shape
+    ``[U]``."""
+
+    field, unit = "throughput", 1e6
 
 
 class LidarGrid(Part):
@@ -478,6 +548,9 @@ PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "last_abs_y": LastMagnitude,
     "last_rate": LastRate,
     "last_beam": LastBeam,
+    "last_throughput": LastThroughput,
+    "buffered": Buffered,
+    "waiting": Waiting,
     "lidar_grid": LidarGrid,
     "depth": DepthImage,
     "camera": CameraImage,

@@ -40,13 +40,15 @@ def antenna_spec(name: str, role: str, **more: Any) -> DeviceSpec:
 
 
 def scenario_of(*devices: DeviceSpec, sensors: dict[str, dict[str, Any]] | None = None) -> Scenario:
-    """The shipped smoke scenario with other devices, and sensors by name with their settings."""
+    """The shipped smoke scenario with other devices, a link with packets, and sensors by name with their
+    settings."""
     base = load_scenario(SCENARIOS / "smoke.toml")
     like = base.services["link"]
     services = {
         name: replace(like, role="sensors", use="lidar", settings=settings)
         for name, settings in (sensors or {}).items()
     }
+    services["link"] = replace(like, use="cell")
     return replace(base, devices=devices, services={**base.services, **services})
 
 

@@ -19,6 +19,8 @@ import caviar_clients.envs  # noqa: F401  # registers the environments
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_protocol.errors import CaviarError, PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Action, BeamChoice, Link
 
 pytestmark = pytest.mark.slow
@@ -349,6 +351,65 @@ def test_an_action_of_several_users_has_an_index_for_each(action: Any) -> None:
             assert any(
                 place in text for place in ("at place 0 (bs → car/rx)", "at place 1 (bs → uav/rx-uav)")
             )
+
+
+# --- packets ---------------------------------------------------------------------------------------------
+
+CELL = SCENARIOS / "cell.toml"
+
+
+def served_by_the_best(env: BeamSelectionEnv, steps: int) -> Iterator[tuple[float, dict[str, Any], Link]]:
+    """Reward, information and link of steps in which every user has the beams of the straight line."""
+    env.reset(seed=2)
+    for _ in range(steps):
+        moment = env._moment
+        assert moment is not None
+        action = [0] * len(env.users)
+        for place, pair in moment.users:
+            ends = directions(moment.scene, [pair])
+            tx, rx = straight_beams(pair.tx.array, ends[0][0], pair.rx.array, ends[1][0])
+            action[place] = tx * pair.rx.array.size + rx
+        _, reward, _, _, info = env.step(np.array(action))
+        assert env._moment is not None
+        assert env._moment.link is not None
+        yield reward, info, env._moment.link
+
+
+@pytest.mark.parametrize("kind", ["throughput", "delay"])
+def test_packets_are_rewarded_over_the_users_that_are_served(kind: str) -> None:
+    """Against sums of their own over the receivers, of which one transmitter serves each."""
+    with environment(CELL, reward=kind, observe=("aod", "buffered", "waiting", "last_throughput")) as env:
+        rewards = []
+        for reward, info, link in served_by_the_best(env, 12):
+            rewards.append(reward)
+            assert link.serving is not None
+            receivers = sorted(set(link.rx))
+            assert sorted(np.array(link.rx)[link.serving].tolist()) == receivers
+            figures = {"throughput": 0.0, "delay": 0.0}
+            for rx in receivers:
+                rows = [u for u, name in enumerate(link.rx) if name == rx]
+                figures["throughput"] += sum(info["throughput"][rows]) / 1e6
+                figures["delay"] -= 1e3 * max(sum(info["delay"][rows]), sum(info["waiting"][rows]))
+            assert reward == pytest.approx(figures[kind] / len(receivers))
+        assert (min(rewards) > 0) if kind == "throughput" else (max(rewards) <= 0 > min(rewards))
+
+
+def test_what_waits_is_observed_before_it_is_decided_upon() -> None:
+    """Two transmitters: the one that serves a receiver has its buffer, the other one nothing."""
+    with environment(CELL, observe=("buffered", "last_throughput")) as env:
+        for _, info, _ in served_by_the_best(env, 5):
+            assert env._moment is not None
+            seen = env._observation(env._moment)
+            assert env.observation_space.contains(seen)
+            assert seen["buffered"].sum() == pytest.approx(info["buffered"].sum() / 1e6, rel=1e-6)
+            assert seen["last_throughput"].sum() == pytest.approx(info["throughput"].sum() / 1e6, rel=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"reward": "delay"}, {"observe": ("buffered",)}])
+def test_packets_are_not_for_a_link_that_sends_none(options: dict[str, Any]) -> None:
+    with pytest.raises(ScenarioError, match="is of packets, and link 'link' is 'beams'") as error:
+        BeamSelectionEnv(GEOMETRIC, **options)
+    assert 'use = "cell"' in str(error.value)
 
 
 # --- mistakes --------------------------------------------------------------------------------------------

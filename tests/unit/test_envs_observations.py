@@ -180,6 +180,30 @@ def test_the_last_beam_counts_pairs_as_actions_do_and_is_0_where_none_was_chosen
     assert read(street, "last_beam", scene, link=link).tolist() == [1.0, 0.125, 0.0]
 
 
+def test_packets_are_observed_with_all_carriers_together(scenario: Scenario) -> None:
+    """Of car 1 two carriers: buffers and throughputs add up, and the oldest packet is that of either."""
+    link = replace(
+        link_of([("bs", "car.1/rx", 0.2), ("bs", "car.2/rx", 0.3), ("bs", "car.1/rx", 0.4)]),
+        buffered=np.array([3e6, 0.0, 1.5e6]),
+        waiting=np.array([0.01, 0.0, 0.25]),
+        throughput=np.array([40e6, 7e6, 2e6]),
+    )
+    found = {
+        name: read(scenario, name, cars(1, 2), link=link).tolist()
+        for name in ("buffered", "waiting", "last_throughput")
+    }
+    assert found == {
+        "buffered": [4.5, 0.0, 0.0],
+        "waiting": [0.25, 0.0, 0.0],
+        "last_throughput": [42.0, 7.0, 0.0],
+    }
+
+
+def test_packets_of_a_link_without_any_are_refused(scenario: Scenario) -> None:
+    with pytest.raises(ScenarioError, match="'waiting' is of packets, and the link of the run sends none"):
+        read(scenario, "waiting", cars(1), link=link_of([("bs", "car.1/rx", 0.2)]))
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [

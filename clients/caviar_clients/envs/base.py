@@ -16,7 +16,7 @@ from gymnasium import spaces
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from caviar_clients.envs.rewards import KINDS, Reward, RewardKind, link_info
+from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.plots.scene_map import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
@@ -26,7 +26,7 @@ from caviar_protocol import observations
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input, Status
-from caviar_protocol.observations import Observer, Users
+from caviar_protocol.observations import Observer, Users, require_packets
 from caviar_protocol.topics import Action, BeamChoice, Link
 from caviar_protocol.topics.link import Command
 
@@ -110,6 +110,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(Path(scenario))
+        if reward in OF_PACKETS:
+            require_packets(self.scenario, f"reward {reward!r}")
         # A program may make hundreds of environments: Python shows the same warning once.
         for text in implausible_values(self.scenario):
             warnings.warn(text, stacklevel=2)
@@ -171,7 +173,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         Returns:
             Observation of the next frame; reward of the decision; whether the goal is reached; whether the
             episode is over; and information: ``abs_y``, ``best_abs_y``, ``baseline_abs_y`` and ``los`` of
-            each user, Shape ``[U]``, beside ``frame`` and ``t_ns``; ``late``, whether the decision came
+            each user, Shape ``[U]``, and of a link with packets `caviar_clients.envs.rewards.PACKETS`,
+            beside ``frame`` and ``t_ns``; ``late``, whether the decision came
             after its deadline, so that the agent's late policy stood in for it, and ``missed_frames``, how
             many frames then went on before the next one that it is asked for (at a broker: a run in this
             process waits).

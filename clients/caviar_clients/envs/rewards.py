@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.errors import ScenarioError
 from caviar_protocol.observations import LinkFigures
 from caviar_protocol.topics import Link
 
@@ -41,16 +42,24 @@ class LinkResult(LinkFigures, Protocol):
 
 def link_info(link: LinkResult) -> dict[str, NDArray[Any]]:
     """What ``info`` has of a link, by name."""
-    return {
+    known = {
         "abs_y": link.abs_y,
         "best_abs_y": link.top_abs_y[..., 0],
         "baseline_abs_y": link.baseline_abs_y,
         "los": link.los,
     }
+    if isinstance(link, Link) and link.throughput is not None:
+        known |= {name: getattr(link, name) for name in PACKETS}
+    return known
 
 
-RewardKind: TypeAlias = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
+PACKETS = ("throughput", "delay", "waiting", "buffered", "dropped")
+"""What ``info`` has of a link with packets, in the units of `Link`."""
+
+RewardKind: TypeAlias = Literal["abs_y", "normalised", "snr", "spectral_efficiency", "throughput", "delay"]
 KINDS: tuple[RewardKind, ...] = get_args(RewardKind)
+OF_PACKETS = ("throughput", "delay")
+"""Rewards for which the link has to have packets."""
 
 
 class Reward:
@@ -58,7 +67,10 @@ class Reward:
 
     Args:
         kind: ``abs_y``: |y| of the chosen pair (the paper, section 4); ``normalised``: |y| over that of the
-            best pair; ``snr``: linear; ``spectral_efficiency`` [bit/s/Hz].
+            best pair; ``snr``: linear; ``spectral_efficiency`` [bit/s/Hz]. Of a link with packets, mean over
+            the users whose receiver the transmitter serves, with a path or without: ``throughput`` [Mbit/s];
+            ``delay`` [ms]: minus the mean delay of the packets that came through in the frame, or minus the
+            age of the oldest one that still waits, whichever is longer: to send nothing is no way out.
     """
 
     def __init__(self, kind: RewardKind) -> None:
@@ -94,7 +106,7 @@ class Reward:
             The mean over these users; 0 where none of them has a path.
         """
         values = self._values(link)
-        counted, served = link.has_path, self.served(link, pairs)
+        counted, served = self._counted(link), self.served(link, pairs)
         if served is not None:
             counted = counted & served
         if len(values) == 1:  # without a mask and a mean of NumPy, which take 5 µs more
@@ -123,8 +135,20 @@ class Reward:
         means: Float64Array = np.divide(total, number, out=np.zeros(len(values)), where=number > 0)
         return means
 
+    def _counted(self, link: Link) -> BoolArray:
+        if self.kind not in OF_PACKETS:
+            return link.has_path
+        if link.serving is None:
+            raise ScenarioError(
+                f"the reward {self.kind!r} is of packets, and the link of the run sends none; write "
+                'use = "cell" and its traffic, or another reward'
+            )
+        return link.serving
+
     def _values(self, link: LinkResult) -> Float64Array:
         match self.kind:
+            case "throughput" | "delay":
+                return self._of_packets(link)
             case "abs_y":
                 return link.abs_y
             case "snr":
@@ -135,3 +159,12 @@ class Reward:
                 best = link.top_abs_y.max(axis=-1, initial=0.0)
                 share: Float64Array = np.divide(link.abs_y, best, out=np.zeros(best.shape), where=best > 0)
                 return share
+
+    def _of_packets(self, link: LinkResult) -> Float64Array:
+        if not isinstance(link, Link) or link.throughput is None:
+            return np.zeros(link.abs_y.shape)  # it is refused where users are counted
+        if self.kind == "throughput":
+            return link.throughput / 1e6
+        ages = [values for values in (link.delay, link.waiting) if values is not None]
+        longest: Float64Array = np.max(ages, axis=0)
+        return 0.0 - 1e3 * longest

@@ -77,7 +77,7 @@ def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Arra
     y = h.reshape((*leading, *grid.shape))  # one element at each end: an array without axes
     for axis, size in grid.axes:
         if size > SMALL:
-            y = np.fft.fft(y, axis=axis)
+            y = np.fft.fft(y, axis=axis, out=np.empty(y.shape, np.complex128))  # it looks long for a type
         else:
             y = (y.swapaxes(axis, -1) @ _fourier(size)).swapaxes(axis, -1)
     magnitude: Float64Array = np.abs(y.reshape(*leading, rx.size, tx.size).swapaxes(-1, -2))
