@@ -16,9 +16,9 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ProductError, ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
-from caviar_services.link.base import noise_power
 from caviar_services.link.cell import CellLink
 from caviar_services.link.cell_settings import CellSettings
+from caviar_services.link.link_budget import noise_power
 from caviar_services.service import Frame, FrameInput, RunInfo
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)

@@ -21,9 +21,10 @@ from caviar_services.antenna_arrays import dft_codebook
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link import cell as module
-from caviar_services.link.base import noise_power, users_of
+from caviar_services.link.base import users_of
 from caviar_services.link.cell import CellLink
 from caviar_services.link.cell_settings import CellSettings
+from caviar_services.link.link_budget import noise_power
 from caviar_services.link.nr import Blocks
 from caviar_services.link.slot_channel import band_points, responses
 from caviar_services.service import Frame, Preparation, RunInfo

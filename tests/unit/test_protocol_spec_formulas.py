@@ -14,8 +14,8 @@ from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Panel, Scene
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.base import noise_power
 from caviar_services.link.beams import BeamLinkSettings
+from caviar_services.link.link_budget import noise_power
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 CARRIERS = (Carrier(name="low", frequency_hz=3.5e9), Carrier(name="high", frequency_hz=28e9))

@@ -35,8 +35,8 @@ from caviar_services.channel.radio_map.mapping import (
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.base import noise_power
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
+from caviar_services.link.link_budget import noise_power
 from caviar_services.mesh.scenery import SceneryShape, read_scenery
 from caviar_services.registry import load
 from caviar_services.service import RunInfo

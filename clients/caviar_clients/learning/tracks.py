@@ -25,7 +25,8 @@ from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.base import User, channels_of
 from caviar_services.link.beam_sweep import sweep_users
-from caviar_services.link.beams import BeamLinkSettings, Budget
+from caviar_services.link.beams import BeamLinkSettings
+from caviar_services.link.link_budget import LinkBudget
 
 P = TypeVar("P", bound=Payload)
 
@@ -188,7 +189,8 @@ class _Reader:
             )
         channel = next(iter(products.values()))
         self._scene = self._scene or scene
-        budget = Budget.of(scene, channel.carriers, settings)
+        figure, temperature = settings.noise_figure_db, settings.temperature_k
+        budget = LinkBudget.of(scene, channel.carriers, figure, temperature)
         channels = channels_of(channel, budget.users)
         swept = dict[int, Float64Array]()
         for group in sweep_users(budget.users, channels.h):

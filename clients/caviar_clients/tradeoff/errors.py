@@ -18,9 +18,10 @@ from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import Channel, Scene
-from caviar_services.link.base import User, channels_of, noise_power, transmit_power, users_of
+from caviar_services.link.base import User, channels_of, users_of
 from caviar_services.link.beam_sweep import sweep
 from caviar_services.link.beams import BeamLinkSettings
+from caviar_services.link.link_budget import noise_power, transmit_power
 
 FLOOR_DB = -200.0
 """[dB] Difference of equal channels: float64 carries no more than −313 dB, and no text reads well with −∞."""

@@ -24,15 +24,9 @@ from caviar_protocol.messages import Input
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.link.base import (
-    BOLTZMANN,
-    User,
-    Users,
-    channels_of,
-    require_channel,
-    transmit_power,
-)
+from caviar_services.link.base import User, Users, channels_of, require_channel
 from caviar_services.link.beam_sweep import sweep
+from caviar_services.link.link_budget import BOLTZMANN, transmit_power
 from caviar_services.service import Frame, StepResult
 
 PILOTS = "pilots"

@@ -27,13 +27,6 @@ from caviar_services.service import Frame, Service
 S = TypeVar("S", bound=msgspec.Struct)
 
 
-BOLTZMANN = 1.380649e-23
-"""[J/K], exact (SI)."""
-
-MAX_POWER_DBM = 200.0
-"""A transmit power beyond this, either way, is a mistake of units and would overflow the SNR."""
-
-
 class LinkModel(Service[S]):
     """Base of all links.
 
@@ -153,44 +146,6 @@ def users_of(scene: Scene, carriers: Sequence[Carrier]) -> Users:
     """
     pairs = pairs_of(scene)
     return Users(User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs)
-
-
-def noise_power(carrier: Carrier, noise_figure_db: float, temperature_k: float) -> float:
-    """Thermal noise k·T·B·F [W] in the carrier's bandwidth (Recommendation ITU-R P.372, noise factor).
-
-    Args:
-        carrier: The carrier, with its bandwidth.
-        noise_figure_db: Noise figure of the receiver [dB].
-        temperature_k: Temperature of the thermal noise [K].
-
-    Example:
-        >>> carrier = Carrier(name="mmwave", frequency_hz=28e9, bandwidth_hz=100e6)
-        >>> f"{noise_power(carrier, 9.0, 290.0):.2e}"  # [W], −85 dBm
-        '3.18e-12'
-    """
-    return BOLTZMANN * temperature_k * carrier.bandwidth_hz * 10 ** (noise_figure_db / 10)
-
-
-def transmit_power(user: User) -> float:
-    """Transmit power [W] of a user's transmitter.
-
-    Args:
-        user: The user.
-
-    Raises:
-        PayloadError: The power is beyond ±`MAX_POWER_DBM`; names the device.
-
-    Example:
-        >>> from caviar_services.testing.samples import CARRIERS, scene
-        >>> transmit_power(users_of(scene(0), CARRIERS)[0])  # of 30 dBm
-        1.0
-    """
-    if not abs(user.tx.power_dbm) <= MAX_POWER_DBM:
-        raise PayloadError(
-            f"device {user.tx.name!r} transmits {user.tx.power_dbm} dBm; "
-            f"power_dbm must lie within ±{MAX_POWER_DBM:g}"
-        )
-    return 10 ** ((user.tx.power_dbm - 30) / 10)
 
 
 def require_channel(frame: Frame) -> Channel:

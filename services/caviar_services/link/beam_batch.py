@@ -20,7 +20,8 @@ from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSee
 from caviar_services.link.base import User, Users
 from caviar_services.link.batch import BatchLink, LinkBatch
 from caviar_services.link.beam_sweep import sweep
-from caviar_services.link.beams import BeamLinkSettings, Budget
+from caviar_services.link.beams import BeamLinkSettings
+from caviar_services.link.link_budget import LinkBudget
 
 HELD = 2**17
 """Complex numbers that are held at once while frames are computed ahead: they stay in the caches."""
@@ -32,7 +33,7 @@ class _Ahead(NamedTuple):
     first: int
     """Number of the first one."""
     frames: int
-    budget: Budget
+    budget: LinkBudget
     swept: list[Float64Array]
     """|y| of each user by the index of the pair, Shape ``[M, K, Nt·Nr]``."""
     best: Float64Array
@@ -103,7 +104,8 @@ class BeamBatch(LinkBatch):
 
     def _sweep_from(self, number: int) -> _Ahead:
         first = self._scene_at(number)
-        budget = Budget.of(first.scene, self._carriers, self._settings)
+        figure, temperature = self._settings.noise_figure_db, self._settings.temperature_k
+        budget = LinkBudget.of(first.scene, self._carriers, figure, temperature)
         elements = max((user.tx.array.size * user.rx.array.size for user in budget.users), default=1)
         each = self._channels.width(len(self._members)) * len(self._carriers) * elements
         count = max(1, min(self._channels.reach(number), self._frames - number, HELD // each))

@@ -33,7 +33,7 @@ from caviar_protocol.topics import Link
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.association import Layout, associate
 from caviar_services.link.base import wrong_choice
-from caviar_services.link.beams import Scored, SweepingLink
+from caviar_services.link.beam_scores import Scored, SweepingLink
 from caviar_services.link.cell_settings import CellSettings, check_cell_settings
 from caviar_services.link.nr import Blocks, NrRates, load_blocks
 from caviar_services.link.slot_channel import band_points, responses

@@ -11,7 +11,7 @@ from caviar_protocol.cell.scheduling import Scheduler
 from caviar_protocol.cell.traffic import Traffic, check_traffic
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.link.association import AssociationRule
-from caviar_services.link.beams import RewardKind, SweepSettings
+from caviar_services.link.beam_scores import RewardKind, SweepSettings
 from caviar_services.link.slot_rates import Sharing
 
 RateModel = Literal["shannon", "capped", "nr"]

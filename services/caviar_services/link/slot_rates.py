@@ -11,7 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon, slot_bits
 from caviar_services.link.association import Layout
-from caviar_services.link.beams import Scored
+from caviar_services.link.beam_scores import Scored
 from caviar_services.link.interference import amplitudes
 
 Sharing = Literal["band", "space"]
