@@ -3,8 +3,9 @@
     python tests/bench/bench_processes.py street-canyon [--frames N] [--markdown FILE]
 
 Starts `caviar run` and reads what the kernel counted for each thread (``/proc/PID/task/TID/schedstat``), from
-the 30th frame on, when kernels are compiled and caches are warm. The growing recording shows how far the
-run is. On two cores no run is faster than half of the sum allows, nor than its busiest thread.
+the 30th frame on, when kernels are compiled and caches are warm. The broker notes when each frame was
+finished (``latency.npz``), which says how many frames lie between two samples. On two cores no run is faster
+than half of the sum allows, nor than its busiest thread.
 """
 
 from __future__ import annotations
@@ -20,19 +21,26 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 WARM_UP = 30
 """Frames that do not count."""
 LAST = 3
 """Frames at the end that do not count: processes end in them."""
 PERIOD_S = 0.05
+FEWEST_SAMPLES = 10
+"""Samples that a measurement needs: a process ends, or is counted, up to a period beside a frame."""
+
+
+class TooShortError(Exception):
+    """A run ended before enough was sampled."""
 
 
 class Sample(NamedTuple):
     """What was counted at an instant."""
 
-    instant_s: float
-    recorded: int
-    """Bytes of the recording."""
+    instant_ns: int
+    """Of the monotonic clock, as the broker's."""
     used_ns: Counter[tuple[str, int]]
     """Processor time by process and thread."""
 
@@ -57,9 +65,10 @@ def name_of(pid: int) -> str:
     return "broker" if "caviar_broker" in words else "launcher"
 
 
-def sampled(pid: int, folder: Path) -> Sample:
+def sampled(pid: int) -> Sample:
     """Threads that end in the meantime are left out."""
     used: Counter[tuple[str, int]] = Counter()
+    instant_ns = time.monotonic_ns()
     for process in list(descendants(pid)):
         try:
             name = name_of(process)
@@ -67,8 +76,7 @@ def sampled(pid: int, folder: Path) -> Sample:
                 used[name, int(task.name)] = int((task / "schedstat").read_text().split()[0])
         except OSError:
             continue
-    recorded = sum(file.stat().st_size for file in folder.rglob("recording-*.mcap"))
-    return Sample(time.monotonic(), recorded, used)
+    return Sample(instant_ns, used)
 
 
 def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float], float, float, int, str]:
@@ -78,20 +86,26 @@ def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float]
     run = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     samples = []
     while run.poll() is None:
-        samples.append(sampled(run.pid, folder))
+        samples.append(sampled(run.pid))
         time.sleep(PERIOD_S)
     if run.returncode:
         raise SystemExit(run.returncode)
-    whole = samples[-1].recorded
-    first = next(s for s in samples if s.recorded >= whole * WARM_UP / frames)
-    last = next(s for s in samples if s.recorded >= whole * (frames - LAST) / frames)
-    count = (last.recorded - first.recorded) / whole * frames
+    (latencies,) = folder.glob("*/latency.npz")
+    with np.load(latencies) as arrays:
+        finished_ns = arrays["finished_ns"]
+    counted = [s for s in samples if finished_ns[WARM_UP] <= s.instant_ns <= finished_ns[-LAST]]
+    if len(counted) < FEWEST_SAMPLES:
+        raise TooShortError(f"{frames} frames of {scenario} last for {len(counted)} samples of {PERIOD_S} s")
+    first, last = counted[0], counted[-1]
+    # Within a frame by proportion: a frame of a heavy scenario is longer than the time between samples.
+    done = np.interp([first.instant_ns, last.instant_ns], finished_ns, np.arange(len(finished_ns)))
+    count = float(done[1] - done[0])
     by_thread = {key: (ns - first.used_ns[key]) / 1e6 / count for key, ns in last.used_ns.items()}
     by_process: defaultdict[str, float] = defaultdict(float)
     for (name, _), ms in by_thread.items():
         by_process[name] += ms
     digest = json.loads((folder / "summary.json").read_text())["digest"]
-    rate = count / (last.instant_s - first.instant_s)
+    rate = count / (last.instant_ns - first.instant_ns) * 1e9
     return dict(by_process), max(by_thread.values()), rate, round(count), digest
 
 
@@ -99,15 +113,22 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("scenario", nargs="?", default="street-canyon")
-    parser.add_argument("--frames", type=int, default=150)
+    parser.add_argument("--frames", type=int, help="default: 150, or ten times as many where these are short")
     parser.add_argument("--markdown", type=Path)
     arguments = parser.parse_args()
-    if arguments.frames < WARM_UP + 2 * LAST:
-        parser.error(f"--frames {arguments.frames} leaves nothing after the first {WARM_UP} frames")
-    with tempfile.TemporaryDirectory() as folder:
-        by_process, busiest, rate, count, digest = measured(
-            arguments.scenario, arguments.frames, Path(folder)
-        )
+    frames = 150 if arguments.frames is None else arguments.frames
+    if frames < WARM_UP + 2 * LAST:
+        parser.error(f"--frames {frames} leaves nothing after the first {WARM_UP} frames")
+    while True:
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                found = measured(arguments.scenario, frames, Path(folder))
+                break
+            except TooShortError as error:
+                if arguments.frames is not None:
+                    parser.error(f"{error}; give more --frames")
+                frames *= 10
+    by_process, busiest, rate, count, digest = found
     rows = [(name, f"{ms:.1f}") for name, ms in sorted(by_process.items(), key=lambda item: -item[1])]
     rows += [("all", f"{sum(by_process.values()):.1f}"), ("busiest thread", f"{busiest:.1f}")]
     title = f"`{arguments.scenario}`, {count} frames"
