@@ -30,7 +30,8 @@ from caviar_broker.journal_format import (
     entry_head,
 )
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import RunDirectory, read_regular, replace_file, sync_file
+from caviar_protocol.files import read_regular, replace_file, sync_file
+from caviar_protocol.run_directory import RunDirectory
 
 
 class CheckpointFiles:

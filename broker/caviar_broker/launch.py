@@ -48,8 +48,9 @@ from caviar_broker.security.limits import PeerLimits
 from caviar_broker.server import BrokerServer
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.files import RunDirectory, file_system_of
+from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 

@@ -22,15 +22,9 @@ import msgspec
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import (
-    PUT_BACK,
-    RunDirectory,
-    read_regular,
-    refuse_other_kinds,
-    replace_file,
-    sync_file,
-)
+from caviar_protocol.files import PUT_BACK, read_regular, refuse_other_kinds, replace_file, sync_file
 from caviar_protocol.messages import PROTOCOL_VERSION, GrantInput, Status
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ReplaySpec, Scenario
 from caviar_protocol.scenario.conversion import Source
 

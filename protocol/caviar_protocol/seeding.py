@@ -1,5 +1,10 @@
-"""Random generators and seeds of runs, episodes and frames: one for each purpose, independent of process and
-order (clause 19)."""
+"""Which seed a service gets: random generators and integer seeds.
+
+They depend on neither process nor order (contract, clause 19).
+
+Every service learns the seed of the run, and derives from it by episode, frame and a name of its own: a NumPy
+`generator` for its own draws, and with `derive_seed` the seed of a library that draws for it.
+"""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.space.scene import device_pose

@@ -39,7 +39,10 @@ _DOING = {
 
 @dataclass(slots=True)
 class Peer:
-    """A service that the run expects, and what has been heard of it."""
+    """What the broker knows of a service: its part in the run, its state, and what has been heard of it.
+
+    What it may use of the broker, as its memory limit, is in `caviar_broker.security.limits.PeerLimits`.
+    """
 
     plan: ServicePlan
     state: ServiceState = ServiceState.EXPECTED

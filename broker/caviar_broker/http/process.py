@@ -24,8 +24,8 @@ from caviar_broker.control.socket import Ask, ask_in_thread, call_at_end, connec
 from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.supervision import describe_exit
 from caviar_protocol.errors import CaviarError, RunError, SetupError
-from caviar_protocol.files import RunDirectory
 from caviar_protocol.keys import Credentials, Pair
+from caviar_protocol.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from caviar_broker.server import BrokerServer

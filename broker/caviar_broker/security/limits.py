@@ -73,8 +73,12 @@ CHATTER = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class PeerLimits:
-    """Limits of a peer: of its memory, messages and connections. Far more than any service of a run needs,
-    unless a scenario's ``[limits]`` differ; ``waiting_mib`` there is the memory limit `queued`."""
+    """Limits of a peer: of its memory, messages and connections.
+
+    A peer is any process that connects, also one that is no service of the run (`core.run.Peer` is one that
+    is). The defaults are far more than a service needs, unless a scenario's ``[limits]`` differ;
+    ``waiting_mib`` there is the memory limit `queued`.
+    """
 
     connections: int = 4096
     """Open connections in all; at most half the descriptors that this process may have."""

@@ -20,7 +20,8 @@ import zmq
 from caviar_clients.cli.keys import BorrowedKey
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import RunDirectory, file_system_of, open_to_append
+from caviar_protocol.files import file_system_of, open_to_append
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_protocol.scratch import PrivateFolder
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each

@@ -37,10 +37,10 @@ from caviar_clients.cli.summary import (
     summarise,
 )
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.files import RunDirectory, runs_below
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
+from caviar_protocol.run_directory import RunDirectory, runs_below
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scratch import PrivateFolder
 from caviar_services.recorder.base import failure

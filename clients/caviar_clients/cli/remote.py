@@ -18,8 +18,9 @@ from rich.console import Console
 import caviar_clients
 from caviar_clients.cli.shared import new_run_directory, print_line
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import RunDirectory, replace_file
+from caviar_protocol.files import replace_file
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, read_authorized
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ServiceSpec
 from caviar_services.registry import registered
 

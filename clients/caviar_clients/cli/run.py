@@ -29,7 +29,7 @@ from caviar_clients.files import printable, write_file
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import RecordingError, RunError, SetupError
-from caviar_protocol.files import RunDirectory
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 

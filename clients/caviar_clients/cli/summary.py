@@ -19,9 +19,9 @@ from caviar_clients.cli.packet_summary import PacketSummary, PacketTotals, packe
 from caviar_clients.cli.shared import counted, scaled
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import Report, Status
 from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX

@@ -15,9 +15,10 @@ import numpy.typing as npt
 from caviar_clients.session.checks import declared_hello, demanded
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import DeclarationError, RecordingError
-from caviar_protocol.files import RunDirectory, open_regular
+from caviar_protocol.files import open_regular
 from caviar_protocol.messages import PROTOCOL_VERSION, GrantInput, Hello, Status
 from caviar_protocol.recording import FrameEntry, Recording
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 
 

@@ -32,9 +32,9 @@ from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import Answer, sorted_products

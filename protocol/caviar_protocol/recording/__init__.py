@@ -35,8 +35,9 @@ import msgspec
 from caviar_protocol.arrays import Payload, quantity
 from caviar_protocol.codec.payloads import decode_payload
 from caviar_protocol.errors import ProtocolError, RecordingError, suggestion
-from caviar_protocol.files import RunDirectory, newest_run, read_regular, replace_file
+from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import Asset, GrantInput, Report, Status
+from caviar_protocol.run_directory import RunDirectory, newest_run
 from caviar_protocol.space.scene import merge_scenes
 from caviar_protocol.topics import PAYLOADS, Scene
 

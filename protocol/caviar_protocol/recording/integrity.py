@@ -13,7 +13,6 @@ import msgspec
 
 from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.files import SEGMENT_PATTERN, RunDirectory, runs_below
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,
@@ -25,6 +24,7 @@ from caviar_protocol.recording import (
     read_manifest,
 )
 from caviar_protocol.recording.segment import Channel, Chunk, Segment
+from caviar_protocol.run_directory import SEGMENT_PATTERN, RunDirectory, runs_below
 
 # A recorder replaces the manifest a few times while it continues a recording, then once a segment.
 _READINGS = 8

@@ -20,7 +20,6 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.errors import RecordingError, suggestion
-from caviar_protocol.files import RunDirectory
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import (
     FrameEntry,
@@ -50,6 +49,7 @@ from caviar_protocol.recording.topics import (
     ChannelArrays,
     LinkArrays,
 )
+from caviar_protocol.run_directory import RunDirectory
 
 P = TypeVar("P", bound=Payload)
 T = TypeVar("T", bound=str)

@@ -22,8 +22,9 @@ import msgspec
 
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import AssetError, RunError
-from caviar_protocol.files import RunDirectory, sync_file
+from caviar_protocol.files import sync_file
 from caviar_protocol.messages import Asset, GrantInput, Input, Role, Status
+from caviar_protocol.run_directory import RunDirectory
 from caviar_services.service import Service
 
 S = TypeVar("S", bound=msgspec.Struct)

@@ -41,7 +41,7 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
-from caviar_protocol.files import Durability, RunDirectory, sync_file
+from caviar_protocol.files import Durability, sync_file
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.recording import (
     FrameEntry,
@@ -52,6 +52,7 @@ from caviar_protocol.recording import (
 )
 from caviar_protocol.recording.integrity import RecordedSegments, follows
 from caviar_protocol.recording.segment import Segment
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import (
     Recorder,

@@ -130,7 +130,7 @@ def path_geometry(
     point_velocity: Float64Array,
     end_velocity: Float64Array,
 ) -> PathGeometry:
-    """Geometry of paths start → points → end.
+    """Compute delays, directions and Doppler shifts of paths start → points → end.
 
     Args:
         start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
