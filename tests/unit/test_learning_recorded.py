@@ -177,7 +177,8 @@ def test_dqn_of_stable_baselines3_trains_on_it(geometric: tuple[Path, Path]) -> 
 
 
 def test_which_parts_are_fed_back() -> None:
-    assert [name for name in PARTS if is_feedback(name)] == ["last_abs_y", "last_rate", "last_beam"]
+    of_packets = ["last_throughput", "buffered", "waiting"]
+    assert [n for n in PARTS if is_feedback(n)] == ["last_abs_y", "last_rate", "last_beam", *of_packets]
     assert not is_feedback("no_such_part")
 
 

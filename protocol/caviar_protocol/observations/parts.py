@@ -1,16 +1,13 @@
-"""What a policy observes: parts by name, and the users that they are about.
+"""Parts of the observation, each a class: angles, positions, the link of the frame before, packets, sensors.
 
-Environments, training on recordings and agents that serve a trained policy read observations here, so that a
-policy sees the same numbers wherever it decides. To add a part: one subclass of `Part`, one line in `PARTS`.
+To add one: a subclass of `Part` here, and a line in `PARTS`.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import reduce
 from operator import add
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
@@ -22,12 +19,10 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scenario.rules import patterns_overlap
-from caviar_protocol.scenario.schema import ServiceSpec, owned_by
+from caviar_protocol.observations.users import KnownScenario, Users, spec_name
 from caviar_protocol.space.coordinates import Vector
-from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions, pairs_of
-from caviar_protocol.topics import AntennaArray, Camera, Depth, Lidar, Scene
+from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
+from caviar_protocol.topics import Camera, Depth, Lidar, Scene
 
 P = TypeVar("P", bound=Payload)
 
@@ -39,26 +34,6 @@ class ObservedFrame(Protocol):
         """Payloads of a topic that are present, by source."""
 
 
-class KnownScenario(Protocol):
-    """What is known of a scenario: a `Scenario`, or what a run says to its agents about it."""
-
-    @property
-    def devices(self) -> Sequence[DeviceSpec]:
-        """All devices."""
-
-    @property
-    def services(self) -> Mapping[str, ServiceSpec]:
-        """Services with their settings; empty where they are not known."""
-
-
-@dataclass(frozen=True)
-class KnownDevices:
-    """What a run says to its agents about the scenario."""
-
-    devices: Sequence[DeviceSpec]
-    services: Mapping[str, ServiceSpec] = field(default_factory=dict)
-
-
 class Bounds(NamedTuple):
     """Bounds, shape and dtype of the values of a part, as a `gymnasium.spaces.Box` takes them."""
 
@@ -66,113 +41,6 @@ class Bounds(NamedTuple):
     high: float
     shape: tuple[int, ...]
     dtype: Any
-
-
-@dataclass(frozen=True)
-class Place:
-    """What one place of the observation and of the action stands for."""
-
-    tx: AntennaArray
-    rx: AntennaArray
-
-    @property
-    def beam_pairs(self) -> int:
-        """Number of pairs of the two codebooks."""
-        return self.tx.size * self.rx.size
-
-
-class Users:
-    """Places for all pairs that a scenario can have, by transmitter, then receiver.
-
-    A device on a pattern (``on = "car.*"``, ``count = 10``) has ``count`` places; the pairs that are there
-    fill them in the order of their names, and what is left stays empty. So spaces keep their size while
-    users come and go.
-
-    Args:
-        scenario: Names the devices.
-        patterns: Receivers that are served, as names with ``*`` and ``?``.
-        without: Receivers among them that are not, in the same form; their places stay empty.
-
-    Raises:
-        ScenarioError: The patterns match no receiver; the text has those there are.
-
-    Example:
-        >>> from caviar_protocol.scenario import load_scenario
-        >>> users = Users(load_scenario("geometric"), ("*",))
-        >>> len(users), users.places[0].beam_pairs
-        (1, 64)
-    """
-
-    def __init__(self, scenario: KnownScenario, patterns: Sequence[str], without: Sequence[str] = ()) -> None:
-        self._patterns, self._without = tuple(patterns), tuple(without)
-        antennas = [d for d in scenario.devices if d.kind == "antenna"]
-        self._groups: list[tuple[DeviceSpec, DeviceSpec]] = [
-            (tx, rx)
-            for tx in sorted((d for d in antennas if d.role in ("tx", "both")), key=_name)
-            for rx in sorted((d for d in antennas if d.role in ("rx", "both")), key=_name)
-            if rx is not tx and self._may_serve(rx)
-        ]
-        if not self._groups:
-            receivers = (d for d in antennas if d.role in ("rx", "both"))
-            names = ", ".join(_full_name(d) for d in receivers) or "none"
-            raise ScenarioError(f"no receiver of the scenario is {' or '.join(patterns)}; there are: {names}")
-        self._first: dict[tuple[str, str], int] = {}
-        self.places: list[Place] = []
-        """One for each pair there may be."""
-        for tx, rx in self._groups:
-            self._first[tx.name, rx.name] = len(self.places)
-            # One object for all of a group: places of a pattern have the same arrays.
-            self.places += [Place(_array(tx), _array(rx))] * (tx.count * rx.count)
-        self._devices: object = None
-        self._found: tuple[tuple[int, Pair], ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def present(self, scene: Scene) -> tuple[tuple[int, Pair], ...]:
-        """Find the pairs of a scene that are served.
-
-        Returns:
-            Place and pair, in the order of the scene's pairs.
-        """
-        # A world makes a new tuple of devices where one comes or goes, and passes on the same one else.
-        if scene.devices is not self._devices:
-            self._devices, self._found = scene.devices, tuple(self._seated(scene))
-        return self._found
-
-    def _seated(self, scene: Scene) -> Iterator[tuple[int, Pair]]:
-        taken: dict[tuple[str, str], int] = {}
-        for pair in pairs_of(scene):
-            group = _spec_name(pair.tx.name), _spec_name(pair.rx.name)
-            if group in self._first and self._serves(pair.rx.name):
-                place = self._first[group] + taken.get(group, 0)
-                taken[group] = taken.get(group, 0) + 1
-                yield place, pair
-
-    def _serves(self, rx: str) -> bool:
-        return owned_by(self._patterns, rx) and not (self._without and owned_by(self._without, rx))
-
-    def _may_serve(self, rx: DeviceSpec) -> bool:
-        # Names of objects are known at run time: two patterns are compared with each other here.
-        return any(patterns_overlap(_full_name(rx), pattern) for pattern in self._patterns)
-
-
-def _name(device: DeviceSpec) -> str:
-    return device.name
-
-
-def _full_name(device: DeviceSpec) -> str:
-    """Name of a device in the run; a pattern where it is on one."""
-    return f"{device.on}/{device.name}" if device.on else device.name
-
-
-def _spec_name(device: str) -> str:
-    """Name in the scenario of a device that may be mounted on an object."""
-    return device.rpartition("/")[2]
-
-
-def _array(device: DeviceSpec) -> AntennaArray:
-    return device.array or AntennaArray()
 
 
 class LinkFigures(Protocol):
@@ -335,7 +203,7 @@ class Velocity(_PerUser):
         return [device_velocity(moment.scene, pair.rx) for _, pair in moment.users]
 
 
-class _OfLink(Part):
+class OfLink(Part):
     """A number for each place out of the link of the frame before; 0 in frame 0 and for an empty place."""
 
     low: ClassVar[float] = 0.0
@@ -384,7 +252,7 @@ def _taken_places(
     return [entry for entry in taken if entry[2]]
 
 
-class LastMagnitude(_OfLink):
+class LastMagnitude(OfLink):
     """|y| of the frame before, the mean over carriers; 0 in frame 0. Shape ``[U]``."""
 
     low = -FAR  # as it was: a trained policy is tied to its bounds
@@ -393,7 +261,7 @@ class LastMagnitude(_OfLink):
         return link.abs_y[..., user]
 
 
-class LastRate(_OfLink):
+class LastRate(OfLink):
     """Spectral efficiency [bit/s/Hz] of the beams of the frame before, the mean over carriers: what a
     receiver feeds back. 0 in frame 0. Shape ``[U]``."""
 
@@ -401,7 +269,7 @@ class LastRate(_OfLink):
         return link.spectral_efficiency[..., user]
 
 
-class LastBeam(_OfLink):
+class LastBeam(OfLink):
     """The pair of beams of the frame before, by its index ``i = tx_beam·Nr + rx_beam`` as
     ``(i + 1) / (Nt·Nr)``; 0 in frame 0 and where none was chosen. Shape ``[U]``."""
 
@@ -428,7 +296,7 @@ def require_packets(scenario: KnownScenario, what: str) -> None:
         )
 
 
-class _OfPackets(_OfLink):
+class _OfPackets(OfLink):
     """A number of the packets of each place; 0 with a transmitter that does not serve the receiver."""
 
     field: ClassVar[str]
@@ -494,7 +362,7 @@ class LidarGrid(Part):
     def read(self, moment: Moment) -> NDArray[np.int8] | None:
         for lidar in moment.frame.payloads("lidar", Lidar).values():
             for scan in lidar.scans:
-                if _spec_name(scan.sensor) == self.sensor and scan.grid is not None:
+                if spec_name(scan.sensor) == self.sensor and scan.grid is not None:
                     return scan.grid.occupancy
         return None
 
@@ -517,7 +385,7 @@ class DepthImage(Part):
     def read(self, moment: Moment) -> NDArray[np.float32] | None:
         for depth in moment.frame.payloads("depth", Depth).values():
             for image in depth.images:
-                if _spec_name(image.sensor) == self.sensor:
+                if spec_name(image.sensor) == self.sensor:
                     return image.depth
         return None
 
@@ -534,9 +402,25 @@ class CameraImage(DepthImage):
     def read(self, moment: Moment) -> NDArray[Any] | None:
         for camera in moment.frame.payloads("camera", Camera).values():
             for image in camera.images:
-                if _spec_name(image.sensor) == self.sensor:
+                if spec_name(image.sensor) == self.sensor:
                     return image.rgb
         return None
+
+
+def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:
+    """Shape of the grid as the LIDAR's settings have it, before there is a scan."""
+    for spec in scenario.services.values():
+        grid = spec.settings.get("grid") if spec.role == "sensors" else None
+        if grid is None:
+            continue
+        # A grid has cells, or a box and the size of a cell, which the last cell may exceed.
+        if "cells" in grid:
+            x, y, z = grid["cells"]
+            return int(x), int(y), int(z)
+        extents = zip(grid["minimum_m"], grid["maximum_m"], grid["cell_m"], strict=True)
+        x, y, z = (max(1, math.ceil((high - low) / edge - 1e-9)) for low, high, edge in extents)
+        return x, y, z
+    raise ScenarioError("observation 'lidar_grid' needs [services.<lidar>.settings.grid] in the scenario")
 
 
 PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
@@ -556,111 +440,3 @@ PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
     "camera": CameraImage,
 }
 """Parts by name. One of a sensor may name it after a colon: ``camera:dash``."""
-
-
-def is_feedback(name: str) -> bool:
-    """Whether a part is read from the link of the frame before alone, and from nothing of the scene.
-
-    Args:
-        name: Of the part, as in `PARTS`.
-
-    Example:
-        >>> is_feedback("last_beam"), is_feedback("position")
-        (True, False)
-    """
-    cls = PARTS.get(name.partition(":")[0])
-    return isinstance(cls, type) and issubclass(cls, _OfLink)
-
-
-def part(scenario: KnownScenario, users: Users, name: str) -> Part:
-    """Make a part of the observation.
-
-    Args:
-        scenario: Has the devices.
-        users: The places.
-        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand after a colon.
-
-    Raises:
-        ScenarioError: The part does not exist, or its sensor does not; the text has those there are.
-    """
-    kind, _, sensor = name.partition(":")
-    cls: Any = PARTS.get(kind)
-    if cls is None:
-        near = get_close_matches(kind, PARTS, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ScenarioError(f"no observation is called {name!r}; {hint}there are: {', '.join(PARTS)}")
-    device = cls.needs_sensor
-    if not device:
-        if sensor:
-            raise ScenarioError(f"{name!r}: {kind!r} is not of a sensor; write {kind!r}")
-        return cls(scenario, users, "")  # type: ignore[no-any-return]  # a subclass of Part
-    names = [d.name for d in scenario.devices if d.kind == device]
-    if not sensor and len(names) == 1:
-        sensor = names[0]
-    if sensor not in names:
-        there = (
-            ", ".join(f"{kind}:{n}" for n in names)
-            or f"none, as the scenario has no device of kind {device!r}"
-        )
-        raise ScenarioError(f"observation {name!r} names no {device} of the scenario; there are: {there}")
-    return cls(scenario, users, sensor)  # type: ignore[no-any-return]  # a subclass of Part
-
-
-class Observer:
-    """Reads some parts of the observation in every frame.
-
-    Args:
-        scenario: Has the devices.
-        users: The places.
-        names: Of the parts, as in `PARTS`.
-
-    Raises:
-        ScenarioError: A part does not exist, or its sensor does not; the text has those there are.
-
-    Example:
-        >>> from caviar_protocol.scenario import load_scenario
-        >>> scenario = load_scenario("geometric")
-        >>> observer = Observer(scenario, Users(scenario, ("*",)), ("aoa", "last_abs_y"))
-        >>> {name: bounds.shape for name, bounds in observer.bounds.items()}
-        {'aoa': (1,), 'last_abs_y': (1,)}
-    """
-
-    def __init__(self, scenario: KnownScenario, users: Users, names: Iterable[str]) -> None:
-        self._parts: dict[str, Part] = {name: part(scenario, users, name) for name in names}
-        self.bounds: Mapping[str, Bounds] = {name: found.bounds for name, found in self._parts.items()}
-        """Of each part, by name."""
-        self._blank = {name: np.zeros(of.shape, of.dtype) for name, of in self.bounds.items()}
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        """What the parts need beside the scene and the link of the frame before, one input for each topic."""
-        return tuple({i.topic: i for found in self._parts.values() for i in found.inputs}.values())
-
-    def read(self, moment: Moment) -> dict[str, NDArray[Any]]:
-        """Read all parts at a frame; zeros stand for what is not known.
-
-        Args:
-            moment: What is known at the frame.
-        """
-        found = {}
-        for name, of in self._parts.items():
-            value = of.read(moment)
-            # A copy: learners keep observations, and some write into them.
-            found[name] = self._blank[name].copy() if value is None else value
-        return found
-
-
-def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:
-    """Shape of the grid as the LIDAR's settings have it, before there is a scan."""
-    for spec in scenario.services.values():
-        grid = spec.settings.get("grid") if spec.role == "sensors" else None
-        if grid is None:
-            continue
-        # A grid has cells, or a box and the size of a cell, which the last cell may exceed.
-        if "cells" in grid:
-            x, y, z = grid["cells"]
-            return int(x), int(y), int(z)
-        extents = zip(grid["minimum_m"], grid["maximum_m"], grid["cell_m"], strict=True)
-        x, y, z = (max(1, math.ceil((high - low) / edge - 1e-9)) for low, high, edge in extents)
-        return x, y, z
-    raise ScenarioError("observation 'lidar_grid' needs [services.<lidar>.settings.grid] in the scenario")

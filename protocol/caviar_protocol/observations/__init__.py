@@ -1,0 +1,139 @@
+"""What a policy observes: parts by name, and the users that they are about.
+
+Environments, training on recordings and agents that serve a trained policy read observations here, so that a
+policy sees the same numbers wherever it decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.messages import Input
+from caviar_protocol.observations.parts import (
+    FAR,
+    PARTS,
+    Bounds,
+    LinkFigures,
+    Moment,
+    ObservedFrame,
+    OfLink,
+    Part,
+    require_packets,
+)
+from caviar_protocol.observations.users import KnownDevices, KnownScenario, Place, Users
+
+__all__ = [
+    "FAR",
+    "PARTS",
+    "Bounds",
+    "KnownDevices",
+    "KnownScenario",
+    "LinkFigures",
+    "Moment",
+    "ObservedFrame",
+    "Observer",
+    "Part",
+    "Place",
+    "Users",
+    "is_feedback",
+    "part",
+    "require_packets",
+]
+
+
+def is_feedback(name: str) -> bool:
+    """Whether a part is read from the link of the frame before alone, and from nothing of the scene.
+
+    Args:
+        name: Of the part, as in `PARTS`.
+
+    Example:
+        >>> is_feedback("last_beam"), is_feedback("position")
+        (True, False)
+    """
+    cls = PARTS.get(name.partition(":")[0])
+    return isinstance(cls, type) and issubclass(cls, OfLink)
+
+
+def part(scenario: KnownScenario, users: Users, name: str) -> Part:
+    """Make a part of the observation.
+
+    Args:
+        scenario: Has the devices.
+        users: The places.
+        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand after a colon.
+
+    Raises:
+        ScenarioError: The part does not exist, or its sensor does not; the text has those there are.
+    """
+    kind, _, sensor = name.partition(":")
+    cls: Any = PARTS.get(kind)
+    if cls is None:
+        near = get_close_matches(kind, PARTS, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ScenarioError(f"no observation is called {name!r}; {hint}there are: {', '.join(PARTS)}")
+    device = cls.needs_sensor
+    if not device:
+        if sensor:
+            raise ScenarioError(f"{name!r}: {kind!r} is not of a sensor; write {kind!r}")
+        return cls(scenario, users, "")  # type: ignore[no-any-return]  # a subclass of Part
+    names = [d.name for d in scenario.devices if d.kind == device]
+    if not sensor and len(names) == 1:
+        sensor = names[0]
+    if sensor not in names:
+        there = (
+            ", ".join(f"{kind}:{n}" for n in names)
+            or f"none, as the scenario has no device of kind {device!r}"
+        )
+        raise ScenarioError(f"observation {name!r} names no {device} of the scenario; there are: {there}")
+    return cls(scenario, users, sensor)  # type: ignore[no-any-return]  # a subclass of Part
+
+
+class Observer:
+    """Reads some parts of the observation in every frame.
+
+    Args:
+        scenario: Has the devices.
+        users: The places.
+        names: Of the parts, as in `PARTS`.
+
+    Raises:
+        ScenarioError: A part does not exist, or its sensor does not; the text has those there are.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> scenario = load_scenario("geometric")
+        >>> observer = Observer(scenario, Users(scenario, ("*",)), ("aoa", "last_abs_y"))
+        >>> {name: bounds.shape for name, bounds in observer.bounds.items()}
+        {'aoa': (1,), 'last_abs_y': (1,)}
+    """
+
+    def __init__(self, scenario: KnownScenario, users: Users, names: Iterable[str]) -> None:
+        self._parts: dict[str, Part] = {name: part(scenario, users, name) for name in names}
+        self.bounds: Mapping[str, Bounds] = {name: found.bounds for name, found in self._parts.items()}
+        """Of each part, by name."""
+        self._blank = {name: np.zeros(of.shape, of.dtype) for name, of in self.bounds.items()}
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the parts need beside the scene and the link of the frame before, one input for each topic."""
+        return tuple({i.topic: i for found in self._parts.values() for i in found.inputs}.values())
+
+    def read(self, moment: Moment) -> dict[str, NDArray[Any]]:
+        """Read all parts at a frame; zeros stand for what is not known.
+
+        Args:
+            moment: What is known at the frame.
+        """
+        found = {}
+        for name, of in self._parts.items():
+            value = of.read(moment)
+            # A copy: learners keep observations, and some write into them.
+            found[name] = self._blank[name].copy() if value is None else value
+        return found
