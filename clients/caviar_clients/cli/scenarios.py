@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from caviar_clients.cli.shared import print_line, require_installed
+from caviar_clients.cli.shared import description, print_line, require_installed
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
@@ -21,28 +21,6 @@ TEMPLATE = "new/scenario.toml"
 _TEMPLATE_NAME = 'name = "my-scenario"'
 # A name of a run becomes part of a directory's name and of ids on the wire.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-
-
-def description(text: str) -> str:
-    """Say what a scenario is.
-
-    Args:
-        text: The scenario's file.
-
-    Returns:
-        The first sentence of the comment at the head of the file, without its full stop.
-
-    Example:
-        >>> description("# Cars drive. They turn.\\n[run]")
-        'Cars drive'
-    """
-    lines = []
-    for line in text.splitlines():
-        comment = line.removeprefix("#").strip()
-        if not line.startswith("#") or not comment:
-            break
-        lines.append(comment)
-    return re.split(r"(?<=\.) (?=[A-Z])", " ".join(lines), maxsplit=1)[0].rstrip(".")
 
 
 def extras_of(scenario: Scenario) -> tuple[str, ...]:

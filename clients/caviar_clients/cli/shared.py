@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -21,9 +22,30 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
 
+def description(text: str) -> str:
+    """Say what a scenario is.
+
+    Args:
+        text: The scenario's file.
+
+    Returns:
+        The first sentence of the comment at the head of the file, without its full stop.
+
+    Example:
+        >>> description("# Cars drive. They turn.\\n[run]")
+        'Cars drive'
+    """
+    lines = []
+    for line in text.splitlines():
+        comment = line.removeprefix("#").strip()
+        if not line.startswith("#") or not comment:
+            break
+        lines.append(comment)
+    return re.split(r"(?<=\.) (?=[A-Z])", " ".join(lines), maxsplit=1)[0].rstrip(".")
+
+
 def complete_scenario(incomplete: str) -> list[tuple[str, str]]:
     """List shipped scenarios whose names begin so, for completion in a shell, which adds files by itself."""
-    from caviar_clients.cli.scenarios import description
     from caviar_protocol.scenario import shipped_scenarios
 
     return [

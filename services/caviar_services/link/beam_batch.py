@@ -19,8 +19,8 @@ from caviar_protocol.topics import Carrier
 from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import User, Users
 from caviar_services.link.batch import BatchLink, LinkBatch
+from caviar_services.link.beam_scores import SweepSettings
 from caviar_services.link.beam_sweep import sweep
-from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import LinkBudget
 
 HELD = 2**17
@@ -59,7 +59,7 @@ class BeamBatch(LinkBatch):
 
     def __init__(
         self,
-        settings: BeamLinkSettings,
+        settings: SweepSettings,
         carriers: tuple[Carrier, ...],
         channels: ChannelBatch,
         members: int,

@@ -15,6 +15,7 @@ from caviar_protocol.topics import Link
 from caviar_services.channel.batch import ChannelBatch, SceneAt
 from caviar_services.link.base import Users
 from caviar_services.link.batch import LinkBatch
+from caviar_services.link.beam_batch import BeamBatch
 from caviar_services.link.beam_scores import RewardKind, Scored, SweepingLink, SweepSettings
 from caviar_services.link.interference import Interferers
 from caviar_services.service import Frame, StepResult
@@ -59,9 +60,6 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
         self, channels: ChannelBatch, members: int, frames: int, scene_at: Callable[[int], SceneAt]
     ) -> LinkBatch:
         """Make the links of many episodes at once."""
-        # Late: it is made of what this module has.
-        from caviar_services.link.beam_batch import BeamBatch
-
         return BeamBatch(self.settings, self.run.carriers, channels, members, frames, scene_at)
 
     _interferers: tuple[Users, Interferers] | None = None
