@@ -31,6 +31,9 @@ parser.add_argument("broker", help="its address: tcp://HOST:PORT")
 parser.add_argument("--users", default="uav/*", help="receivers that are served: one user")
 parser.add_argument("--key", help="file with the agent's secret key; none for a broker without keys")
 parser.add_argument("--broker-key", help="file with the broker's public key")
+parser.add_argument(
+    "--wait", type=float, default=30.0, metavar="S", help="for the broker's answer (default: 30)"
+)
 options = parser.parse_args()
 
 env = BeamSelectionEnv(
@@ -41,6 +44,7 @@ env = BeamSelectionEnv(
     reward="normalised",  # |y| over that of the best pair
     key=options.key,
     broker_key=options.broker_key,
+    connect_timeout_s=options.wait,
 )
 pairs = int(env.action_space.n)
 tried, total = np.ones((SECTORS, pairs)), np.ones((SECTORS, pairs))  # each pair once, at its best: optimism

@@ -149,15 +149,6 @@ def entry_head(before: int, *pieces: bytes | memoryview) -> tuple[bytes, int]:
     return HEAD.pack(length, crc), crc
 
 
-def read_journal(path: Path) -> Iterator[JournalEntry]:
-    """The entries of a journal up to its end, or to the first that is damaged.
-
-    Raises:
-        RecordingError: The file cannot be read or is a journal of another format.
-    """
-    return iter(JournalReader(path))
-
-
 class EntryLocation(NamedTuple):
     """An entry by what decides whether it is needed, and its place in the file."""
 

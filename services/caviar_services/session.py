@@ -19,11 +19,7 @@ from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore, IncomingAsset
 from caviar_protocol.codec import message_type
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.errors import (
-    AssetError,
-    ProtocolError,
-    RunError,
-)
+from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
@@ -41,14 +37,7 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
-from caviar_services.service import (
-    Frame,
-    Preparation,
-    Progress,
-    Service,
-    StepResult,
-    no_progress,
-)
+from caviar_services.service import Frame, Preparation, Progress, Service, StepResult, no_progress
 
 _log = logging.getLogger("caviar.service")
 

@@ -32,7 +32,7 @@ from pathlib import Path
 from scenarios_support import SCENARIOS, Finished, caviar, marked, run, running
 
 from caviar_broker.control.socket import ask
-from caviar_broker.journal_format import read_journal
+from caviar_broker.journal_format import JournalReader
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import SYNC_PERIOD_S
 from caviar_protocol.recording.integrity import recorded_until
@@ -208,7 +208,7 @@ def _recorded(directory: Path) -> int:
 
 
 def _went_on_with(directory: Path) -> int:
-    found = [entry.frame for entry in read_journal(directory / "journal.msgpack") if entry.epoch > 1]
+    found = [entry.frame for entry in JournalReader(directory / "journal.msgpack") if entry.epoch > 1]
     return found[0] if found else 0
 
 

@@ -74,7 +74,8 @@ def test_the_remote_trainer_plays_all_episodes(tmp_path: Path) -> None:
 
 
 def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None:
-    command = [sys.executable, str(EXAMPLES / "remote_trainer.py"), "remote", "tcp://127.0.0.1:9"]
+    program = str(EXAMPLES / "remote_trainer.py")
+    command = [sys.executable, program, "remote", "tcp://127.0.0.1:9", "--wait", "0.5"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
-    assert "tcp://127.0.0.1:9" in done.stdout + done.stderr
+    assert "tcp://127.0.0.1:9 within 0.5 s" in done.stdout + done.stderr

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from caviar_broker.core.events import Journal, Product
 from caviar_broker.journal import JournalFile
-from caviar_broker.journal_format import MAGIC, JournalReader, read_journal
+from caviar_broker.journal_format import MAGIC, JournalReader
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 
@@ -37,7 +37,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_entries_come_back_in_order_with_decisions_and_products(path: Path) -> None:
-    entries = list(read_journal(path))
+    entries = list(JournalReader(path))
     assert [e.number for e in entries] == list(range(1, 51))
     assert {(e.epoch, e.episode, e.service, e.outcome) for e in entries} == {(3, 1, "world", "done")}
     assert entries[0].decisions == entry(1).decisions
@@ -55,7 +55,7 @@ def test_large_bodies_are_written_from_where_they_lie_and_come_back_whole(tmp_pa
     journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
     journal.write(entries)
     journal.close()
-    found = list(read_journal(tmp_path / "journal.msgpack"))
+    found = list(JournalReader(tmp_path / "journal.msgpack"))
     assert [e.number for e in found] == list(range(1, len(bodies) + 2))
     assert [[p[2] for p in e.products] for e in found[:-1]] == [[body] if body else [] for body in bodies]
     assert [p[2] for p in found[-1].products] == [bodies[5], b"y" * 100_000]
@@ -74,7 +74,7 @@ def test_what_the_system_takes_in_parts_is_written_whole(
     journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
     journal.write([entry(1, b"a" * 100_000), entry(2), entry(3, b"b" * 70_000)])
     journal.close()
-    found = list(read_journal(tmp_path / "journal.msgpack"))
+    found = list(JournalReader(tmp_path / "journal.msgpack"))
     assert [[p[2] for p in e.products] for e in found] == [[b"a" * 100_000], [], [b"b" * 70_000]]
 
 
@@ -82,7 +82,7 @@ def test_a_later_broker_appends(path: Path) -> None:
     journal = JournalFile(path, epoch=4)
     journal.write([entry(51)])
     journal.close()
-    assert [(e.number, e.epoch) for e in read_journal(path)][-2:] == [(50, 3), (51, 4)]
+    assert [(e.number, e.epoch) for e in JournalReader(path)][-2:] == [(50, 3), (51, 4)]
 
 
 def test_wherever_it_is_cut_off_the_whole_entries_before_are_read(path: Path) -> None:
@@ -90,7 +90,7 @@ def test_wherever_it_is_cut_off_the_whole_entries_before_are_read(path: Path) ->
     ends = []
     for cut in range(len(data) - 2500, len(data), 7):
         path.write_bytes(data[:cut])
-        ends.append(len(list(read_journal(path))))
+        ends.append(len(list(JournalReader(path))))
     assert ends == sorted(ends)
     assert set(ends) <= {47, 48, 49}
 
@@ -107,13 +107,13 @@ def test_what_is_no_entry_ends_the_log_and_is_named_with_its_place(path: Path, j
     assert f"the entry at byte {size} is" in reader.problem
     assert reader.lost == len(junk)
     with pytest.raises(RecordingError, match="No such file"):
-        list(read_journal(path.with_name("other")))
+        list(JournalReader(path.with_name("other")))
 
 
 def test_no_bit_that_flips_goes_unnoticed(path: Path) -> None:
     """500 of them, anywhere; what is before it is read as it was."""
     data = bytearray(path.read_bytes())
-    whole = list(read_journal(path))
+    whole = list(JournalReader(path))
     rng = random.Random(1)
     for bit in rng.sample(range(len(data) * 8), 500):
         data[bit // 8] ^= 1 << bit % 8
@@ -149,11 +149,11 @@ def test_what_is_cut_off_a_damaged_journal_is_kept_beside_it(path: Path) -> None
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    whole = list(read_journal(path))
+    whole = list(JournalReader(path))
     journal = JournalFile(path, epoch=4)
     journal.write([entry(51)])
     journal.close()
-    assert list(read_journal(path))[:-1] == whole
+    assert list(JournalReader(path))[:-1] == whole
     cut = path.with_name("journal.msgpack.cut").read_bytes()
     assert data.endswith(cut)
     assert len(data) - len(cut) < len(data) // 2
@@ -164,7 +164,7 @@ def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
     journal = JournalFile(tmp_path / "journal.msgpack", epoch=1)
     for number in range(1, 4):
         journal.write([entry(number)])
-        assert [e.number for e in read_journal(journal.path)] == list(range(1, number + 1))
+        assert [e.number for e in JournalReader(journal.path)] == list(range(1, number + 1))
     journal.close()
 
 
@@ -191,7 +191,7 @@ def test_an_entry_that_the_system_takes_in_part_is_not_in_the_journal(
             journal.write([entry(51, b"x" * 1000)])
     journal.write([entry(52)])
     journal.close()
-    assert [e.number for e in read_journal(path)] == [*range(1, 51), 52]
+    assert [e.number for e in JournalReader(path)] == [*range(1, 51), 52]
 
 
 def test_a_journal_that_cannot_be_opened_is_an_error_that_names_it(tmp_path: Path) -> None:

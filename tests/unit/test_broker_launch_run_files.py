@@ -12,7 +12,7 @@ from recording_builders import record_run
 
 from caviar_broker.control.launcher import LogFile
 from caviar_broker.control.socket import ControlSocket
-from caviar_broker.journal_format import read_journal, run_of_journal
+from caviar_broker.journal_format import JournalReader, run_of_journal
 from caviar_broker.launch import parser, serve
 from caviar_broker.run_record import RunRecord, versions_of
 from caviar_protocol.errors import CaviarError, RunError
@@ -81,7 +81,7 @@ def test_journal_and_recording_say_of_which_run_they_are(runs: Path) -> None:
     manifest = read_manifest(runs / "b")
     assert manifest is not None
     assert (run_of_journal(runs / "b" / "journal.msgpack"), manifest.run) == ("b", "b")
-    assert [e.run for e in read_journal(runs / "b" / "journal.msgpack")][1:3] == ["", ""]
+    assert [e.run for e in JournalReader(runs / "b" / "journal.msgpack")][1:3] == ["", ""]
 
 
 @pytest.mark.parametrize("kind", KINDS)

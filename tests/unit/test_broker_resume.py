@@ -14,7 +14,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.run import Resumption
 from caviar_broker.journal import CheckpointFiles, JournalFile
-from caviar_broker.journal_format import read_journal
+from caviar_broker.journal_format import JournalReader
 from caviar_broker.resume import read_resumption
 from caviar_protocol import messages as m
 from caviar_protocol.digest import RunDigest
@@ -108,7 +108,7 @@ def test_services_are_restored_from_their_last_state_and_get_the_grants_since(tm
     restored = run.seen(m.Restore, "link")[0].frame
     saved = [
         e.frame
-        for e in read_journal(tmp_path / "journal.msgpack")
+        for e in JournalReader(tmp_path / "journal.msgpack")
         if (e.service, e.epoch) == ("link", 1) and e.file
     ]
     assert restored == max(frame for frame in saved if frame <= finished) >= 2
@@ -123,10 +123,10 @@ def test_a_journal_that_breaks_off_is_continued_after_its_last_whole_entry(tmp_p
     path = tmp_path / "journal.msgpack"
     data = path.read_bytes()
     path.write_bytes(data[:-5])
-    before = len(list(read_journal(path)))
+    before = len(list(JournalReader(path)))
     run = runs.go()
     assert run.outcome.digest == undisturbed(STATEFUL)
-    entries = list(read_journal(path))
+    entries = list(JournalReader(path))
     assert entries[before - 1].epoch == 1
     assert entries[before].epoch == 2
 

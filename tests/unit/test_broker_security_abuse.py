@@ -25,6 +25,8 @@ pytestmark = pytest.mark.slow
 
 BESIDE_S = 1.5
 """[s] for which the run goes on beside the peer that means ill."""
+PATIENCE_S = 20.0
+"""[s] for what has to come and is quick where no other work is on the machine."""
 STRETCHES = 5
 """Of that length at most. Other work on the machine disturbs some of them, a peer that does harm all."""
 GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL" + bytes(16) + b"\0" + bytes(31)
@@ -87,7 +89,7 @@ def unharmed(background: Background) -> None:
 
 
 def told(broker: Serving, words: str) -> None:
-    eventually(lambda: words in broker.witness.texts(), f"the user reads {words!r}", 5.0)
+    eventually(lambda: words in broker.witness.texts(), f"the user reads {words!r}", PATIENCE_S)
 
 
 # --- strangers -------------------------------------------------------------------------------------------
@@ -131,7 +133,7 @@ def test_a_message_without_an_end_is_cut_off_before_it_fills_the_memory(tmp_path
 def test_a_part_that_announces_more_than_any_may_have_ends_its_connection(tmp_path: Path) -> None:
     with eight_services(tmp_path) as background, raw(background.broker.endpoint) as connection:
         connection.sendall(b"\x02" + struct.pack(">Q", 1 << 40))
-        eventually(lambda: is_ended(connection), "the connection is ended", 3.0)
+        eventually(lambda: is_ended(connection), "the connection is ended", PATIENCE_S)
         unharmed(background)
 
 

@@ -15,7 +15,7 @@ from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_t
 from caviar_broker import journal_writer, server
 from caviar_broker.core.events import Journal, StopRequested
 from caviar_broker.journal import JournalFile
-from caviar_broker.journal_format import read_journal
+from caviar_broker.journal_format import JournalReader
 from caviar_protocol import messages as m
 from caviar_protocol.codec import decode_message
 from caviar_protocol.errors import RunError
@@ -39,7 +39,7 @@ def test_a_decision_is_in_the_journal_soon_though_nobody_waits_for_it(tmp_path: 
     services = ("world", "sensors:left", "sensors:right")
 
     def journaled(service: str) -> bool:
-        entries = read_journal(tmp_path / "journal.msgpack")
+        entries = JournalReader(tmp_path / "journal.msgpack")
         return any((e.service, e.frame) == (service, 0) for e in entries)
 
     with (
@@ -91,7 +91,7 @@ def test_no_grant_overtakes_the_journal_entries_that_it_relies_on(tmp_path: Path
         before = events[: events.index(("granted", "", frame))]
         assert ("written", "world", frame - 1) in before
         assert ("written", "sensors", frame - 1) in before
-    entries = list(read_journal(tmp_path / "journal.msgpack"))
+    entries = list(JournalReader(tmp_path / "journal.msgpack"))
     assert [(e.service, e.frame) for e in entries if e.service == "world"] == [
         ("world", k) for k in range(20)
     ]
@@ -159,7 +159,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
         sensors.answer()
         path = tmp_path / "journal.msgpack"
         eventually(
-            lambda: {"world", "sensors"} <= {e.service for e in read_journal(path)}, "frame 0 is in it"
+            lambda: {"world", "sensors"} <= {e.service for e in JournalReader(path)}, "frame 0 is in it"
         )
         world.answer()
         sensors.answer()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from caviar_clients.cli.summary import ReportTally, decided_lines
+from caviar_clients.cli.summary import ReportTally
+from caviar_clients.cli.summary_table import decided_lines
 from caviar_protocol.messages import Report
 
 

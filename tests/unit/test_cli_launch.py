@@ -17,10 +17,11 @@ import msgspec
 import pytest
 
 from caviar_clients.cli import launch
-from caviar_clients.cli.launch import TAIL, Child, Launcher
+from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.processes import TAIL, Child
 from caviar_protocol.errors import RunError
+from caviar_protocol.files import remove_leftovers
 from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scratch import remove_leftovers
 
 pytestmark = pytest.mark.slow
 

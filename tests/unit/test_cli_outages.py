@@ -6,12 +6,8 @@ from pathlib import Path
 
 from recording_builders import frame, frame_of, link, record, scene
 
-from caviar_clients.cli.summary import (
-    SHOWN_INSIDE,
-    ReportTally,
-    outage_lines,
-    summarise,
-)
+from caviar_clients.cli.summary import ReportTally, summarise
+from caviar_clients.cli.summary_table import SHOWN_INSIDE, outage_lines
 from caviar_protocol.messages import Report
 from caviar_protocol.recording import Recording
 

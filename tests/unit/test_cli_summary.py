@@ -12,7 +12,8 @@ from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
 from caviar_clients.cli.scenarios import new_scenario
-from caviar_clients.cli.summary import recorded_figures, summary_of, summary_table
+from caviar_clients.cli.summary import recorded_figures, summary_of
+from caviar_clients.cli.summary_table import summary_table
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
 

@@ -17,9 +17,8 @@ from typing import Any
 
 from caviar_broker.event_loop import call_with_timeout
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import read_regular, refuse_other_kinds, replace_file
+from caviar_protocol.files import PrivateFolder, read_regular, refuse_other_kinds, replace_file
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scratch import PrivateFolder
 
 BACKLOG = 16
 """Connections that wait for the broker's loop; with more, a client waits `REACH_S` for its place."""

@@ -168,6 +168,10 @@ class Participant:
             found = self.tasks[frame] = Task(self.plan.name, frame)
         return found
 
+    def has_decided(self, edge: Edge, frame: int) -> bool:
+        """Whether it is known what a consumer gets over one of this source's edges in a frame."""
+        return frame - edge.lag < self.next_frame or frame < edge.lag
+
 
 def provenance_of(product: Product, status: Status, frame: int, cause: str = "") -> GrantInput:
     """Provenance of a product, as a consumer in ``frame`` is granted it."""
@@ -282,10 +286,9 @@ class DecisionTable:
         products: list[Product] = []
         for edge, source in participant.inputs if frame < self.frames else participant.lagged:
             if frame < edge.lag:
-                first = GrantInput(
-                    topic=edge.topic, source=edge.source, status=_ABSENT, cause=_NO_EARLIER_FRAME
+                inputs.append(
+                    GrantInput(topic=edge.topic, source=edge.source, status=_ABSENT, cause=_NO_EARLIER_FRAME)
                 )
-                inputs.append(first)
                 continue
             origin = source.tasks[frame - edge.lag]
             decision = origin.decisions[edge.topic]
@@ -310,7 +313,7 @@ class DecisionTable:
             consumer = self.participants[name]
             frame = consumer.next_frame
             for edge, origin in consumer.inputs:
-                lacks = frame <= self.frames and not is_decided(edge, origin, frame)
+                lacks = frame <= self.frames and not origin.has_decided(edge, frame)
                 if lacks and edge.source == source:
                     found.append(f"{name} waits for {edge.topic} of frame {frame - edge.lag}")
         return ", ".join(found)
@@ -475,11 +478,6 @@ class DecisionTable:
         assert all(n <= window for n in reached), "too many frames overlap"
         kept = [task for task in self.tasks() if task.state not in OUTSTANDING]
         assert all(task.frame >= self.finished_frames - 1 for task in kept), "tasks are not released"
-
-
-def is_decided(edge: Edge, source: Participant, frame: int) -> bool:
-    """Whether it is known what a consumer gets over an edge in a frame."""
-    return frame - edge.lag < source.next_frame or frame < edge.lag
 
 
 def _absent(task: Task, topic: str, cause: str) -> Decision:

@@ -18,7 +18,6 @@ from caviar_broker.core.decisions import (
     Participant,
     Task,
     TaskInputs,
-    is_decided,
     provenance_of,
 )
 from caviar_broker.core.events import Action, Notice, Product
@@ -279,7 +278,7 @@ class Dispatcher:
         table = self.table
         latest, frame = participant.latest, participant.next_frame
         # Most services wait for the last input of their next frame now, and need not be looked at for that.
-        if latest and frame < table.frames and not is_decided(*latest[0], frame):
+        if latest and frame < table.frames and not latest[0][1].has_decided(latest[0][0], frame):
             latest[0][1].waiting.add(participant)
         else:
             self.ready.add(participant)
@@ -483,7 +482,7 @@ class Dispatcher:
                 if task.state in (TaskState.GRANTED, TaskState.OVERDUE):
                     edges = participant.inputs if task.frame < self.table.frames else participant.lagged
                     for edge, source in edges:
-                        known = is_decided(edge, source, task.frame)
+                        known = source.has_decided(edge, task.frame)
                         assert known, f"{task} granted before {edge} (clause 7)"
 
     def _notice(self, kind: str, task: Task, text: str) -> None:

@@ -32,9 +32,9 @@ from caviar_clients.cli.summary import recorded_figures
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
+from caviar_protocol.files import PrivateFolder
 from caviar_protocol.host import DISTRIBUTION, install_command
 from caviar_protocol.scenario import load_scenario, shipped_scenarios
-from caviar_protocol.scratch import PrivateFolder
 from caviar_services import drjit_setup
 
 EXTRAS = ("channel", "sensors", "world", "plot", "policy", "system", "learning")

@@ -14,8 +14,8 @@ import typer
 
 from caviar_protocol import keys as k
 from caviar_protocol.errors import SetupError, suggestion
+from caviar_protocol.files import PrivateFolder
 from caviar_protocol.messages import Role
-from caviar_protocol.scratch import PrivateFolder
 from caviar_protocol.topics import PAYLOADS
 
 app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")

@@ -5,25 +5,23 @@ from __future__ import annotations
 import json
 import os
 import selectors
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
 import zmq
 
 from caviar_clients.cli.keys import BorrowedKey
+from caviar_clients.cli.processes import Child, end, wait
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
-from caviar_protocol.files import file_system_of, open_to_append
+from caviar_protocol.files import PrivateFolder, file_system_of, open_to_append
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
-from caviar_protocol.scratch import PrivateFolder
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
 
 KILL_AFTER_S = 1.0
@@ -40,100 +38,11 @@ _TRACING_ROLES = ("channel", "sensors")
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
 
-KILLED_S = 2.0
-"""[s] within which a process ends that is killed, unless it waits for a disk."""
-TAIL = 1 << 16
-"""[B] of a log that are looked at for its last line."""
-_CRASH = "Fatal Python error: "
-_AFTER_A_CRASH = ("Extension modules: ", "  File ", "  Binary file ")
-
-
-@dataclass
-class Child:
-    """The process of one service."""
-
-    name: str
-    process: subprocess.Popen[bytes]
-    log: Path
-    pidfd: int
-    """Readable once the process is dead."""
-
-    @classmethod
-    def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
-        """Start a process.
-
-        Args:
-            name: Of the service.
-            command: Program and arguments.
-            log: Gets what the process prints, after what a process before it printed.
-            environment: All of its environment.
-        """
-        with open_to_append(log) as file:
-            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=file,
-                start_new_session=True,  # Ctrl-C is the launcher's, which ends the run in order
-                env=environment,
-            )
-        # A process id may be another process's a moment later; the descriptor stays that of this one.
-        return cls(name, process, log, os.pidfd_open(process.pid))
-
-    def last_line(self) -> str:
-        """The last line that the process printed, or what it died of in a library; empty if it printed
-        nothing."""
-        with self.log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            lines = file.read().decode(errors="replace").strip().splitlines()
-        if not lines:
-            return ""
-        # After a crash faulthandler lists all threads and libraries; what counts stands above them.
-        if lines[-1].startswith(_AFTER_A_CRASH):
-            crashes = (number for number in reversed(range(len(lines))) if lines[number].startswith(_CRASH))
-            if (number := next(crashes, None)) is not None:
-                trace = dropwhile(lambda line: not line.startswith("Current thread "), lines[number:])
-                place = next((line.strip() for line in trace if line.startswith("  File ")), "no Python code")
-                return f"{lines[number]}, {place}"
-        return lines[-1]
-
 
 def _describe_exit(status: int) -> str:
     from caviar_broker.supervision import describe_exit  # late, as in `Launcher._look_after_broker`
 
     return describe_exit(status)
-
-
-def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
-    """End processes: SIGTERM, and SIGKILL for those that are left later.
-
-    Args:
-        processes: Which; those that have ended already are left out.
-        seconds: Time between the two signals [s].
-
-    Returns:
-        Process ids of those that still live, since they wait for a disk.
-    """
-    for process in processes:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-    wait(processes, seconds)
-    for process in processes:
-        if process.poll() is None:
-            process.kill()
-    # A process in uninterruptible sleep takes no signal, SIGKILL neither: the launcher must not wait for it.
-    wait(processes, KILLED_S)
-    return [process.pid for process in processes if process.poll() is None]
-
-
-def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Wait until all processes have ended, but for ``seconds`` at most [s]."""
-    until = time.monotonic() + seconds
-    for process in processes:
-        try:
-            process.wait(max(0.0, until - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            continue
 
 
 @dataclass

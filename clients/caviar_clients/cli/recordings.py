@@ -24,25 +24,22 @@ from rich.text import Text
 
 from caviar_broker.journal_format import NO_BROKER, JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
-from caviar_clients.cli.packet_summary import packet_line
 from caviar_clients.cli.shared import counted, print_line, scaled
-from caviar_clients.cli.summary import (
+from caviar_clients.cli.summary import RunSummary, SourceSummary, resume_hint, summarise
+from caviar_clients.cli.summary_table import (
     SHOWN_DAMAGE,
-    RunSummary,
-    SourceSummary,
     decided_lines,
     link_quality,
     outage_lines,
-    resume_hint,
-    summarise,
+    packet_line,
 )
 from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.files import PrivateFolder
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording, RecordingWarning, frame_name
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.run_directory import RunDirectory, runs_below
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scratch import PrivateFolder
 from caviar_services.recorder.base import failure
 from caviar_services.recorder.segment_writer import Persistence, SegmentWriter, stored_products
 

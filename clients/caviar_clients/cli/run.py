@@ -20,8 +20,8 @@ from rich.text import Text
 
 from caviar_broker.run_record import read_record
 from caviar_broker.security.access import check_bind
-from caviar_clients.cli.interruption import Interruption
 from caviar_clients.cli.launch import Launcher
+from caviar_clients.cli.processes import Interruption
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable
@@ -441,7 +441,7 @@ def _bar(console: Console) -> Progress:
 
 
 def _show(console: Console, summary: Mapping[str, Any]) -> None:
-    from caviar_clients.cli.summary import summary_table
+    from caviar_clients.cli.summary_table import summary_table
 
     console.print(summary_table(summary))
     print_line(console, f"digest {summary['digest']}")

@@ -1,4 +1,7 @@
-"""Figures of a run, from its recording: as a structure, as JSON (``caviar run --json``), and in words."""
+"""Figures of a run, from its recording: as a structure, and as JSON (``caviar run --json``).
+
+`summary_table` puts them into words.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,8 @@ from typing import Annotated, Any, cast
 
 import msgspec
 import numpy as np
-from rich.markup import escape
-from rich.table import Column, Table
-from rich.text import Text
 
-from caviar_clients.cli.packet_summary import PacketSummary, PacketTotals, packet_line
-from caviar_clients.cli.shared import counted, scaled
+from caviar_clients.cli.shared import counted
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Report, Status
@@ -28,10 +27,6 @@ from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX
 
 STATE = "state:"
 """Begins the name of a decision that is no choice, but what a service knew when the episode began."""
-SHOWN_INSIDE = 8
-"""Antennas inside an object that are named; of the others, the number."""
-SHOWN_DAMAGE = 20
-"""Lines about damage that are printed; of the others, the number."""
 
 _CAUSES = {cause.count_name: cause for cause in Cause}
 _DROPPED = "dropped"
@@ -78,6 +73,23 @@ class SourceSummary(msgspec.Struct, kw_only=True):
     absent: int = 0
     late: int = 0
     bytes: Annotated[int, quantity("B", "stored")] = 0
+
+
+class PacketSummary(msgspec.Struct, kw_only=True):
+    """What became of packets, over all frames and users."""
+
+    arrived: Annotated[int, quantity("bit", "came for users")]
+    sent: Annotated[int, quantity("bit", "came through")]
+    dropped: Annotated[int, quantity("bit", "too old, or the buffer was full")]
+    delivered: int
+    """Packets of which the last bit came through."""
+    mean_delay: Annotated[float | None, quantity("s", "of these")]
+    """None where there was none."""
+    mean_throughput: Annotated[float, quantity("bit/s", "of a user")]
+    blocks: int
+    """Transport blocks that were sent."""
+    block_errors: int
+    """Of these, how many were not decoded."""
 
 
 class LinkSummary(msgspec.Struct, kw_only=True):
@@ -225,6 +237,42 @@ class ReportTally:
         return [*never, *dropped, *unmatched]
 
 
+class PacketTotals:
+    """Sums over links, of which those without packets count as nothing."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(6, np.int64)
+        self._delay, self._throughput, self._receivers, self._any = 0.0, 0.0, 0, False
+
+    def add(self, link: Link) -> None:
+        """Add a frame's link."""
+        if link.arrived is None or link.delay is None or link.delivered is None or link.throughput is None:
+            return
+        self._any = True
+        counts = (link.arrived, link.sent, link.dropped, link.delivered, link.blocks, link.block_errors)
+        self._counts += [0 if values is None else int(values.sum()) for values in counts]
+        self._delay += float(link.delay @ link.delivered)
+        self._throughput += float(link.throughput.sum())
+        # A receiver on a carrier is one user here, however many transmitters reach it.
+        self._receivers += len(set(zip(link.rx, link.carrier, strict=True)))
+
+    def summary(self) -> PacketSummary | None:
+        """Figures of all links; None where none had packets."""
+        if not self._any:
+            return None
+        arrived, sent, dropped, delivered, blocks, errors = self._counts.tolist()
+        return PacketSummary(
+            arrived=arrived,
+            sent=sent,
+            dropped=dropped,
+            delivered=delivered,
+            mean_delay=self._delay / delivered if delivered else None,
+            mean_throughput=self._throughput / max(self._receivers, 1),
+            blocks=blocks,
+            block_errors=errors,
+        )
+
+
 class _LinkTotals:
     """Sums over users that have a path, and how many users had none."""
 
@@ -349,44 +397,6 @@ def resume_hint(recording: Recording) -> str:
     )
 
 
-def decided_lines(found: Sequence[Decided]) -> list[str]:
-    """Put decisions into words, one line each."""
-    lines = []
-    for entry in found:
-        total = sum(entry.frames.values())
-        shares = ", ".join(f"{value} {count / total:.0%}" for value, count in entry.frames.items())
-        line = f"{entry.service}: {entry.decision} {shares}; {counted(entry.changes, 'change')}"
-        if entry.error_checks:
-            line += f"; stated error held in {entry.error_covered} of {counted(entry.error_checks, 'check')}"
-        lines.append(line)
-    return lines
-
-
-def outage_lines(outage: OutageSummary) -> list[str]:
-    """Put the causes into one line, and into one each which antenna stands inside of which object."""
-    parts = [f"{count} {cause}" for cause, count in outage.causes.items()]
-    if outage.unexplained:
-        parts.append(f"{outage.unexplained} for a cause that the channel did not report")
-    lines = [", ".join(parts)]
-    shown = list(outage.inside.items())[:SHOWN_INSIDE]
-    lines += [f"inside an object: {name}, in {counted(frames, 'frame')}" for name, frames in shown]
-    if len(outage.inside) > len(shown):
-        lines.append(f"inside an object: {len(outage.inside) - len(shown)} more antennas")
-    return lines
-
-
-def link_quality(snr_db: float | None, snr_best_db: float | None, bit_rate: float) -> str:
-    """Put the SNR [dB] of the chosen and of the best beams, and a user's bit rate [bit/s], into words.
-
-    Example:
-        >>> link_quality(12.34, 15.0, 2.5e8)
-        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a user'
-    """
-    snr, best = ("none" if value is None else f"{value:.1f} dB" for value in (snr_db, snr_best_db))
-    rate, unit = scaled(bit_rate, ("bit/s", "kbit/s", "Mbit/s", "Gbit/s"))
-    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a user"
-
-
 def recorded_figures(directory: Path) -> RunSummary | None:
     """Sum up the recording of a run; None where it has none that can be read."""
     try:
@@ -440,72 +450,3 @@ def summary_of(
         "decided": msgspec.to_builtins(recorded.decided) if recorded else [],
         "warnings": [*warnings, *(recorded.warnings if recorded else ())],
     }
-
-
-def summary_table(summary: Mapping[str, Any]) -> Table:
-    """Make the table of a finished run: latencies and misses by service; below, what else there is to say.
-
-    Args:
-        summary: As `summary_of` returns it.
-    """
-    figures_of = (Column(name, justify="right") for name in ("p50 ms", "p99 ms", "budget ms", "misses"))
-    title = Text(f"{summary['scenario']}: {summary['run']}")  # as Text: brackets in a name are no markup
-    table = Table("service", *figures_of, title=title, title_justify="left")
-    for name, figures in summary["services"].items():
-        table.add_row(
-            escape(name),
-            f"{figures['p50_ms']:.2f}",
-            f"{figures['p99_ms']:.2f}",
-            f"{figures['budget_ms']:g}",
-            f"[red]{figures['misses']}[/red]" if figures["misses"] else "0",
-        )
-    table.caption_justify = "left"
-    table.caption = _caption(summary)
-    return table
-
-
-def _caption(summary: Mapping[str, Any]) -> str:
-    parts = [f"{counted(summary['frames'], 'frame')}, {summary['frames_per_second']:.1f} frames/s"]
-    if summary["frames_recorded"] not in (None, summary["frames"]):
-        parts.append(
-            f"{counted(summary['frames_recorded'], 'frame')} recorded, of which the run finished "
-            f"{summary['frames']}; its digest is that of these"
-        )
-    late, pace = summary["deadlines"], summary["pace"]
-    if late["decisions"]:
-        parts.append(_missed(sum(s["misses"] for s in summary["services"].values()), late))
-    if pace["slips"]:
-        parts.append(
-            f"{counted(pace['slips'], 'frame')} slipped behind real time, "
-            f"by {pace['worst_slip_ms']:.1f} ms at worst, {pace['lag_ms']:.1f} ms in all; none was skipped"
-        )
-    if summary["mean_abs_y"] is not None:
-        share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0
-        parts.append(
-            f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best "
-            f"({share:.1%}), straight line {summary['mean_abs_y_baseline']:.3g}"
-        )
-    if summary["mean_bit_rate"] is not None:
-        quality = link_quality(summary["mean_snr_db"], summary["mean_snr_best_db"], summary["mean_bit_rate"])
-        parts.append(f"mean SNR {quality}")
-    if summary.get("packets") is not None:
-        parts.append(packet_line(msgspec.convert(summary["packets"], PacketSummary)))
-    if summary["outage"] is not None:
-        causes, *inside = outage_lines(msgspec.convert(summary["outage"], OutageSummary))
-        parts += [f"{summary['no_path_share']:.1%} of users without a path: {causes}", *inside]
-    parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
-    parts += [f"warning: {warning}" for warning in summary["warnings"]]
-    return "\n".join(parts)
-
-
-def _missed(misses: int, late: Mapping[str, Any]) -> str:
-    """Count missed deadlines, and say how promptly the broker decided those without an answer by then."""
-    seen = late["decisions"]
-    when = f"{late['p99_ms']:.2f} ms late (p99), {late['worst_ms']:.2f} ms at worst"
-    # A late answer that arrives before the broker looks at the clock is a miss without a decision.
-    if misses <= seen:
-        return f"{counted(seen, 'missed deadline')}, decided {when}"
-    return (
-        f"{counted(misses, 'missed deadline')}: {seen} decided {when}; "
-        f"{misses - seen} answered before the broker looked at the clock"
-    )

@@ -20,7 +20,7 @@ from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, l
 from caviar_clients.plots.scene_map import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.connected import agent_of, open_session
+from caviar_clients.session.connected import CONNECT_TIMEOUT_S, agent_of, open_session
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol import observations
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
@@ -60,6 +60,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         render_mode: ``rgb_array``: a map of the scene.
         key, broker_key: For a broker with keys: files with the agent's secret key and with the broker's
             public one. By default those that CAVIAR_KEY and CAVIAR_BROKER_KEY name.
+        connect_timeout_s: Time in which a broker has to answer [s].
 
     Raises:
         ScenarioError: The scenario or an argument is wrong; the text has value, place and remedy.
@@ -97,6 +98,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         render_mode: str | None = None,
         key: str | Path | None = None,
         broker_key: str | Path | None = None,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         if reward not in KINDS:
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
@@ -125,7 +127,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         )
         self.reward = Reward(reward)
         """Of the link."""
-        self._broker = broker
+        self._broker, self._connect_timeout_s = broker, connect_timeout_s
         own, its = (None if path is None else Path(path) for path in (key, broker_key))
         self._credentials = None if broker is None else credentials(own, its)
         self._directory = None if directory is None else Path(directory)
@@ -276,6 +278,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             self._directory,
             self._credentials,
             with_scenery=self.uses_scenery,
+            connect_timeout_s=self._connect_timeout_s,
         )
 
     # --- what a kind of environment defines -----------------------------------------------------------

@@ -184,6 +184,7 @@ class _Pilot(UavPathV1Env):
             self._credentials,
             with_scenery=True,
             beside=(self._selection.agent,),
+            connect_timeout_s=self._connect_timeout_s,
         )
 
 

@@ -19,7 +19,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.observations import Moment
-from caviar_services.link.batch import BatchLink
+from caviar_services.link.base import BatchLink
 
 Normalization: TypeAlias = Literal["recorded", "unit"]
 Observation = dict[str, NDArray[Any]]

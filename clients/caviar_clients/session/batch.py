@@ -19,9 +19,8 @@ from caviar_protocol.topics import Action
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.batch import MemberSeed as MemberSeed
 from caviar_services.channel.batch import SceneAt
-from caviar_services.link.base import LinkModel
-from caviar_services.link.batch import BatchLink as BatchLink
-from caviar_services.link.batch import LinkBatch
+from caviar_services.link.base import BatchLink as BatchLink
+from caviar_services.link.base import LinkBatch, LinkModel
 from caviar_services.registry import load
 
 REMEDY = (
@@ -128,7 +127,7 @@ class BatchSession:
 
         Args:
             number: Of the frame, which follows on the one before.
-            beams: As in `caviar_services.link.batch.LinkBatch.step`.
+            beams: As in `caviar_services.link.base.LinkBatch.step`.
 
         Raises:
             RunError: No episode has begun, or a service failed.

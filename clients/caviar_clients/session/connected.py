@@ -17,7 +17,8 @@ from caviar_protocol.keys import Credentials
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
 from caviar_services.connection import Terminated, Termination
-from caviar_services.runner import CONNECT_TIMEOUT_S, Runner
+from caviar_services.runner import CONNECT_TIMEOUT_S as CONNECT_TIMEOUT_S
+from caviar_services.runner import Runner
 from caviar_services.service import StepResult
 
 IMPLEMENTATION = "gymnasium"
@@ -225,6 +226,7 @@ def open_session(
     credentials: Credentials | None = None,
     with_scenery: bool = False,
     beside: Sequence[str] = (),
+    connect_timeout_s: float = CONNECT_TIMEOUT_S,
 ) -> Session:
     """Open a session of one agent of a scenario, or of several.
 
@@ -237,6 +239,7 @@ def open_session(
         credentials: For a broker with keys; None: what the environment says.
         with_scenery: Whether `Session.scenery` is fetched.
         beside: Further agents whose places are taken.
+        connect_timeout_s: Time in which a broker has to answer [s].
 
     Raises:
         ScenarioError: A broker and a directory are given; a broker records where it was started.
@@ -249,6 +252,4 @@ def open_session(
         return EmbeddedSession(scenario, agent, inputs, directory, with_scenery, beside)
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
-    return ConnectedSession(
-        broker, agent, inputs, credentials=credentials, with_scenery=with_scenery, beside=beside
-    )
+    return ConnectedSession(broker, agent, inputs, connect_timeout_s, credentials, with_scenery, beside)

@@ -6,16 +6,13 @@ their last axis and any axes of transmitters, cells or environments before it.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 
 Scheduler = Literal["round-robin", "max-rate", "proportional-fair"]
-
-SCHEDULERS: tuple[Scheduler, ...] = get_args(Scheduler)
-"""Names of the schedulers."""
 
 
 def round_robin(turns: Int64Array) -> Float64Array:

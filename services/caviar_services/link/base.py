@@ -6,22 +6,22 @@ different beams, and each is scored for itself. To add a link, subclass `LinkMod
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, TypeVar, cast
+from typing import ClassVar, NamedTuple, TypeVar, cast
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Complex128Array, Int32Array
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import GrantInput, Input, Role, Status
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Scene, UserSchedule
-from caviar_services.channel.batch import ChannelBatch, SceneAt
-from caviar_services.link.batch import LinkBatch
+from caviar_services.channel.batch import ChannelBatch, MemberSeed, SceneAt
 from caviar_services.service import Frame, Service
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -72,6 +72,45 @@ class LinkModel(Service[S]):
             Links that are equal, bit by bit, to those of a run of each episode.
         """
         raise NotImplementedError(f"{type(self).__name__} computes one episode at a time")
+
+
+class BatchLink(NamedTuple):
+    """Result of a frame per member and user: fields of `caviar_protocol.topics.Link`, of M members and in the
+    order of its users."""
+
+    tx: tuple[str, ...]
+    rx: tuple[str, ...]
+    carrier: tuple[str, ...]
+    has_path: BoolArray
+    """Shape ``[M, U]``, as all below."""
+    los: BoolArray
+    tx_beam: Int64Array
+    rx_beam: Int64Array
+    abs_y: Float64Array
+    top_abs_y: Float64Array
+    """|y| of the best pair alone, Shape ``[M, U, 1]``."""
+    baseline_abs_y: Float64Array
+    snr: Float64Array
+    spectral_efficiency: Float64Array
+    """[bit/s/Hz]."""
+
+
+class LinkBatch(ABC):
+    """The links of many episodes; a link makes one with `LinkModel.batch`."""
+
+    @abstractmethod
+    def begin(self, members: Sequence[MemberSeed]) -> None:
+        """Begin an episode of each member."""
+
+    @abstractmethod
+    def step(self, number: int, beams: Int64Array) -> BatchLink:
+        """Score the beams of a frame.
+
+        Args:
+            number: Of the frame, which follows on the one before.
+            beams: Index ``tx_beam·Nr + rx_beam`` of the pair of each member and user, −1 where it is not
+                served; Shape ``[M, U]`` with the users of `users_of`.
+        """
 
 
 @dataclass(frozen=True)

@@ -3,22 +3,33 @@
 Every beam pair of every user is swept each frame (`beam_sweep`), so that the chosen pair stands beside the
 best one (paper, eq. 2) and beside the pair along the straight line (the baseline of section 4). The link has
 no state: what a user gets follows from the channel and the choices of the frame alone.
+
+Of many episodes at once all pairs are swept for some frames ahead, as one array: a beam has no influence on
+the next frame (`BeamBatch`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon
-from caviar_protocol.topics import Link
-from caviar_services.channel.batch import ChannelBatch, SceneAt
-from caviar_services.link.base import Users
-from caviar_services.link.batch import LinkBatch
-from caviar_services.link.beam_batch import BeamBatch
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.scene import antennas, directions
+from caviar_protocol.topics import Carrier, Link
+from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
+from caviar_services.link.base import BatchLink, LinkBatch, User, Users
 from caviar_services.link.beam_scores import RewardKind, Scored, SweepingLink, SweepSettings
+from caviar_services.link.beam_sweep import sweep
 from caviar_services.link.interference import Interferers
+from caviar_services.link.link_budget import LinkBudget
 from caviar_services.service import Frame, StepResult
+
+HELD = 2**17
+"""Complex numbers that are held at once while frames are computed ahead: they stay in the caches."""
 
 
 class BeamLinkSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,3 +109,140 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
         }
         if self.settings.reward == "spectral_efficiency":
             fields["reward"] = efficiency
+
+
+# --- many episodes at once ------------------------------------------------------------
+
+
+class _Ahead(NamedTuple):
+    """K frames whose beam pairs are swept; M is 1 where all members have the same channel."""
+
+    first: int
+    """Number of the first one."""
+    frames: int
+    budget: LinkBudget
+    swept: list[Float64Array]
+    """|y| of each user by the index of the pair, Shape ``[M, K, Nt·Nr]``."""
+    best: Float64Array
+    """Shape ``[M, K, U]``; ``baseline`` likewise."""
+    baseline: Float64Array
+    has_path: BoolArray
+    """Shape ``[M, K, U]``."""
+    los: BoolArray
+    """Shape ``[K, U]``."""
+
+
+class BeamBatch(LinkBatch):
+    """Links of M members.
+
+    Args:
+        settings: Of the link.
+        carriers: Of the run.
+        channels: Of all members.
+        members: M.
+        frames: Of an episode.
+        scene_at: The scene of a frame, by its number.
+    """
+
+    def __init__(
+        self,
+        settings: BeamLinkSettings,
+        carriers: tuple[Carrier, ...],
+        channels: ChannelBatch,
+        members: int,
+        frames: int,
+        scene_at: Callable[[int], SceneAt],
+    ) -> None:
+        self._settings, self._carriers, self._channels = settings, carriers, channels
+        self._members, self._frames, self._scene_at = np.arange(members), frames, scene_at
+        self._ahead: _Ahead | None = None
+
+    def begin(self, members: Sequence[MemberSeed]) -> None:
+        self._channels.begin(members)
+        self._ahead = None
+
+    def step(self, number: int, beams: Int64Array) -> BatchLink:
+        ahead = self._ahead
+        if ahead is None or not 0 <= number - ahead.first < ahead.frames:
+            ahead = self._ahead = self._sweep_from(number)
+        row, budget, shape = number - ahead.first, ahead.budget, beams.shape
+        abs_y = np.empty(shape)
+        for u, swept in enumerate(ahead.swept):
+            of_user = beams[:, u]
+            members = self._members if len(swept) > 1 else 0
+            abs_y[:, u] = np.where(of_user < 0, 0.0, swept[members, row, of_user])
+        snr = budget.power_over_noise * abs_y**2
+        # Of −1 the quotient is −1, too.
+        tx_beam, rx_beam = np.divmod(beams, budget.receive_beams)
+        return BatchLink(
+            tx=budget.tx,
+            rx=budget.rx,
+            carrier=budget.carrier,
+            has_path=np.broadcast_to(ahead.has_path[:, row], shape).copy(),
+            los=np.broadcast_to(ahead.los[row], shape).copy(),
+            tx_beam=tx_beam,
+            rx_beam=np.where(tx_beam < 0, -1, rx_beam),
+            abs_y=abs_y,
+            top_abs_y=np.broadcast_to(ahead.best[:, row], shape)[..., None].copy(),
+            baseline_abs_y=np.broadcast_to(ahead.baseline[:, row], shape).copy(),
+            snr=snr,
+            spectral_efficiency=shannon(snr, self._settings.max_spectral_efficiency),
+        )
+
+    def _sweep_from(self, number: int) -> _Ahead:
+        first = self._scene_at(number)
+        figure, temperature = self._settings.noise_figure_db, self._settings.temperature_k
+        budget = LinkBudget.of(first.scene, self._carriers, figure, temperature)
+        elements = max((user.tx.array.size * user.rx.array.size for user in budget.users), default=1)
+        each = self._channels.width(len(self._members)) * len(self._carriers) * elements
+        count = max(1, min(self._channels.reach(number), self._frames - number, HELD // each))
+        frames = [first]
+        while len(frames) < count:
+            following = self._scene_at(number + len(frames))
+            if following.scene.devices != first.scene.devices:
+                break
+            frames.append(following)
+        found = self._channels.channels(frames)
+        places = _places(first, budget.users, self._carriers)
+        swept, best, baseline = [], [], []
+        towards = [directions(at.scene, budget.users) for at in frames]
+        for u, (user, (pair, carrier)) in enumerate(zip(budget.users, places, strict=True)):
+            abs_y = _swept(found, user, pair, carrier)
+            straight = [_straight(user, at_tx[u], at_rx[u]) for at_tx, at_rx in towards]
+            swept.append(abs_y)
+            best.append(abs_y.max(axis=-1))
+            baseline.append(abs_y[:, np.arange(len(frames)), straight])
+        pairs, of_carrier = ([place[axis] for place in places] for axis in range(2))
+        return _Ahead(
+            first=number,
+            frames=len(frames),
+            budget=budget,
+            swept=swept,
+            best=np.stack(best, axis=-1),
+            baseline=np.stack(baseline, axis=-1),
+            has_path=found.has_path[:, :, pairs, of_carrier],
+            los=found.los[:, pairs],
+        )
+
+
+def _places(at: SceneAt, users: Users, carriers: Sequence[Carrier]) -> list[tuple[int, int]]:
+    """Number of the pair, and of the carrier, of each user."""
+    tx, rx = ([device.name for device in antennas(at.scene, role)] for role in ("tx", "rx"))
+    names = [carrier.name for carrier in carriers]
+    return [
+        (tx.index(user.tx.name) * len(rx) + rx.index(user.rx.name), names.index(user.carrier.name))
+        for user in users
+    ]
+
+
+def _swept(found: BatchChannels, user: User, pair: int, carrier: int) -> Float64Array:
+    """|y| of all beam pairs of a user, Shape ``[M, K, Nt·Nr]``."""
+    h = np.ascontiguousarray(found.h[pair][:, :, carrier])
+    abs_y = sweep(h, user.tx.array, user.rx.array)
+    return abs_y.reshape(*h.shape[:2], -1)
+
+
+def _straight(user: User, towards_rx: Sequence[float], towards_tx: Sequence[float]) -> int:
+    """Index of the pair along the straight line."""
+    sent, taken = straight_beams(user.tx.array, towards_rx, user.rx.array, towards_tx)
+    return sent * user.rx.array.size + taken

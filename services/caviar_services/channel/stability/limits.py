@@ -168,8 +168,6 @@ def _(lab: Lab) -> Outcome:
 HALVES = (0, 1, 2), (0, 2, 3)
 """Corners of the triangles of a square."""
 
-SPLIT = [(-300, -300, 0), (300, -300, 0), (300, 300, 0), (-300, 300, 0)]
-
 
 def _ground_and(plates: list[Plate], lab: Lab, **settings: object) -> Outcome:
     """Two rays over ground, and nothing else of what is there besides."""

@@ -71,6 +71,7 @@ from caviar_services.channel.statistical.waves import (
     Line,
     PairWaves,
     Shares,
+    Sight,
     Waves,
     angles,
     dot,
@@ -424,16 +425,6 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
         bins = bins_of(self.wideband, self.run.carriers, tau, offsets)
         return wideband_parts(bins, responses(bins), receivers)
-
-
-class Sight(NamedTuple):
-    """Straight lines of all pairs of a scene, by transmitter, then receiver."""
-
-    lines: list[Line]
-    free: list[bool]
-    """Whether nothing blocks each."""
-    near: list[bool]
-    """Whether its ends are so near to each other that there is no path."""
 
 
 class _Drawn(NamedTuple):

@@ -195,6 +195,16 @@ class Line:
         return math.degrees(math.atan2(y, x))
 
 
+class Sight(NamedTuple):
+    """Straight lines of all pairs of a scene, by transmitter, then receiver."""
+
+    lines: list[Line]
+    free: list[bool]
+    """Whether nothing blocks each."""
+    near: list[bool]
+    """Whether its ends are so near to each other that there is no path."""
+
+
 class Waves:
     """Waves of all pairs, added pair after pair as plain numbers.
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from caviar_protocol.scratch import MARK, PrivateFolder, remove_leftovers
+from caviar_protocol.files import FOLDER_MARK, PrivateFolder, remove_leftovers
 
 HOLDS = """
 import sys
-from caviar_protocol.scratch import PrivateFolder
+from caviar_protocol.files import PrivateFolder
 folder = PrivateFolder("test")
 (folder.path / "secret.key").write_text("secret")
 print(folder.path, flush=True)
@@ -95,12 +95,12 @@ def test_what_is_not_surely_a_leftover_stays(place: Path, kind: str) -> None:
         there.write_text("mine")
     elif kind == "link":
         (place / "elsewhere").mkdir(mode=0o700)
-        (place / "elsewhere" / MARK).touch()
+        (place / "elsewhere" / FOLDER_MARK).touch()
         there.symlink_to(place / "elsewhere")
     else:
         there.mkdir(mode=0o700)
         if kind == "open to others":
-            (there / MARK).touch()
+            (there / FOLDER_MARK).touch()
             there.chmod(0o755)
     assert remove_leftovers() == []
     assert there.exists()

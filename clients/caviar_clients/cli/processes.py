@@ -1,20 +1,114 @@
-"""Ctrl-C during ``caviar run``: the first one ends the run in order, a second one at once."""
+"""Processes of a run: how one is started and ended, and what Ctrl-C during ``caviar run`` does."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import dropwhile
+from pathlib import Path
 from types import FrameType
 
+from caviar_protocol.files import open_to_append
+
+KILLED_S = 2.0
+"""[s] within which a process ends that is killed, unless it waits for a disk."""
+TAIL = 1 << 16
+"""[B] of a log that are looked at for its last line."""
+_CRASH = "Fatal Python error: "
+_AFTER_A_CRASH = ("Extension modules: ", "  File ", "  Binary file ")
 ORDERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end a run: of the terminal, of a supervisor, of a terminal that is closed."""
 PYTHON_S = 0.5
 """[s] that the interpreter has to handle a signal: while a service computes in a library of C, it handles
 none."""
+
+
+@dataclass
+class Child:
+    """The process of one service."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    pidfd: int
+    """Readable once the process is dead."""
+
+    @classmethod
+    def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
+        """Start a process.
+
+        Args:
+            name: Of the service.
+            command: Program and arguments.
+            log: Gets what the process prints, after what a process before it printed.
+            environment: All of its environment.
+        """
+        with open_to_append(log) as file:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,  # Ctrl-C is the launcher's, which ends the run in order
+                env=environment,
+            )
+        # A process id may be another process's a moment later; the descriptor stays that of this one.
+        return cls(name, process, log, os.pidfd_open(process.pid))
+
+    def last_line(self) -> str:
+        """The last line that the process printed, or what it died of in a library; empty if it printed
+        nothing."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        if not lines:
+            return ""
+        # After a crash faulthandler lists all threads and libraries; what counts stands above them.
+        if lines[-1].startswith(_AFTER_A_CRASH):
+            crashes = (number for number in reversed(range(len(lines))) if lines[number].startswith(_CRASH))
+            if (number := next(crashes, None)) is not None:
+                trace = dropwhile(lambda line: not line.startswith("Current thread "), lines[number:])
+                place = next((line.strip() for line in trace if line.startswith("  File ")), "no Python code")
+                return f"{lines[number]}, {place}"
+        return lines[-1]
+
+
+def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
+    """End processes: SIGTERM, and SIGKILL for those that are left later.
+
+    Args:
+        processes: Which; those that have ended already are left out.
+        seconds: Time between the two signals [s].
+
+    Returns:
+        Process ids of those that still live, since they wait for a disk.
+    """
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+    # A process in uninterruptible sleep takes no signal, SIGKILL neither: the launcher must not wait for it.
+    wait(processes, KILLED_S)
+    return [process.pid for process in processes if process.poll() is None]
+
+
+def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Wait until all processes have ended, but for ``seconds`` at most [s]."""
+    until = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            continue
 
 
 class Interruption:
