@@ -14,7 +14,7 @@ import caviar_clients.envs
 from caviar_clients.envs.radio_strike.env import RadioStrikeEnv
 from caviar_clients.envs.radio_strike.simulation import EpisodesOverError
 from caviar_clients.envs.radio_strike.vector_env import RadioStrikeVectorEnv
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 
 pytestmark = pytest.mark.slow
 
@@ -181,14 +181,14 @@ def test_wrong_actions_and_seeds_are_refused_with_the_member() -> None:
     envs = batch(3)
     with pytest.raises(RunError, match=r"call reset\(\)"):
         envs.step(np.zeros((3, 2), np.int64))
-    with pytest.raises(ScenarioError, match="2 seeds for 3 members"):
+    with pytest.raises(ScenarioError, match="seed has 2 numbers; write 3, one for each member"):
         envs.reset(seed=[1, 2])
     envs.reset(seed=1)
     with pytest.raises(ScenarioError, match=r"action \[0, 64\] of member 1"):
         envs.step(np.array([[0, 0], [0, 64], [0, 0]]))
     with pytest.raises(ScenarioError, match=r"action \[-1, 3\] of member 2"):
         envs.step(np.array([[0, 0], [0, 1], [-1, 3]]))
-    with pytest.raises(ScenarioError, match=r"actions have shape \[2, 2\]; write \[3, 2\]"):
+    with pytest.raises(PayloadError, match=r"int64 of shape \[2, 2\]; write whole numbers of shape \[3, 2\]"):
         envs.step(np.zeros((2, 2), np.int64))
 
 

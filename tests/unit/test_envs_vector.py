@@ -285,7 +285,7 @@ def test_an_agent_that_decides_beside_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"num_envs": 0}, "num_envs=0; write a whole number above 0"),
+        ({"num_envs": 0}, "num_envs=0; write a whole number from 1 to 65536"),
         ({"broker": "tcp://127.0.0.1:9"}, r"broker='tcp://127.0.0.1:9' is not for many.*SyncVectorEnv"),
         ({"directory": "run"}, r"directory='run' is not for many"),
         ({"render_mode": "rgb_array"}, r"render_mode='rgb_array' is not for many"),

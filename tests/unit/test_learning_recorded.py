@@ -188,7 +188,19 @@ def test_which_parts_are_fed_back() -> None:
         ({"users": "bike/*"}, ScenarioError, "no receiver of .* is bike/"),
         ({"users": "*"}, CaviarError, "the arrays of .* are not those of"),
         ({"observe": ("aodd",)}, ScenarioError, "no observation is called 'aodd'; did you mean 'aod'"),
-        ({"observe": "aod"}, ScenarioError, "write a list of each"),
+        ({"observe": "aod"}, ScenarioError, r"observe is the text 'aod'; write a tuple of names"),
+        ({"observe": 3}, ScenarioError, "observe=3: 3 is no text"),
+        ({"observe": [3]}, ScenarioError, "3 is no text"),
+        ({"observe": []}, ScenarioError, "observe names no part"),
+        ({"observe": ["buffered"]}, ScenarioError, "'buffered' is of packets, which are not replayed"),
+        ({"reward": "delay"}, ScenarioError, "reward 'delay' is of packets, which are not replayed"),
+        ({"users": 3}, ScenarioError, "users=3: 3 is no text"),
+        ({"carrier": "none"}, ScenarioError, "is uav/. on carrier 'none'; name others"),
+        ({"recordings": "runs/x"}, ScenarioError, "recordings is the text 'runs/x'"),
+        ({"recordings": [3]}, ScenarioError, "3 is no text"),
+        ({"autoreset_mode": "now"}, ScenarioError, "autoreset_mode='now'; write 'NextStep' or 'SameStep'"),
+        ({"num_envs": 0}, ScenarioError, "num_envs=0; write a whole number from 1 to 65536"),
+        ({"num_envs": 10**9}, ScenarioError, "write a whole number from 1 to 65536"),
         ({"reward": "rate"}, ScenarioError, "no reward is called 'rate'"),
         ({"normalization": "units"}, ScenarioError, "write 'recorded' or 'unit'"),
     ],
@@ -196,8 +208,9 @@ def test_which_parts_are_fed_back() -> None:
 def test_what_does_not_fit_is_refused(
     options: dict[str, Any], error: type[Exception], expected: str, tmp_path: Path
 ) -> None:
+    given = {"num_envs": 2, "recordings": [smoke(tmp_path)], "users": "uav/*"}
     with pytest.raises(error, match=expected):
-        RecordedBeamsVectorEnv(2, [smoke(tmp_path)], **{"users": "uav/*", **options})
+        RecordedBeamsVectorEnv(**{**given, **options})
 
 
 def test_a_recording_without_a_channel_is_refused(tmp_path: Path) -> None:
@@ -217,5 +230,21 @@ def test_actions_are_checked_and_an_episode_has_to_begin(geometric: tuple[Path, 
         env.step(np.array([0, 64]))
     with pytest.raises(PayloadError, match=r"whole numbers of shape \[2\]"):
         env.step(np.array([0.5, 1.0]))
+    with pytest.raises(PayloadError, match=r"write whole numbers of shape \[2\]"):
+        env.step([1, [2]])  # type: ignore[arg-type]
     with pytest.raises(ScenarioError, match="there is: tracks"):
         env.reset(options={"track": 1})
+
+
+@pytest.mark.parametrize("tracks", [[0, 99], [0, -1], [0], 0, "ab", [], [0.5, 0], [0, 0, 0]])
+def test_users_that_are_not_recorded_are_refused(tracks: Any, geometric: tuple[Path, Path]) -> None:
+    env = RecordedBeamsVectorEnv(2, [geometric[1]])
+    with pytest.raises(ScenarioError, match=r"write 2 whole numbers from 0 to \d+, one for each member"):
+        env.reset(options={"tracks": tracks})
+
+
+@pytest.mark.parametrize("track", [99, -1, "a", 0.5, [0]])
+def test_a_user_that_is_not_recorded_is_refused(track: Any, geometric: tuple[Path, Path]) -> None:
+    env = RecordedBeamsEnv([geometric[1]])
+    with pytest.raises(ScenarioError, match=r"; write a whole number from 0 to \d+"):
+        env.reset(options={"track": track})

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from caviar_clients.envs.arguments import checked_names, checked_path, checked_patterns
 from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.plots.scene_map import MapRenderer
 from caviar_clients.session.base import Frame, Session
@@ -104,14 +105,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ScenarioError(f"render_mode is {render_mode!r}; write 'rgb_array' or None")
-        # A text is a sequence, too: of names of one letter.
-        if isinstance(observe, str):
-            raise ScenarioError(
-                f"observe is the text {observe!r}; write a tuple of names: observe=({observe!r},)"
-            )
+        observe = checked_names("observe", observe)
         if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
-        self.scenario = checked_scenario(Path(scenario))
+        self.scenario = checked_scenario(checked_path("scenario", scenario))
         if reward in OF_PACKETS:
             require_packets(self.scenario, f"reward {reward!r}")
         # A program may make hundreds of environments: Python shows the same warning once.
@@ -119,7 +116,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             warnings.warn(text, stacklevel=2)
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
-        self.users = Users(self.scenario, (users,) if isinstance(users, str) else users)
+        self.users = Users(self.scenario, checked_patterns("users", users))
         self.observer = Observer(self.scenario, self.users, observe)
         """Reads the parts of the observation."""
         self.observation_space: spaces.Dict[Any] = spaces.Dict(  # type: ignore[assignment]  # of arrays
@@ -127,6 +124,8 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         )
         self.reward = Reward(reward)
         """Of the link."""
+        if not isinstance(broker, str | None):
+            raise ScenarioError(f"broker={broker!r}; write its address, as in 'tcp://127.0.0.1:5570'")
         self._broker, self._connect_timeout_s = broker, connect_timeout_s
         own, its = (None if path is None else Path(path) for path in (key, broker_key))
         self._credentials = None if broker is None else credentials(own, its)

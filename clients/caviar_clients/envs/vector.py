@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from caviar_clients.envs.arguments import checked_members, checked_seeds, whole_numbers
 from caviar_clients.envs.base import BeamSelectionEnv, Observation
 from caviar_clients.envs.rewards import RewardKind, link_info
 from caviar_clients.session.batch import REMEDY, BatchLink, BatchSession, MemberSeed, check_batch
@@ -22,7 +23,6 @@ from caviar_protocol.topics import Scene
 
 Actions = NDArray[np.int64]
 P = TypeVar("P", bound=Payload)
-HIGHEST_SEED = 2**63 - 1
 
 
 class _Nothing:
@@ -81,8 +81,7 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
         reward: RewardKind = "abs_y",
         **others: Any,
     ) -> None:
-        if not (isinstance(num_envs, int) and num_envs > 0):
-            raise ScenarioError(f"num_envs={num_envs!r}; write a whole number above 0")
+        num_envs = checked_members(num_envs)
         for name, value in others.items():
             if value is not None:
                 raise ScenarioError(f"{name}={value!r} is not for many environments at once; {REMEDY}")
@@ -131,10 +130,10 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
             ScenarioError: An option does not exist, or seeds are no M numbers.
             RunError: The run has ended.
         """
+        members = self._seeded(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         if options:
             raise ScenarioError(f"no options of reset are called {sorted(options)}; there are none")
-        members = self._seeded(seed)
         if self._session is None:
             scenario, agent = self.single.scenario, self.single.agent
             self._session = BatchSession(scenario, agent, self.num_envs)
@@ -199,21 +198,14 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
             if self._members is not None:
                 return [_following(member) for member in self._members]
             seed = self.single.scenario.run.seed
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed)
-        if len(seeds) != self.num_envs:
-            raise ScenarioError(f"seed has {len(seeds)} numbers; write {self.num_envs}, one a member")
+        seeds = checked_seeds(seed, self.num_envs)
         known = self._members
         if known is None:
             known = [MemberSeed(self.single.scenario.run.seed + i, -1) for i in range(self.num_envs)]
-        members = []
-        for member, chosen in zip(known, seeds, strict=True):
-            if chosen is None:
-                members.append(_following(member))
-            elif 0 <= chosen <= HIGHEST_SEED:
-                members.append(MemberSeed(int(chosen), 0))
-            else:
-                raise ScenarioError(f"seed {chosen}; write whole numbers from 0 to 2**63 - 1")
-        return members
+        return [
+            _following(member) if chosen is None else MemberSeed(chosen, 0)
+            for member, chosen in zip(known, seeds, strict=True)
+        ]
 
     def _begin(self, session: BatchSession) -> tuple[Observation, dict[str, Any]]:
         session.begin(self._members or ())
@@ -224,14 +216,8 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
 
     def _beam_pairs(self, actions: Actions) -> Int64Array:
         """The actions, Shape ``[M, places]``."""
-        given, shape = np.asarray(actions), (self.num_envs, len(self._highest))
-        fits = given.size == shape[0] * shape[1] and len(given) == self.num_envs
-        if not (fits and np.issubdtype(given.dtype, np.integer)):
-            raise PayloadError(
-                f"the actions are {given.dtype} of shape {list(given.shape)}; write whole numbers of shape "
-                f"{list(self.action_space.shape or ())}"
-            )
-        chosen = given.reshape(shape)
+        shape = (self.num_envs, len(self._highest))
+        chosen = whole_numbers(actions, self.action_space.shape or (), shape).reshape(shape)
         if (chosen < 0).any() or (chosen > self._highest).any():
             member, place = np.argwhere((chosen < 0) | (chosen > self._highest))[0].tolist()
             raise PayloadError(

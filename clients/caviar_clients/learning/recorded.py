@@ -13,7 +13,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from caviar_clients.envs.rewards import KINDS, Reward, RewardKind, link_info
+from caviar_clients.envs.arguments import (
+    checked_members,
+    checked_names,
+    checked_patterns,
+    checked_seeds,
+    whole_numbers,
+)
+from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.learning.tracks import NoProducts, Tracks, read_tracks
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon
@@ -23,6 +30,8 @@ from caviar_services.link.base import BatchLink
 
 Normalization: TypeAlias = Literal["recorded", "unit"]
 Observation = dict[str, NDArray[Any]]
+_MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+_PARTS_OF_PACKETS = ("last_throughput", "buffered", "waiting")
 
 
 class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
@@ -77,12 +86,20 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         if normalization not in get_args(Normalization):
             known = " or ".join(map(repr, get_args(Normalization)))
             raise ScenarioError(f"normalization={normalization!r}; write {known}")
-        if isinstance(observe, str) or isinstance(recordings, str | Path):
-            raise ScenarioError(f"observe={observe!r}, recordings={recordings!r}; write a list of each")
-        self.num_envs = num_envs
+        if reward in OF_PACKETS:
+            raise ScenarioError(f"reward {reward!r} is of packets, which are not replayed; write 'abs_y'")
+        observe, recordings = checked_names("observe", observe), checked_names("recordings", recordings)
+        if packets := [name for name in observe if name in _PARTS_OF_PACKETS]:
+            raise ScenarioError(f"observation {packets[0]!r} is of packets, which are not replayed")
+        if not observe:
+            raise ScenarioError("observe names no part; write observe=('aod',)")
+        if autoreset_mode not in (*_MODES, *(mode.value for mode in _MODES)):
+            known = " or ".join(repr(mode.value) for mode in _MODES)
+            raise ScenarioError(f"autoreset_mode={autoreset_mode!r}; write {known}")
+        num_envs = self.num_envs = checked_members(num_envs)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.tracks: Tracks = read_tracks(recordings, observe, users, carrier)
+        self.tracks: Tracks = read_tracks(recordings, observe, checked_patterns("users", users), carrier)
         self._reward = Reward(reward)
         self._scale = 1 / self.tracks.rms() if normalization == "unit" else np.ones(len(self.tracks.has_path))
         self._best = self.tracks.swept.max(axis=1)
@@ -114,14 +131,17 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         Raises:
             ScenarioError: An option does not exist.
         """
+        seeds = checked_seeds(seed, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         options = dict(options or {})
         chosen = options.pop("tracks", None)
         if options:
             raise ScenarioError(f"no options of reset are called {sorted(options)}; there is: tracks")
+        if chosen is not None:
+            chosen = self._checked_tracks(chosen)
         if seed is not None or not self._orders:
-            first = 0 if seed is None else seed
-            seeds = [first + i for i in range(self.num_envs)] if isinstance(first, int) else list(first)
+            if seed is None:
+                seeds = checked_seeds(0, self.num_envs)
             self._orders = [_Order(len(self.tracks.tracks), s) for s in seeds]
         everyone = np.ones(self.num_envs, np.bool_)
         self._begin(everyone, chosen)
@@ -169,13 +189,19 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
             self._row[member], self._end[member] = rows.start, rows.stop
         self._over = self._over & ~members
 
-    def _checked(self, actions: NDArray[np.int64]) -> Int64Array:
-        beams, count = np.asarray(actions), self.tracks.place.beam_pairs
-        if beams.shape != (self.num_envs,) or not np.issubdtype(beams.dtype, np.integer):
-            raise PayloadError(
-                f"the actions are {beams.dtype} of shape {list(beams.shape)}; write whole numbers of shape "
-                f"{[self.num_envs]}"
+    def _checked_tracks(self, chosen: object) -> list[int]:
+        """The option ``tracks`` of `reset`."""
+        count, given = len(self.tracks.tracks), np.asarray(chosen, dtype=object).ravel().tolist()
+        fits = np.shape(given) == (self.num_envs,) and np.ndim(chosen) == 1  # type: ignore[arg-type]
+        if not (fits and all(isinstance(i, int | np.integer) and 0 <= i < count for i in given)):
+            raise ScenarioError(
+                f"tracks={chosen!r}; write {self.num_envs} whole numbers from 0 to {count - 1}, one for each "
+                "member"
             )
+        return [int(i) for i in given]
+
+    def _checked(self, actions: NDArray[np.int64]) -> Int64Array:
+        beams, count = whole_numbers(actions, (self.num_envs,)), self.tracks.place.beam_pairs
         if (beams < 0).any() or (beams >= count).any():
             member = int(np.flatnonzero((beams < 0) | (beams >= count))[0])
             raise PayloadError(
@@ -298,8 +324,13 @@ class RecordedBeamsEnv(gymnasium.Env[Observation, np.int64]):
         """Begin an episode; ``options`` may have ``track``, the index of the user."""
         super().reset(seed=seed)
         options = dict(options or {})
+        if "tracks" in options:
+            raise ScenarioError("no options of reset are called ['tracks']; there is: track")
         if "track" in options:
-            options["tracks"] = [options.pop("track")]
+            track, count = options.pop("track"), len(self._one.tracks.tracks)
+            if not (isinstance(track, int | np.integer) and 0 <= track < count):
+                raise ScenarioError(f"track={track!r}; write a whole number from 0 to {count - 1}")
+            options["tracks"] = [int(track)]
         observation, info = self._one.reset(seed=seed, options=options)
         self._is_over = False
         return self._only(observation), self._only(info)

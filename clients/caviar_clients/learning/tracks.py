@@ -254,7 +254,8 @@ class _Reader:
     def tracks(self, recordings: Sequence[Path | str]) -> Tracks:
         if self._scenario is None or self._pair is None or self._users is None or self._scene is None:
             where = ", ".join(map(str, recordings)) or "no recording"
-            raise ScenarioError(f"no receiver of {where} is {' or '.join(self._patterns)}; name others")
+            on = "" if self._carrier is None else f" on carrier {self._carrier!r}"
+            raise ScenarioError(f"no receiver of {where} is {' or '.join(self._patterns)}{on}; name others")
         columns = {
             name: np.array([v for rows in self._found for v in rows.columns[name]])
             for name in self._found[0].columns

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from caviar_clients.envs.arguments import whole_numbers
 from caviar_clients.envs.radio_strike.rules import BEAMS, USERS, RulesName, rules_of
 from caviar_clients.envs.radio_strike.simulation import Library, Outcome, Simulation
 from caviar_clients.envs.radio_strike.sources import Source, episode_loaders
@@ -177,11 +178,12 @@ class RadioStrikeEnv(gymnasium.Env[Float64Array, NDArray[np.int64]]):
             action: User and beam.
 
         Raises:
+            PayloadError: The action is no two whole numbers.
             ScenarioError: There is no such user or beam.
             RunError: The episode is over, `reset` was never called, or, with ``legacy``, a user is at the end
                 of the last episode.
         """
-        user, beam = map(int, action)
+        user, beam = whole_numbers(action, (2,)).tolist()
         if not 0 <= beam < BEAMS:
             raise ScenarioError(f"beam {beam} is not in the codebook; write a number from 0 to {BEAMS - 1}")
         return self._returned(user, self._played(user, np.array([beam])))
@@ -196,8 +198,9 @@ class RadioStrikeEnv(gymnasium.Env[Float64Array, NDArray[np.int64]]):
         Returns:
             As `step`; ``info["best_beam"]`` is the beam.
         """
-        outcome = self._played(int(user), None)
-        observation, reward, terminated, truncated, info = self._returned(int(user), outcome)
+        (chosen,) = whole_numbers([user], (1,)).tolist()
+        outcome = self._played(chosen, None)
+        observation, reward, terminated, truncated, info = self._returned(chosen, outcome)
         return observation, reward, terminated, truncated, info | {"best_beam": int(outcome.beam[0])}
 
     def _played(self, user: int, beams: NDArray[np.int64] | None) -> Outcome:

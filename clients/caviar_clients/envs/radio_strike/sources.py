@@ -170,7 +170,13 @@ def episode_loaders(
     """
     if sources is None:
         return [partial(synthetic_episode, number) for number in range(SYNTHETIC_EPISODES)]
-    several = [sources] if isinstance(sources, str | Path | Episode | Recording) else list(sources)
+    kinds = str | Path | Episode | Recording
+    if not isinstance(sources, kinds | Iterable) or isinstance(sources, bytes):
+        raise ScenarioError(f"episodes={sources!r}; write a path, or a list of paths or episodes")
+    several = [sources] if isinstance(sources, kinds) else list(sources)
+    for source in several:
+        if not isinstance(source, kinds):
+            raise ScenarioError(f"episodes has {source!r}; write paths, recordings and episodes")
     found = [load for source in several for load in _loaders(source, users, base_station)]
     if not found:
         raise ScenarioError("episodes=[]; name one source at least, or leave it out")

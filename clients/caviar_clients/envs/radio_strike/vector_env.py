@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from caviar_clients.envs.arguments import checked_members, checked_seeds, whole_numbers
 from caviar_clients.envs.radio_strike.env import (
     action_space,
     episode_option,
@@ -70,8 +71,7 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
         steps: int | None = None,
     ) -> None:
         super().__init__()
-        if num_envs < 1:
-            raise ScenarioError(f"num_envs={num_envs!r}; write a whole number from 1 on")
+        num_envs = checked_members(num_envs)
         values = [mode.value for mode in _MODES]
         if autoreset_mode not in _MODES and autoreset_mode not in values:
             raise ScenarioError(f"autoreset_mode={autoreset_mode!r}; write one of {', '.join(values)}")
@@ -118,12 +118,7 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
         Raises:
             ScenarioError: The number of seeds is not that of members, or an option is wrong.
         """
-        if seed is None or isinstance(seed, int | np.integer):
-            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
-        else:
-            seeds = list(seed)
-        if len(seeds) != self.num_envs:
-            raise ScenarioError(f"{len(seeds)} seeds for {self.num_envs} members; write one for each")
+        seeds = checked_seeds(seed, self.num_envs)
         game, episode = self._simulation, episode_option(options, self._simulation)
         first_time = not self._random
         if first_time:
@@ -149,6 +144,7 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
             actions: User and beam of each, Shape ``[num_envs, 2]``.
 
         Raises:
+            PayloadError: The actions are no whole numbers of this shape.
             ScenarioError: There is no such user or beam; names the member.
             RunError: `reset` was never called, or, with ``legacy``, the last episode is over.
         """
@@ -173,7 +169,8 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
             RunError: `reset` was never called, or a member ended in the step before and is to be reset in
                 this one.
         """
-        chosen, _ = self._checked(np.stack([users, np.zeros_like(users)], axis=1))
+        given = whole_numbers(users, (self.num_envs,))
+        chosen, _ = self._checked(np.stack([given, np.zeros_like(given)], axis=1))
         if self._ended.any():
             raise RunError("a member has ended; call reset(), or take AutoresetMode.SAME_STEP")
         return self._returned(self._simulation.step(chosen, None), chosen, is_best=True)
@@ -183,9 +180,7 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
     def _checked(self, actions: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         if not self._random:
             raise RunError("no episode has begun; call reset()")
-        given = np.asarray(actions)
-        if given.shape != (self.num_envs, 2):
-            raise ScenarioError(f"actions have shape {list(given.shape)}; write [{self.num_envs}, 2]")
+        given = whole_numbers(actions, (self.num_envs, 2))
         users, beams = given.astype(np.int64).T.copy()
         # As unsigned numbers negative ones are large: one comparison finds both.
         if (users.view(np.uint64) >= len(USERS)).any() or (beams.view(np.uint64) >= BEAMS).any():
