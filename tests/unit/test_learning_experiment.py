@@ -70,6 +70,26 @@ def test_an_experiment_is_read_with_its_defaults() -> None:
         ),
         ("gamma = 0.0", "gamma = 1.5", "my.toml:16: algorithm.gamma: is 1.5, write a number ≥ 0"),
         ("gamma = 0.0", "clip_range = 0.2", "unknown key 'clip_range'"),
+        (
+            "gamma = 0.0",
+            "learning_starts = 500",
+            "algorithm.learning_starts: is 500, and 500 steps",
+        ),
+        ("gamma = 0.0", "train_freq = 1000000000", "algorithm.train_freq: is 1000000000, and 500 steps"),
+        ("gamma = 0.0", "gradient_steps = 1000000000", "algorithm.gradient_steps: is 1000000000, write"),
+        ("batch_size = 64", "batch_size = 1000000000000", "algorithm.batch_size: is 1000000000000, write"),
+        ("members = 4", "members = 501", "environment.members: is 501, and 500 steps of all members"),
+        ('name = "dqn"\n', "", "my.toml:14: algorithm: lacks 'name', write one of a2c, dqn, ppo"),
+        ("layers = [32, 16]", "layers = [100000]", "network.layers[0]: is 100000, write"),
+        ("layers = [32, 16]", "layers = [65536, 65536]", "has 2 layers, 4,294,967,296 weights between them"),
+        ("scale = 50.0", "scale = inf", "features.position.scale: is inf, write numbers > 0"),
+        ("scale = 50.0", "scale = 1e-320", "features.position.scale: is 1e-320, write numbers > 0"),
+        (
+            "offset = [70.0, 0.0, 20.0]",
+            "offset = nan",
+            "position.offset: is nan, write finite",
+        ),
+        ("caviar/BeamSelection-v0", ".:Mine-v0", "environment.id: module '.' cannot be imported: TypeError"),
         ('name = "dqn"', 'name = "dqm"', "my.toml:15: algorithm.name: is 'dqm'; did you mean 'dqn'?"),
         ('name = "dqn"', 'name = "dqn"\nlibrary = "rllib"', "algorithm.library"),
         ("layers = [32, 16]", "layers = [0]", "my.toml:20: network.layers[0]: is 0"),
@@ -92,6 +112,14 @@ def test_what_is_wrong_is_named_with_its_place(old: str, new: str, expected: str
     with pytest.raises(ScenarioError) as refused:
         parse_experiment(TEXT.replace(old, new, 1), "my.toml")
     assert expected in str(refused.value)
+
+
+def test_a_module_that_breaks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "breaks_at_import.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    text = TEXT.replace("caviar/BeamSelection-v0", "breaks_at_import:Mine-v0")
+    with pytest.raises(ScenarioError, match=r"'breaks_at_import' cannot be imported: ZeroDivisionError"):
+        parse_experiment(text, "my.toml")
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from caviar_clients.learning.campaign import prepare_folder, reached, train_expe
 from caviar_clients.learning.checkpoints import newest_checkpoint
 from caviar_clients.learning.events import EventFile, read_events
 from caviar_clients.learning.experiment import Experiment, parse_experiment
-from caviar_clients.learning.training import LinearRate, Progress, train_seed
+from caviar_clients.learning.training import LinearRate, Progress, read_result, train_seed
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import find_scenario
 from caviar_services.agent.policy import PolicyModel
@@ -295,3 +296,54 @@ def test_events_are_records_with_checksums(tmp_path: Path) -> None:
 def test_the_learning_rate_falls_over_the_whole_experiment() -> None:
     rate = LinearRate(1e-3, 1e-4)
     assert [rate(1.0), rate(0.5), rate(0.0)] == pytest.approx([1e-3, 5.5e-4, 1e-4])
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_network_that_diverges_ends_the_training_before_its_checkpoint(
+    fails: bool, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    def diverge(model: Any, *_: object) -> None:
+        with torch.no_grad():
+            next(model.policy.parameters()).fill_(float("nan"))
+        if fails:  # as the distributions of PPO do
+            raise ValueError("found invalid values")
+
+    monkeypatch.setattr(training, "_train_chunk", diverge)
+    with pytest.raises(RunError, match=r"seed 1 has diverged: .* Give an experiment of another name a"):
+        train_seed(experiment(short), 1, tmp_path)
+    assert newest_checkpoint(tmp_path / "seed-1" / "checkpoints") is None
+
+
+def test_a_training_without_enough_memory_says_what_to_make_smaller(
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def allocate(*_: object) -> None:
+        raise MemoryError("Unable to allocate 7.28 TiB")
+
+    monkeypatch.setattr(training, "_train_chunk", allocate)
+    with pytest.raises(RunError, match=r"more memory than there is, at step 0: .*; write a smaller"):
+        train_seed(experiment(short), 1, tmp_path)
+
+
+def test_a_folder_whose_record_is_gone_is_not_gone_on_with(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short)
+    folder = prepare_folder(wanted, tmp_path)
+    (folder / "seed-1").mkdir()
+    (folder / "experiment.json").unlink()
+    with pytest.raises(RunError, match=r"has seed-1, and no experiment\.json that says of what; give"):
+        prepare_folder(wanted, tmp_path)
+
+
+def test_a_result_of_another_seed_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "seed-1").mkdir()
+    (tmp_path / "seed-1" / "result.json").write_text('{"seed": 7, "steps": 1, "digest": "", "seconds": 1}')
+    with pytest.raises(RunError, match=r"result\.json is of seed 7; remove it to train seed 1"):
+        read_result(tmp_path, 1)
+
+
+def test_a_copy_of_a_checkpoint_is_none(tmp_path: Path) -> None:
+    for name in ("000000000035", "000000000070.old", "000000000070 (copy)"):
+        (tmp_path / name).mkdir()
+    assert newest_checkpoint(tmp_path) == tmp_path / "000000000035"

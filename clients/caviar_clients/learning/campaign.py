@@ -100,6 +100,11 @@ def prepare_folder(experiment: Experiment, root: Path) -> Path:
         try:
             before = msgspec.json.decode(file.read_bytes(), type=_Record)
         except FileNotFoundError:
+            if trained := sorted(path.name for path in folder.glob("seed-*")):
+                raise RunError(
+                    f"{folder} has {', '.join(trained[:4])}, and no {RECORD} that says of what; give the "
+                    "experiment another name, or remove the folder"
+                ) from None
             replace_file(file, msgspec.json.format(msgspec.json.encode(now), indent=1))
             return folder
         except msgspec.DecodeError as error:

@@ -26,7 +26,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
     Args:
         folder: Of the checkpoints of one seed; it may not exist.
     """
-    found = [path for path in folder.glob("[0-9]*") if path.is_dir() and not path.name.endswith(_PARTIAL)]
+    # A copy that a user made of one is none, nor is a draft.
+    found = [path for path in folder.glob("[0-9]*") if path.is_dir() and path.name.isdecimal()]
     return max(found, default=None, key=lambda path: int(path.name))
 
 

@@ -29,7 +29,9 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import math
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -43,6 +45,9 @@ from caviar_protocol.scenario import absolute_paths, find_scenario, load_scenari
 from caviar_protocol.scenario.conversion import Place, Source, convert_table
 
 Count = Annotated[int, quantity("1", "whole number above 0", ge=1, le=2**40)]
+Rows = Annotated[int, quantity("1", "whole number above 0", ge=1, le=2**20)]
+"""Of a batch: more take all memory, or hours for one step."""
+Repeats = Annotated[int, quantity("1", "whole number above 0", ge=1, le=10_000)]
 Share = Annotated[float, quantity("1", "from 0 to 1", ge=0, le=1)]
 Rate = Annotated[float, quantity("1", "learning rate", gt=0, le=10)]
 Positive = Annotated[float, quantity("1", "above 0", gt=0)]
@@ -118,10 +123,11 @@ class Dqn(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True, tag
     buffer_size: Count | None = None
     """Transitions that are kept; more than ``steps`` take no more memory."""
     learning_starts: Annotated[int, quantity("1", "steps", ge=0)] | None = None
-    batch_size: Count | None = None
+    """Steps before the first that is learned from; below ``steps`` of the experiment."""
+    batch_size: Rows | None = None
     tau: Share | None = None
     train_freq: Count | None = None
-    gradient_steps: Annotated[int, quantity("1", "-1: as many as steps", ge=-1)] | None = None
+    gradient_steps: Annotated[int, quantity("1", "-1: as many as steps", ge=-1, le=10_000)] | None = None
     target_update_interval: Count | None = None
     exploration_fraction: Share | None = None
     exploration_initial_eps: Share | None = None
@@ -141,8 +147,8 @@ class _OnPolicy(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Ppo(_OnPolicy, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="ppo"):
     """Proximal policy optimization."""
 
-    batch_size: Count | None = None
-    n_epochs: Count | None = None
+    batch_size: Rows | None = None
+    n_epochs: Repeats | None = None
     clip_range: Share | None = None
     clip_range_vf: Positive | None = None
     target_kl: Positive | None = None
@@ -155,12 +161,26 @@ class A2c(_OnPolicy, frozen=True, kw_only=True, forbid_unknown_fields=True, tag=
     use_rms_prop: bool | None = None
 
 
+Units = Annotated[int, quantity("1", "units of a layer", ge=1, le=2**16)]
+MOST_WEIGHTS = 2**27
+"""Between hidden layers: 0.5 GB, and twice as much for what the optimizer remembers."""
+
+
 class Network(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Table ``[network]``: of the policy; without it, that of the library."""
 
-    layers: tuple[Count, ...] | None = None
+    layers: tuple[Units, ...] | None = None
     """Units of each hidden layer."""
     activation: Literal["relu", "tanh"] | None = None
+
+    def __post_init__(self) -> None:
+        layers = self.layers or ()
+        weights = sum(a * b for a, b in pairwise(layers))
+        if weights > MOST_WEIGHTS or len(layers) > 100:
+            raise ValueError(
+                f"layers = {list(layers)[:8]} has {len(layers)} layers, {weights:,} weights between them; "
+                f"write 100 layers at most, with {MOST_WEIGHTS:,} weights"
+            )
 
 
 class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -262,6 +282,7 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
     environment = msgspec.structs.replace(made.environment, options=options)
     made = msgspec.structs.replace(made, environment=environment, source=source)
     _check_options(made)
+    _check_steps(made)
     _check_encodings(made)
     return made
 
@@ -272,12 +293,10 @@ def _check_options(experiment: Experiment) -> None:
     module, separator, _ = experiment.environment.id.rpartition(":")
     try:
         if separator:
-            importlib.import_module(module)
+            _import(module)
         spec = gymnasium.spec(experiment.environment.id)
     except ImportError as error:
-        raise place.at("id").error(
-            f"module {module!r} cannot be imported: {error}; is it installed, or in PYTHONPATH?"
-        ) from error
+        raise place.at("id").error(str(error)) from error
     except gymnasium.error.Error as error:
         ids = [name for name in gymnasium.registry if name.startswith("caviar/")]
         raise place.at("id").error(
@@ -293,16 +312,58 @@ def _check_options(experiment: Experiment) -> None:
             raise place.at("options").error(f"lacks {name!r}, which {experiment.environment.id} needs")
 
 
+def _check_steps(experiment: Experiment) -> None:
+    """Refuse what needs more steps than are trained: nothing would be learned."""
+    steps, algorithm = experiment.experiment.steps, experiment.algorithm
+    if experiment.environment.members > steps:
+        raise experiment.place("environment", "members").error(
+            f"is {experiment.environment.members}, and {steps} steps of all members together are trained; "
+            "write fewer, or more steps below [experiment]"
+        )
+    for name in ("learning_starts", "train_freq", "n_steps"):
+        value = getattr(algorithm, name, None)
+        # The first steps that are learned from are the one after.
+        if value is not None and value > steps - (name == "learning_starts"):
+            raise experiment.place("algorithm", name).error(
+                f"is {value}, and {steps} steps are trained: nothing would be learned; write a smaller "
+                "number, or more steps below [experiment]"
+            )
+
+
 def _check_encodings(experiment: Experiment) -> None:
     for name, encoding in experiment.features.items():
         scales = encoding.scale if isinstance(encoding.scale, tuple) else (encoding.scale,)
-        if not all(scale > 0 for scale in scales):
+        # The network computes with 32 bits, of which the least positive number is about 1e-38.
+        if not all(1e-30 <= scale <= 1e30 for scale in scales):
             place = experiment.place("features", name, "scale")
-            raise place.error(f"is {encoding.scale}, write numbers > 0")
+            raise place.error(f"is {encoding.scale}, write numbers > 0, from 1e-30 to 1e30")
+        offsets = encoding.offset if isinstance(encoding.offset, tuple) else (encoding.offset,)
+        if not all(math.isfinite(offset) and abs(offset) <= 1e30 for offset in offsets):
+            place = experiment.place("features", name, "offset")
+            raise place.error(f"is {encoding.offset}, write finite numbers")
         waves = encoding.waves if isinstance(encoding.waves, tuple) else (encoding.waves,)
         if not all(0 <= count <= 1024 for count in waves):
             place = experiment.place("features", name, "waves")
             raise place.error(f"is {encoding.waves}, write whole numbers from 0 to 1024")
+
+
+def _import(module: str) -> None:
+    """Import the module of an environment.
+
+    Raises:
+        ImportError: That fails; the text says why.
+    """
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f"module {module!r} cannot be imported: {error}; is it installed, or in PYTHONPATH?"
+        ) from error
+    except Exception as error:  # whatever the module of a user raises, or a name that is none
+        raise ImportError(
+            f"module {module!r} cannot be imported: {type(error).__name__}: {error}; write "
+            "module:Name-v0, and look whether python -c 'import MODULE' succeeds"
+        ) from error
 
 
 _NOT_OPTIONS = ("self", "render_mode", "num_envs")

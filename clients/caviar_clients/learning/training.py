@@ -89,15 +89,18 @@ def read_result(folder: Path, seed: int) -> SeedResult | None:
         None where the training has not come to its end.
 
     Raises:
-        RunError: The file is damaged.
+        RunError: The file is damaged, or of another seed.
     """
     file = seed_folder(folder, seed) / RESULT
     try:
-        return msgspec.json.decode(file.read_bytes(), type=SeedResult)
+        found = msgspec.json.decode(file.read_bytes(), type=SeedResult)
     except FileNotFoundError:
         return None
     except (OSError, msgspec.DecodeError) as error:
         raise RunError(f"{file} cannot be read: {error}; remove it to train this seed again") from error
+    if found.seed != seed:
+        raise RunError(f"{file} is of seed {found.seed}; remove it to train seed {seed}")
+    return found
 
 
 def make_envs(experiment: Experiment) -> Any:
@@ -201,7 +204,8 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
             model.set_logger(_logger(events))
             callback = _reporting(lambda: report(_progress(model, seed)))
             while model.num_timesteps < total:
-                _train_chunk(model, total, seed, callback)
+                with _explained(model, seed):
+                    _train_chunk(model, total, seed, callback)
                 save_checkpoint(mine / CHECKPOINTS, model)
         report(_progress(model, seed))
         model.save(mine / MODEL)
@@ -230,6 +234,32 @@ def _train_chunk(model: Any, total: int, seed: int, callback: Any) -> None:
     every = inspect.signature(model.learn).parameters["log_interval"].default
     model.learn(total - model.num_timesteps, callback, log_interval=every, reset_num_timesteps=False)
     model.trained_s += time.monotonic() - began
+
+
+@contextmanager
+def _explained(model: Any, seed: int) -> Iterator[None]:
+    """Say why a chunk cannot be trained: no memory, or a network that has diverged."""
+    import torch
+
+    failed: Exception | None = None
+    try:
+        yield
+    except (MemoryError, RuntimeError, ValueError) as error:
+        if isinstance(error, MemoryError) or "allocate memory" in str(error):
+            raise RunError(
+                f"seed {seed} needs more memory than there is, at step {model.num_timesteps:,}: {error}; "
+                "write a smaller batch_size, n_steps or buffer_size below [algorithm]"
+            ) from error
+        failed = error
+    # PPO and A2C fail on what is no number; DQN goes on with it in silence.
+    if not all(bool(torch.isfinite(values).all()) for values in model.policy.parameters()):
+        raise RunError(
+            f"seed {seed} has diverged: weights of its network are not finite after step "
+            f"{model.num_timesteps:,}. The checkpoint before it stays. Give an experiment of another name a "
+            "smaller learning_rate or max_grad_norm, or features and rewards of about 1"
+        ) from failed
+    if failed is not None:
+        raise failed
 
 
 def _chunk_seed(seed: int, steps: int) -> int:
@@ -324,7 +354,7 @@ def _new_model(experiment: Experiment, envs: Any, seed: int) -> Any:
     policy = "MultiInputPolicy" if isinstance(envs.observation_space, gymnasium.spaces.Dict) else "MlpPolicy"
     try:
         model = cls(policy, envs, seed=seed, device="cpu", policy_kwargs=kwargs, **given)
-    except (AssertionError, ValueError) as error:  # as the library refuses spaces and values
+    except (AssertionError, ValueError, MemoryError) as error:  # as the library refuses spaces and values
         raise experiment.place("algorithm").error(
             f"{algorithm.called} of Stable-Baselines3 does not take this: {error}"
         ) from error

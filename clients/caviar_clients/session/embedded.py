@@ -26,6 +26,7 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import NO_BROKER
 from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
+from caviar_clients.files import make_folder_of
 from caviar_clients.session.base import Frame, Session, declared
 from caviar_clients.session.direct import DirectFrames, plays_directly
 from caviar_clients.session.watchdog import Watchdog, Work
@@ -417,7 +418,7 @@ class EmbeddedSession(Session):
         self.notices: deque[str] = deque(maxlen=KEPT_NOTICES)
         """Notices of the run, the newest last."""
         if directory is not None:
-            directory.mkdir(parents=True, exist_ok=True)
+            make_folder_of(RunDirectory(directory).journal)
         endless = replace_field(scenario, run=replace_field(scenario.run, episodes=ENDLESS))
         self._seed = -1
         scenery_here = self._take_scenery if with_scenery else None

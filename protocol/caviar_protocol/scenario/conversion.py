@@ -250,6 +250,8 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
     tag_field = structs[0].tag_field or "type"
     by_tag = {str(choice.tag): choice for choice in structs}
     tag = value.get(tag_field)
+    if tag is None and tag_field not in value:
+        raise place.error(f"lacks {tag_field!r}, write one of {', '.join(sorted(by_tag))}")
     if tag not in by_tag:
         raise place.at(tag_field).error(f"is {show(tag)}; {suggestion(str(tag), by_tag)}")
     _check_struct(value, by_tag[tag], place)
