@@ -28,7 +28,8 @@ import numpy as np
 from bench_channel import canyon
 from bench_ladder import world
 
-from caviar_protocol.arrays import Complex64Array, Complex128Array
+from caviar_clients.tradeoff.errors import nmse
+from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.messages import GrantInput, Status
@@ -156,8 +157,8 @@ def beside_sionna(frequency_hz: float, receivers: int = 10, rays: int = 1_000_00
         raw = _sionna_paths(model, scene, r, rays)
         for name, is_exact in (("float32 carrier", False), ("exact carrier", True)):
             hf, taps = _sionna_parts(raw, channel, r, carrier, is_exact)
-            errors.setdefault(f"hf, {name}", []).append(_nmse(channel.hf[r].h[0], hf))
-            errors.setdefault(f"taps, {name}", []).append(_nmse(channel.taps[r].h[0], taps))
+            errors.setdefault(f"hf, {name}", []).append(nmse(channel.hf[r].h[0], hf))
+            errors.setdefault(f"taps, {name}", []).append(nmse(channel.taps[r].h[0], taps))
     return {
         f"{name}, {kind}": 10 * np.log10(figure)
         for name, values in errors.items()
@@ -222,10 +223,6 @@ def _with_exact_carrier(paths: Any, channel: Channel, r: int, carrier: Carrier) 
     exact = a * np.exp(-2j * np.pi * np.mod(carrier.frequency_hz * mine[nearest], 1.0))
     a = a * np.divide(exact, turned, out=np.ones_like(a), where=turned != 0)
     return tuple(mi.TensorXf(np.ascontiguousarray(part, np.float32)) for part in (a.real, a.imag))
-
-
-def _nmse(found: Complex64Array, expected: Complex128Array) -> float:
-    return float((np.abs(found - expected) ** 2).sum() / (np.abs(expected) ** 2).sum())
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.propagation.patterns import Patterns, element_amplitude
-from caviar_services.channel.stability.formulas import C, turn
+from caviar_services.channel.stability.formulas import C, turn, vertical
 from caviar_services.channel.stability.lab import Array, Thing, antenna, free_space, measure, scene, sionna
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
@@ -264,12 +264,12 @@ def test_panels_are_arrays_of_their_own_for_plane_waves() -> None:
                                                     antenna("r", "rx", rx)]))  # fmt: skip
     along = (rx - tx) / np.linalg.norm(rx - tx)
     wavelength, expected = C / FREQUENCY, []
-    theta_rx = theta_hat(-along)
+    theta_rx = vertical(-along)
     for panel in PANELS:
         turned = turn(-0.4, 0, 0) @ turn(*np.radians([panel.yaw_deg, panel.pitch_deg, panel.roll_deg]))
         local = along @ turned
         amplitude = element_amplitude("tr38901", local[None])[0]
-        for field in (theta_hat(local), np.cross(local, theta_hat(local))):
+        for field in (vertical(local), np.cross(local, vertical(local))):
             for y, z in ((-0.25, 0.25), (-0.25, -0.25), (0.25, 0.25), (0.25, -0.25)):
                 place = turn(-0.4, 0, 0) @ panel.position_m + turned @ np.array([0, y, z]) * wavelength
                 polarized = amplitude * float(turned @ field @ theta_rx)
@@ -277,11 +277,6 @@ def test_panels_are_arrays_of_their_own_for_plane_waves() -> None:
     distance = float(np.linalg.norm(rx - tx))
     wave = wavelength / (4 * np.pi * distance) * np.exp(-2j * np.pi * (distance / wavelength % 1))
     np.testing.assert_allclose(channel.h[0].h[0], wave * np.array(expected), atol=1e-9 * abs(wave))
-
-
-def theta_hat(k: Array) -> Array:
-    theta, phi = np.arccos(k[2]), np.arctan2(k[1], k[0])
-    return np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)])
 
 
 def test_all_rungs_agree_on_panels_and_polarizations() -> None:

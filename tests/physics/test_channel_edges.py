@@ -23,6 +23,7 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_services.channel.stability.waves import around
 
 pytestmark = pytest.mark.channel
 
@@ -52,12 +53,6 @@ def along(model: ChannelModel[Any], places: Array, things: list[Thing] | None = 
     """The channels to receivers at these places, in their order."""
     devices = [antenna(f"r{i:05d}", "rx", place) for i, place in enumerate(places)]
     return measure(model, scene([antenna("t", "tx", STATION), *devices], things or []))
-
-
-def around(count: int) -> Array:
-    """Places about the corner, in light and in shadow."""
-    angle = np.linspace(-3.0, 1.2, count)
-    return np.column_stack([9 * np.cos(angle), 9 * np.sin(angle), np.linspace(1.4, 2.6, count)])
 
 
 def test_a_corner_is_the_same_where_one_mesh_divides_the_border_and_the_other_does_not(

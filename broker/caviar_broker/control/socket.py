@@ -1,4 +1,4 @@
-"""The socket of a running broker's control channel, and its clients: blocking, and for an event loop.
+"""The control socket of a running broker, and its clients: blocking, and for an event loop.
 
 ``control.sock`` and ``control.json``, which says where the socket is, stand in the directory of a run.
 """

@@ -1,4 +1,4 @@
-"""Traffic: how many packets arrive for a user in each slot.
+"""Traffic models: how many packets arrive for a user in each slot.
 
 A model is the number of packets that were offered up to an instant, as a function of time, which `Offered`
 has piece by piece. ``constant`` traffic and ``trace`` send a packet whenever that passes a whole number;

@@ -23,9 +23,9 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
+from caviar_protocol.space.coordinates import Vector, dot
 from caviar_services.mesh.shapes import Mesh
 
-_Vector: TypeAlias = tuple[float, float, float]
 # Unit normal and offset: a point p is n·p + d off.
 _Plane: TypeAlias = tuple[float, float, float, float]
 _Corners: TypeAlias = tuple[int, int, int]
@@ -91,7 +91,7 @@ class _Decimation:
     def __init__(self, mesh: Mesh, tolerance: float) -> None:
         self._mesh = mesh
         self._tolerance = tolerance
-        self._points: list[_Vector] = [(x, y, z) for x, y, z in mesh.vertices.tolist()]
+        self._points: list[Vector] = [(x, y, z) for x, y, z in mesh.vertices.tolist()]
         self._faces: dict[int, _Corners] = {i: (a, b, c) for i, (a, b, c) in enumerate(mesh.faces.tolist())}
         self._of_vertex: dict[int, set[int]] = defaultdict(set)
         for number, corners in self._faces.items():
@@ -153,7 +153,7 @@ class _Decimation:
             before = self._faces[face]
             a, b, c = (onto if corner == vertex else corner for corner in before)
             old, new = self._normal(before), self._normal((a, b, c))
-            if old is not None and (new is None or _dot(old, new) < _TURN):
+            if old is not None and (new is None or dot(old, new) < _TURN):
                 return False
             standing.add(frozenset((a, b, c)))
         others = {frozenset(self._faces[face]) for face in self._of_vertex[onto] - shared}
@@ -194,30 +194,26 @@ class _Decimation:
                     planes[corner].add(self._through(across, start))
         return planes
 
-    def _through(self, normal: _Vector, vertex: int) -> _Plane:
+    def _through(self, normal: Vector, vertex: int) -> _Plane:
         # Rounded: triangles of one wall share one plane, of which a vertex has to be held to but one.
         a, b, c = (round(part, 9) for part in normal)
-        return a, b, c, -round(_dot(normal, self._points[vertex]), 6)
+        return a, b, c, -round(dot(normal, self._points[vertex]), 6)
 
-    def _normal(self, corners: _Corners) -> _Vector | None:
+    def _normal(self, corners: _Corners) -> Vector | None:
         a, b, c = (self._points[corner] for corner in corners)
         return _unit(_cross(_minus(b, a), _minus(c, a)))
 
 
-def _minus(a: _Vector, b: _Vector) -> _Vector:
+def _minus(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _dot(a: _Vector, b: _Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: _Vector, b: _Vector) -> _Vector:
+def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _unit(vector: _Vector) -> _Vector | None:
-    length = math.sqrt(_dot(vector, vector))
+def _unit(vector: Vector) -> Vector | None:
+    length = math.sqrt(dot(vector, vector))
     return (vector[0] / length, vector[1] / length, vector[2] / length) if length > 1e-12 else None
 
 

@@ -17,7 +17,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.coordinates import Vector, dot
 from caviar_services.world.base import course_rate
 from caviar_services.world.scenery import Obstacles
 
@@ -314,7 +314,7 @@ class Flyer:
         d = math.hypot(*way)
         if d < _ARRIVED:
             return _REST
-        v = _dot(velocity, way) / d
+        v = dot(velocity, way) / d
         if d >= v * _H + v * abs(v) / (2 * a):
             slope = _H + v / a
             w = (d + v * v / (2 * a)) / slope if slope > 0.0 else math.inf
@@ -329,13 +329,13 @@ def _bent(wish: Vector, planes: list[Vector]) -> Vector:
     # Of two planes that both are in the way, what is left is the part along their line of intersection.
     if not planes:
         return wish
-    found = _sum(wish, planes[-1], -min(_dot(wish, planes[-1]), 0.0))
-    if len(planes) == 1 or _dot(found, planes[0]) >= 0.0:
+    found = _sum(wish, planes[-1], -min(dot(wish, planes[-1]), 0.0))
+    if len(planes) == 1 or dot(found, planes[0]) >= 0.0:
         return found
     (ax, ay, az), (bx, by, bz) = planes
     crease = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
-    square = _dot(crease, crease)
-    return _scaled(crease, _dot(wish, crease) / square) if square > 1e-12 else _REST
+    square = dot(crease, crease)
+    return _scaled(crease, dot(wish, crease) / square) if square > 1e-12 else _REST
 
 
 def _course(velocity: Vector, yaw: float) -> float:
@@ -346,10 +346,6 @@ def _course(velocity: Vector, yaw: float) -> float:
 def _unit(axis: int, sign: float) -> Vector:
     x, y, z = (sign if axis == i else 0.0 for i in range(3))
     return (x, y, z)
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _sum(a: Vector, b: Vector, factor: float = 1.0) -> Vector:

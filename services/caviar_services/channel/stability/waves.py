@@ -297,7 +297,7 @@ def _along(model: Model, places: Float64Array, *things: Thing) -> Channel:
     return measure(model, scene([antenna("t", "tx", STATION.tolist()), *devices], things))
 
 
-def _around(count: int) -> Float64Array:
+def around(count: int) -> Float64Array:
     """Places in light and in shadow of the corner, on a walk of 9 m about it."""
     angle = np.linspace(-3.0, 1.2, count)
     return np.column_stack([9 * np.cos(angle), 9 * np.sin(angle), np.linspace(1.4, 2.6, count)])
@@ -306,7 +306,7 @@ def _around(count: int) -> Float64Array:
 @case("edge", "a corner as two meshes: the same as one mesh")
 def _(lab: Lab) -> Outcome:
     one, two = (
-        20 * np.log10(np.abs(pair_sums(_along(_corner(lab, plates), _around(24)))))
+        20 * np.log10(np.abs(pair_sums(_along(_corner(lab, plates), around(24)))))
         for plates in ([Plate("both", BOTH, CONDUCTOR)], CORNER)
     )
     return worst(np.abs(two - one).tolist(), 0.01, "dB", "level at 24 places")
@@ -364,7 +364,7 @@ def _(lab: Lab) -> Outcome:
 def _(lab: Lab) -> Outcome:
     """Edges are farther apart than a point moves from one step to the next."""
     car = Thing("car", (3.0, -3.5, 0.76), quaternion=(math.cos(0.2), 0.0, 0.0, math.sin(0.2)))
-    channel = _along(_corner(lab, CORNER), _around(2000), car)
+    channel = _along(_corner(lab, CORNER), around(2000), car)
     lived = swapped = 0
     last: dict[int, Float64Array] = {}
     for begin, end in zip(channel.offsets[:-1].tolist(), channel.offsets[1:].tolist(), strict=True):

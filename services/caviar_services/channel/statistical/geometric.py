@@ -49,7 +49,7 @@ from caviar_protocol.arrays import (
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, dot
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.channel.arrays.channel_matrices import (
@@ -74,7 +74,6 @@ from caviar_services.channel.statistical.waves import (
     Sight,
     Waves,
     angles,
-    dot,
     superposed_waves,
     times,
     turned,

@@ -22,7 +22,15 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, quantity
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose, UnitQuaternion, Vector, rotated, unrotated
+from caviar_protocol.space.coordinates import (
+    SPEED_OF_LIGHT,
+    Pose,
+    UnitQuaternion,
+    Vector,
+    dot,
+    rotated,
+    unrotated,
+)
 from caviar_protocol.space.scene import device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.antenna_arrays import element_phases
@@ -408,13 +416,3 @@ def angles(vector: Vector) -> tuple[float, float]:
     """
     x, y, z = vector
     return (math.atan2(math.hypot(x, y), z), math.atan2(y, x))
-
-
-def dot(a: Vector, b: Vector) -> float:
-    """Inner product.
-
-    Example:
-        >>> dot((1.0, 2.0, 3.0), (1.0, 0.0, 1.0))
-        4.0
-    """
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
