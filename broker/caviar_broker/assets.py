@@ -90,12 +90,12 @@ class AssetExchange:
 
     def handle_offer(self, service: str, message: m.AssetOffer, _: Sequence[zmq.Frame]) -> None:
         """Ask for the files of an ASSET_OFFER that are not here yet."""
-        peer = self.clock.peer(service)
-        if peer is None or (message.epoch, message.attempt) != (self.clock.plan.epoch, peer.attempt):
+        member = self.clock.member(service)
+        if member is None or (message.epoch, message.attempt) != (self.clock.plan.epoch, member.attempt):
             self.note(service, "offered scenery for another epoch or attempt; not used")
             return
         self.feed(ev.AssetsOffered(service, message.assets))  # says what is wrong with it, if anything
-        if peer.role != "world" or peer.state is not ServiceState.PREPARING:
+        if member.role != "world" or member.state is not ServiceState.PREPARING:
             return
         try:
             _check_names(message.assets)

@@ -125,7 +125,7 @@ class Connections:
         if why := self._guard.refusal(route, hello.name, hello.role, hello.outputs):
             self._unauthorized(route, f"HELLO as {hello.name!r} ({hello.role}): {why}")
             return
-        before = self.clock.peer(hello.name)
+        before = self.clock.member(hello.name)
         attempt = before.attempt if before else 0
         self._replying = route
         # The clock decides; whether it did is seen by the attempt, which counts incarnations.
@@ -133,8 +133,8 @@ class Connections:
             self.watchdog.recheck(hello.name)  # one that was killed may be back before its death shows
         local = bool(hello.pid and hello.host and hello.host == self._host)
         self.clock.receive(ev.Joined(hello, local), time.monotonic_ns())
-        peer = self.clock.peer(hello.name)
-        if peer is not None and peer.attempt > attempt:
+        member = self.clock.member(hello.name)
+        if member is not None and member.attempt > attempt:
             self._admit(route, hello, local)
         self.perform()  # WELCOME goes to an admitted service; one turned away changes nothing
 
@@ -158,9 +158,9 @@ class Connections:
         if why := self._guard.refusal(route, attach.name):
             self._unauthorized(route, f"ATTACH to {attach.name!r}: {why}")
             return
-        name, peer = attach.name, self.clock.peer(attach.name)
-        current = peer is not None and peer.present and name in self.routes
-        if peer is None or not current or (attach.epoch, attach.attempt) != (self.epoch, peer.attempt):
+        name, member = attach.name, self.clock.member(attach.name)
+        current = member is not None and member.present and name in self.routes
+        if member is None or not current or (attach.epoch, attach.attempt) != (self.epoch, member.attempt):
             text = f"{name!r} is not in the run as attempt {attach.attempt} of epoch {attach.epoch}"
             self.reply(route, m.Error(code="unknown-peer", of="ATTACH", message=text))
             self._refused("strangers", f"ATTACH of {self._stranger(route)} was refused: {text}")

@@ -198,8 +198,8 @@ class Watchdog:
     def check(self, now: int) -> None:
         """Look for local processes that are stopped, and probe remote ones."""
         for service, watched in list(self._watched.items()):
-            peer = self.clock.peer(service)
-            if peer is None or not peer.present:
+            member = self.clock.member(service)
+            if member is None or not member.present:
                 continue
             if watched.process is not None:
                 self._check_local(service, watched, watched.process, now)

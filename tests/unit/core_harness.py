@@ -270,9 +270,9 @@ class Simulation:
     # --- the services ----------------------------------------------------------------------------
 
     def attempt(self, name: str) -> int:
-        peer = self.clock.peer(name)
-        assert peer is not None
-        return peer.attempt
+        member = self.clock.member(name)
+        assert member is not None
+        return member.attempt
 
     def _deliver(self, name: str, message: m.Message, state: Any = None) -> None:
         if name not in self.alive:

@@ -169,7 +169,7 @@ def test_a_process_id_told_over_a_websocket_is_not_watched(tmp_path: Path) -> No
         Peer(http.url, "world", pid=2**22 + 1, host=host_identity(), implementation="page") as world,
     ):
         world.join()
-        hello = http.broker.server.clock.peer("world").hello  # type: ignore[union-attr]
+        hello = http.broker.server.clock.member("world").hello  # type: ignore[union-attr]
         assert (hello.pid, hello.host, hello.implementation) == (0, "", "page")
 
 

@@ -112,7 +112,7 @@ def test_a_service_without_the_right_key_ends_within_seconds_with_the_remedy(
             connection.receive(20.0)
         connection.close()
         assert time.monotonic() - started < 5.0
-        assert broker.server.clock.peer("world").attempt == 0  # type: ignore[union-attr]
+        assert broker.server.clock.member("world").attempt == 0  # type: ignore[union-attr]
         eventually(lambda: "a connection from " in broker.witness.texts(), "the user reads it")
 
 

@@ -195,7 +195,7 @@ def test_a_process_that_rejoins_is_watched_in_place_of_the_one_before(tmp_path: 
             assert second.stdout.readline() == "granted\n"
             first.kill()
             first.wait()
-            known = broker.server.clock.peer("world")
+            known = broker.server.clock.member("world")
             assert known is not None
             assert (known.attempt, known.present) == (2, True)
             second.kill()

@@ -366,8 +366,8 @@ def test_clauses_18_and_20_under_wait_equal_inputs_give_equal_digests_kills_or_n
 
     def kill(index: int) -> None:
         name = services[index % len(services)].name
-        peer = slow.clock.peer(name)
-        if peer is not None and peer.present and peer.ready is not None and slow.clock.state in BETWEEN:
+        member = slow.clock.member(name)
+        if member is not None and member.present and member.ready is not None and slow.clock.state in BETWEEN:
             slow.kill(name)
             slow.after(timing.randrange(100 * MS), lambda: slow.hello(name))
 

@@ -352,7 +352,7 @@ class LauncherPipe:
         except ValueError:
             order = None
         match order:
-            case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.peer(service):
+            case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.member(service):
                 self._server.feed(ev.Lost(service, verdict))
             case {"restarted": str(service), "text": str(text)}:
                 self._server.note(service, text, "restarted")

@@ -255,7 +255,7 @@ class ControlServer:
         service, text, kind = (
             request.get(k, d) for k, d in (("service", ""), ("text", ""), ("kind", "note"))
         )
-        known = isinstance(service, str) and (not service or self.server.clock.peer(service) is not None)
+        known = isinstance(service, str) and (not service or self.server.clock.member(service) is not None)
         if not known or not isinstance(text, str) or not 0 < len(text) <= 1000:
             return _refusal("a note has a text of 1 to 1000 characters, and a service of the run or none")
         if kind not in NOTED:

@@ -14,7 +14,7 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.decisions import DecisionTable, GrantOrder, Ledger
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.run import Peer, Resumption, Run
+from caviar_broker.core.run import Member, Resumption, Run
 from caviar_broker.core.transitions import ServiceEvent, ServiceState
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Checkpoint, Done, Fault, Restore
@@ -105,7 +105,7 @@ class Checkpoints:
         self,
         run: Run,
         grant: Callable[[GrantOrder, Mapping[str, str]], None],
-        return_service: Callable[[Peer, int], None],
+        return_service: Callable[[Member, int], None],
         payload_size: PayloadSize,
     ) -> None:
         self._run, self._grant, self._return_service = run, grant, return_service
@@ -122,141 +122,141 @@ class Checkpoints:
         if before is not None and run.graph is not None:
             self.histories = histories_of(before, run.graph, run.plan, self._payload_size)
 
-    def reset(self, peer: Peer, *, begins: bool) -> None:
+    def reset(self, member: Member, *, begins: bool) -> None:
         """Note that a service is reset, as an episode ``begins`` or within one."""
         # A recorder's state is its recording, which it continues by itself.
-        able = peer.hello is not None and CAPABILITY in peer.hello.capabilities
-        if not (able and peer.role != "recorder" and self._run.plan.remembers):
+        able = member.hello is not None and CAPABILITY in member.hello.capabilities
+        if not (able and member.role != "recorder" and self._run.plan.remembers):
             # It may have had one: this incarnation can lack the capability that the one before had.
-            self.histories.pop(peer.name, None)
-        elif peer.name in self.histories:
-            self.histories[peer.name].rewind()
+            self.histories.pop(member.name, None)
+        elif member.name in self.histories:
+            self.histories[member.name].rewind()
         elif begins:
-            self.histories[peer.name] = CheckpointHistory()
+            self.histories[member.name] = CheckpointHistory()
 
-    def add(self, peer: Peer, order: GrantOrder, answer: Done | Fault) -> None:
+    def add(self, member: Member, order: GrantOrder, answer: Done | Fault) -> None:
         """Keep a grant and its answer, for a service that saves its state."""
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         if history is not None:
             # What was decided from wall time, as the rung of an adaptive channel, is imposed when it is
             # granted again.
             chosen = answer.decisions if isinstance(answer, Done) else {}
-            history.add(AnsweredGrant(order, self._digests(peer, answer), chosen), self._payload_size)
+            history.add(AnsweredGrant(order, self._digests(member, answer), chosen), self._payload_size)
 
-    def _digests(self, peer: Peer, answer: Done | Fault) -> dict[str, str] | None:
+    def _digests(self, member: Member, answer: Done | Fault) -> dict[str, str] | None:
         """Digests by topic of what an answer holds and a service takes; None for FAULT."""
         if isinstance(answer, Fault):
             return None
         # Only topics in demand: others were dropped when they came, so that a difference has no consequence.
         graph = self._run.graph
-        wanted = graph.outputs[peer.name] if graph else ()
+        wanted = graph.outputs[member.name] if graph else ()
         return {header.topic: header.digest for header in answer.products if header.topic in wanted}
 
     # --- saving --------------------------------------------------------------------------------------
 
-    def is_due(self, peer: Peer) -> bool:
+    def is_due(self, member: Member) -> bool:
         """Whether a service shall save its state before it is granted anything more."""
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         return history is not None and history.is_due(self._run.plan.checkpoint_frames)
 
-    def request(self, peer: Peer, now: int) -> None:
+    def request(self, member: Member, now: int) -> None:
         """Send CHECKPOINT to a service that owes nothing, once."""
-        history = self.histories[peer.name]
+        history = self.histories[member.name]
         # Called with each answer while several grants are outstanding; the first call alone asks.
         if history.asked is None:
             history.asked, history.asked_at = history.last, now
-            self._run.send(peer, Checkpoint(**self._run.ids(peer), frame=history.last))
+            self._run.send(member, Checkpoint(**self._run.ids(member), frame=history.last))
 
-    def saving_since(self, peer: Peer) -> int | None:
+    def saving_since(self, member: Member) -> int | None:
         """When a service that saves its state was asked to [ns]; None: it does not."""
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         return history.asked_at if history is not None and history.asked is not None else None
 
     def handle_checkpoint_done(self, event: ev.CheckpointReceived, now: int) -> bool:
         """Take CHECKPOINT_DONE: whether it was waited for."""
-        run, peer, message = self._run, self._run.peers[event.service], event.message
-        if not run.current(peer, message.epoch, message.attempt, "CHECKPOINT_DONE"):
+        run, member, message = self._run, self._run.members[event.service], event.message
+        if not run.current(member, message.epoch, message.attempt, "CHECKPOINT_DONE"):
             return False
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         asked = None if history is None else history.asked
         if history is None or asked is None or (message.episode, message.frame) != (run.episode, asked):
             what = f"CHECKPOINT_DONE for episode {message.episode} frame {message.frame}"
-            run.stale(peer, "CHECKPOINT_DONE", what)
+            run.stale(member, "CHECKPOINT_DONE", what)
             return False
         history.save(event.state)
-        run.enter_journal("checkpoint", peer.name, message.frame, now, state=event.state)
+        run.enter_journal("checkpoint", member.name, message.frame, now, state=event.state)
         return True
 
-    def concerns(self, peer: Peer, fault: Fault) -> bool:
+    def concerns(self, member: Member, fault: Fault) -> bool:
         """Whether a FAULT answers CHECKPOINT or RESTORE, and not a grant."""
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         if history is None or fault.episode != self._run.episode:
             return False
         # RESTORE and CHECKPOINT name the frame after which the state was taken, a grant names the next one.
-        restoring = peer.state is ServiceState.RESTORING and not peer.restored
+        restoring = member.state is ServiceState.RESTORING and not member.restored
         return fault.frame == (history.frame if restoring else history.asked)
 
     # --- restoring -----------------------------------------------------------------------------------
 
-    def restore(self, peer: Peer, now: int) -> bool:
+    def restore(self, member: Member, now: int) -> bool:
         """Send RESTORE, or the first grant again, to a service that was reset; False where there is none."""
-        history = self.histories.get(peer.name)
+        history = self.histories.get(member.name)
         if history is None or history.last < 0:
             return False
-        peer.move(ServiceEvent.RESTORE, now)
-        peer.restored = False
+        member.move(ServiceEvent.RESTORE, now)
+        member.restored = False
         if history.frame >= 0:
-            message = Restore(**self._run.ids(peer), frame=history.frame)
-            self._run.send(peer, message, attachment=history.state)
+            message = Restore(**self._run.ids(member), frame=history.frame)
+            self._run.send(member, message, attachment=history.state)
         else:
-            self._grant_next(peer, history, now)
+            self._grant_next(member, history, now)
         return True
 
-    def handle_ready(self, peer: Peer, now: int) -> None:
+    def handle_ready(self, member: Member, now: int) -> None:
         """Take READY, the answer to RESTORE."""
-        history = self.histories.get(peer.name)
-        if history is None or history.frame < 0 or history.position or peer.restored:
-            self._run.unexpected(peer, "READY", "once, after PREPARE, and once after RESTORE")
+        history = self.histories.get(member.name)
+        if history is None or history.frame < 0 or history.position or member.restored:
+            self._run.unexpected(member, "READY", "once, after PREPARE, and once after RESTORE")
             return
-        peer.restored = True
-        self._grant_next(peer, history, now)
+        member.restored = True
+        self._grant_next(member, history, now)
 
-    def _grant_next(self, peer: Peer, history: CheckpointHistory, now: int) -> None:
+    def _grant_next(self, member: Member, history: CheckpointHistory, now: int) -> None:
         # Each grant that is repeated has the whole time for a reset: a long history is no stall.
-        peer.since = now
+        member.since = now
         pending = history.pending
         if pending is not None:
-            peer.restored = True
+            member.restored = True
             self._grant(pending.order, pending.chosen)
         else:
-            peer.move(ServiceEvent.RESTORED, now)
-            self._return_service(peer, now)
+            member.move(ServiceEvent.RESTORED, now)
+            self._return_service(member, now)
 
-    def handle_repeated_answer(self, peer: Peer, answer: Done | Fault, now: int) -> None:
+    def handle_repeated_answer(self, member: Member, answer: Done | Fault, now: int) -> None:
         """Take DONE or FAULT of a service that is being restored, and compare it with the one before."""
-        run, history = self._run, self.histories.get(peer.name)
+        run, history = self._run, self.histories.get(member.name)
         kind = "DONE" if isinstance(answer, Done) else "FAULT"
-        if not run.current(peer, answer.epoch, answer.attempt, kind):
+        if not run.current(member, answer.epoch, answer.attempt, kind):
             return
-        pending = history.pending if history is not None and peer.restored else None
+        pending = history.pending if history is not None and member.restored else None
         expected = (run.episode, pending.order.frame) if pending else None
         if history is None or pending is None or (answer.episode, answer.frame) != expected:
             what = f"{kind} for episode {answer.episode} frame {answer.frame}"
-            run.stale(peer, kind, what, pending.order.frame if pending else -1)
+            run.stale(member, kind, what, pending.order.frame if pending else -1)
             return
         # Under hold and drop the frame did without the answer once, and its decision stands whatever comes
         # now.
-        if isinstance(answer, Fault) and pending.digests is not None and peer.plan.is_indispensable:
+        if isinstance(answer, Fault) and pending.digests is not None and member.plan.is_indispensable:
             text = f"failed in frame {answer.frame}, {answer.phase}: {answer.message}"
-            run.fail(f"{peer} was restored and {text}", peer.name, now)
+            run.fail(f"{member} was restored and {text}", member.name, now)
             return
         # The answer itself goes nowhere: consumers have had the first one, and the journal has its decisions.
-        self._compare(peer, answer.frame, pending.digests, self._digests(peer, answer))
+        self._compare(member, answer.frame, pending.digests, self._digests(member, answer))
         history.position += 1
-        self._grant_next(peer, history, now)
+        self._grant_next(member, history, now)
 
     def _compare(
-        self, peer: Peer, frame: int, before: Mapping[str, str] | None, again: Mapping[str, str] | None
+        self, member: Member, frame: int, before: Mapping[str, str] | None, again: Mapping[str, str] | None
     ) -> None:
         if before == again:
             return
@@ -266,10 +266,10 @@ class Checkpoints:
             topics = sorted(t for t in {*before, *again} if before.get(t) != again.get(t))
             what = f"another {', '.join(topics)}"
         text = (
-            f"{peer} answered frame {frame} again after its restart, with {what}: it is not "
+            f"{member} answered frame {frame} again after its restart, with {what}: it is not "
             "reproducible; the run continues with what was decided"
         )
-        self._run.notice("differs", peer.name, text, frame)
+        self._run.notice("differs", member.name, text, frame)
 
 
 def histories_of(

@@ -23,7 +23,7 @@ from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.membership import Liveness, Registration
 from caviar_broker.core.plan import RunPlan
-from caviar_broker.core.run import Peer, Resumption, Run, Snapshot
+from caviar_broker.core.run import Member, Resumption, Run, Snapshot
 from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
@@ -214,9 +214,9 @@ class FrameClock:
         """The service whose fault that was; empty where it was none's."""
         return self._run.culprit
 
-    def peer(self, name: str) -> Peer | None:
+    def member(self, name: str) -> Member | None:
         """What is known of a service; None for a name that the run does not expect."""
-        return self._run.peers.get(name)
+        return self._run.members.get(name)
 
     def status(self, now: int) -> RunStatus:
         """Who does what, and who is waited for, at the time ``now`` [ns]."""
@@ -225,14 +225,14 @@ class FrameClock:
     def validate(self) -> None:
         """Cross-field invariants; raises AssertionError naming the one that is broken."""
         run, dispatcher = self._run, self._episodes.dispatcher
-        peers = run.peers.values()
+        members = run.members.values()
         assert (dispatcher is not None) == (run.state is RunState.RUNNING), "dispatcher outside an episode"
         assert not run.culprit or run.error, "a culprit without an error"
         assert (run.graph is None) == (run.state is RunState.JOINING) or run.over, "a graph too early"
         if dispatcher is not None:
             dispatcher.validate()
-            away = [p for p in peers if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
+            away = [p for p in members if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
             absent = [p.name for p in away if not p.rejoin(self.plan.timeouts)]
             assert not absent, f"{absent} are not in the episode"
         if run.state is RunState.FINISHED:
-            assert not any(p.present for p in peers), "finished while a service is here"
+            assert not any(p.present for p in members), "finished while a service is here"

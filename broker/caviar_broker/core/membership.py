@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
-from caviar_broker.core.run import Peer, Run
+from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 from caviar_protocol.codec import check_version
 from caviar_protocol.digest import geometry_digest
@@ -55,48 +55,48 @@ class Registration:
             if refusal.code in ("version", "declaration"):  # waiting would not mend it
                 run.fail(f"{hello.role} {hello.name!r} was refused: {refusal.message}", hello.name, now)
             return
-        peer = run.peers[hello.name]
-        if peer.state is ServiceState.LOST:
-            run.notice("back", peer.name, f"{peer} came back after {(now - peer.since) / 1e9:.3g} s")
+        member = run.members[hello.name]
+        if member.state is ServiceState.LOST:
+            run.notice("back", member.name, f"{member} came back after {(now - member.since) / 1e9:.3g} s")
         # Before WELCOME is made, which carries the attempt that this counts.
-        peer.join(hello, now)
+        member.join(hello, now)
         run.send(
-            peer,
+            member,
             Welcome(
                 version=PROTOCOL_VERSION,
                 run=run.plan.run,
                 epoch=run.plan.epoch,
-                attempt=peer.attempt,
+                attempt=member.attempt,
                 capabilities=tuple(c for c in hello.capabilities if c in CAPABILITIES),
                 heartbeat_ns=run.plan.timeouts.heartbeat,
                 liveness_ns=run.plan.timeouts.liveness,
                 seed=run.plan.seed,
-                settings=dict(peer.plan.settings),
-                scenario=dict(peer.plan.scenario),
-                rejoin_ns=self._held_open(peer, event.local),
+                settings=dict(member.plan.settings),
+                scenario=dict(member.plan.scenario),
+                rejoin_ns=self._held_open(member, event.local),
             ),
         )
         # The graph needs every declaration; one that comes back later is prepared by the graph that there is.
         if run.state is RunState.JOINING:
-            if all(p.state is ServiceState.JOINED for p in run.peers.values()):
+            if all(p.state is ServiceState.JOINED for p in run.members.values()):
                 self._all_joined(now)
         else:
             self._prepare_whoever_can(now)
 
-    def _held_open(self, peer: Peer, local: bool) -> int:
+    def _held_open(self, member: Member, local: bool) -> int:
         """How long a service may try to come back by itself once its connections are lost [ns].
 
         A connection within one machine is lost with the broker alone. What started the broker starts the
         local services again too, and one that tried to come back would take the place of its successor.
         """
-        return peer.rejoin(self._run.plan.timeouts) if peer.plan.remote or not local else 0
+        return member.rejoin(self._run.plan.timeouts) if member.plan.remote or not local else 0
 
     def _refusal(self, hello: Hello) -> Refuse | None:
-        peer = self._run.peers.get(hello.name)
-        if peer is None:
-            near = difflib.get_close_matches(hello.name, self._run.peers, n=1)
+        member = self._run.members.get(hello.name)
+        if member is None:
+            near = difflib.get_close_matches(hello.name, self._run.members, n=1)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            expected = ", ".join(sorted(self._run.peers))
+            expected = ", ".join(sorted(self._run.members))
             return Refuse(
                 code="unknown-name",
                 message=f"the run has no service {hello.name!r}; {hint}it expects: {expected}",
@@ -104,7 +104,7 @@ class Registration:
         # Not fatal: it may have been started while the last frames were run.
         if self._run.over:
             return Refuse(code="late", message="the run is over")
-        if peer.state not in (ServiceState.EXPECTED, ServiceState.LOST):
+        if member.state not in (ServiceState.EXPECTED, ServiceState.LOST):
             return Refuse(
                 code="name-taken",
                 message=f"a service named {hello.name!r} takes part already; end it or use another name",
@@ -113,20 +113,20 @@ class Registration:
             check_version(hello.version)
         except VersionError as error:
             return Refuse(code="version", message=str(error))
-        for feature in peer.plan.features:
+        for feature in member.plan.features:
             if hello.version < feature.since:
                 text = (
-                    f"{feature.key}: {peer} speaks protocol {_dotted(hello.version)}, which does not know "
+                    f"{feature.key}: {member} speaks protocol {_dotted(hello.version)}, which does not know "
                     f"{feature.text}: protocol {_dotted(feature.since)} brought it; update the service, or "
                     "do without the key"
                 )
-                return Refuse(code="version", message=located(text, peer.name, self._run.plan.source))
-        contradiction = _contradiction(peer, hello)
+                return Refuse(code="version", message=located(text, member.name, self._run.plan.source))
+        contradiction = _contradiction(member, hello)
         return Refuse(code="declaration", message=contradiction) if contradiction else None
 
     def _all_joined(self, now: int) -> None:
         run = self._run
-        hellos = {name: peer.hello for name, peer in run.peers.items() if peer.hello}
+        hellos = {name: member.hello for name, member in run.members.items() if member.hello}
         try:
             run.graph = build_graph(hellos, run.plan.record)
         except DeclarationError as error:
@@ -147,29 +147,29 @@ class Registration:
         run = self._run
         assert run.graph is not None
         # Worlds first, since all others load the scenery that worlds offer between PREPARE and READY.
-        worlds = [p for p in run.peers.values() if p.role == "world" and run.takes_part(p)]
+        worlds = [p for p in run.members.values() if p.role == "world" and run.takes_part(p)]
         scenery_is_known = all(p.ready for p in worlds)
         if scenery_is_known and (missing := self._missing_pattern()):
             run.fail(*missing, now)
             return
-        for peer in run.peers.values():
-            if peer.state is ServiceState.JOINED and (peer.role == "world" or scenery_is_known):
-                peer.move(ServiceEvent.PREPARE, now)
+        for member in run.members.values():
+            if member.state is ServiceState.JOINED and (member.role == "world" or scenery_is_known):
+                member.move(ServiceEvent.PREPARE, now)
                 prepare = Prepare(
                     epoch=run.plan.epoch,
-                    attempt=peer.attempt,
-                    demand=run.graph.demand[peer.name],
-                    assets=() if peer.role == "world" else self._scenery(),
+                    attempt=member.attempt,
+                    demand=run.graph.demand[member.name],
+                    assets=() if member.role == "world" else self._scenery(),
                     producers=dict(run.graph.producers),
-                    prefixes={} if peer.role == "world" else _prefixes(worlds),
+                    prefixes={} if member.role == "world" else _prefixes(worlds),
                 )
-                run.send(peer, prepare)
+                run.send(member, prepare)
 
     def _scenery(self) -> tuple[Asset, ...]:
         """The scenery of all worlds, each file once, and pattern files that no world brings."""
         # A world's own file goes before the broker's, which is that of its name with the same digest.
         found = {pattern.name: pattern.asset for pattern in self._run.plan.patterns if pattern.asset}
-        found |= {asset.name: asset for peer in self._run.peers.values() for asset in peer.assets}
+        found |= {asset.name: asset for member in self._run.members.values() for asset in member.assets}
         return tuple(found[name] for name in sorted(found))
 
     def _missing_pattern(self) -> tuple[str, str] | None:
@@ -186,89 +186,89 @@ class Registration:
 
     def handle_asset_offer(self, event: ev.AssetsOffered, now: int) -> None:
         """A world's scenery: one name stands for one file in the run (clause 4)."""
-        run, peer = self._run, self._run.peers[event.service]
-        if peer.state is not ServiceState.PREPARING or peer.role != "world":
-            run.unexpected(peer, "ASSET_OFFER", "only of a world, between PREPARE and READY")
+        run, member = self._run, self._run.members[event.service]
+        if member.state is not ServiceState.PREPARING or member.role != "world":
+            run.unexpected(member, "ASSET_OFFER", "only of a world, between PREPARE and READY")
             return
         digests = {asset.name: asset.digest for asset in event.assets}
         # Others have loaded what it offered first: the run would continue with two geometries.
-        if peer.ready and digests != {asset.name: asset.digest for asset in peer.assets}:
-            self._refuse(peer, "geometry", f"{peer} came back with other scenery than it had before", now)
+        if member.ready and digests != {asset.name: asset.digest for asset in member.assets}:
+            self._refuse(member, "geometry", f"{member} came back with other scenery than it had before", now)
             return
-        for other in run.peers.values():
+        for other in run.members.values():
             clashing = [a.name for a in other.assets if digests.get(a.name, a.digest) != a.digest]
-            if other is not peer and clashing:
-                text = f"{other} and {peer} bring different files named {clashing[0]!r}; rename one of them"
-                self._refuse(peer, "clash", text, now)
+            if other is not member and clashing:
+                text = f"{other} and {member} bring different files named {clashing[0]!r}; rename one of them"
+                self._refuse(member, "clash", text, now)
                 return
         for pattern in run.plan.patterns:
             offered = digests.get(pattern.name)
             if offered and pattern.asset and offered != pattern.asset.digest:
                 text = (
-                    f"{pattern.key}: {peer} offers another file as {pattern.name!r} than the scenario's "
+                    f"{pattern.key}: {member} offers another file as {pattern.name!r} than the scenario's "
                     f"{pattern.path}: have it offer that one, or none, and the broker does"
                 )
-                self._refuse(peer, "geometry", located(text, peer.name, run.plan.source), now)
+                self._refuse(member, "geometry", located(text, member.name, run.plan.source), now)
                 return
         # An offer is progress: a world that reads a large scene sends no READY for a while.
-        peer.assets, peer.advanced_at = event.assets, now
+        member.assets, member.advanced_at = event.assets, now
 
     def handle_ready(self, event: ev.ReadyReceived, now: int) -> None:
         """READY: check what it claims, and go on when all services are ready."""
-        run, peer, message = self._run, self._run.peers[event.service], event.message
-        if not run.current(peer, message.epoch, message.attempt, "READY"):
+        run, member, message = self._run, self._run.members[event.service], event.message
+        if not run.current(member, message.epoch, message.attempt, "READY"):
             return
-        if peer.state is ServiceState.RESTORING:
-            self._episodes.checkpoints.handle_ready(peer, now)
+        if member.state is ServiceState.RESTORING:
+            self._episodes.checkpoints.handle_ready(member, now)
             return
-        if peer.state is not ServiceState.PREPARING:
-            run.unexpected(peer, "READY", "once, after PREPARE")
+        if member.state is not ServiceState.PREPARING:
+            run.unexpected(member, "READY", "once, after PREPARE")
             return
-        peer.move(ServiceEvent.READY, now)
+        member.move(ServiceEvent.READY, now)
         for note in message.notes:
             kind = "warning" if note.startswith(WARNING) else "note"
-            run.notice(kind, peer.name, note.removeprefix(WARNING))
-        if not self._accepted(peer, message, now):
+            run.notice(kind, member.name, note.removeprefix(WARNING))
+        if not self._accepted(member, message, now):
             return
-        peer.ready = message
+        member.ready = message
         # After the first episode an agent chooses seeds with DONE; a run that goes on has its seed.
         if message.seed >= 0 and run.state is RunState.PREPARING and run.resumption is None:
-            run.wish(message.seed, peer, now)
+            run.wish(message.seed, member, now)
         self._prepare_whoever_can(now)
         if run.state is not RunState.PREPARING:
-            self._episodes.reset(peer, now)
-        elif all(p.state is ServiceState.READY for p in run.peers.values() if run.takes_part(p)):
+            self._episodes.reset(member, now)
+        elif all(p.state is ServiceState.READY for p in run.members.values() if run.takes_part(p)):
             run.enter(RunEvent.ALL_READY, now)
             self._episodes.begin(now)
 
-    def _accepted(self, peer: Peer, message: Ready, now: int) -> bool:
+    def _accepted(self, member: Member, message: Ready, now: int) -> bool:
         """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
         # A service without geometry says none, and an empty digest is no contradiction.
         expected = geometry_digest(self._scenery())
-        if peer.role != "world" and message.geometry and message.geometry != expected:
+        if member.role != "world" and message.geometry and message.geometry != expected:
             text = (
-                f"{peer} holds scenery {message.geometry[:12]}…, the worlds announced "
+                f"{member} holds scenery {message.geometry[:12]}…, the worlds announced "
                 f"{expected[:12] or 'none'}…; clear its asset cache and start it again"
             )
-            self._refuse(peer, "geometry", text, now)
+            self._refuse(member, "geometry", text, now)
             return False
         # Of all that are ready by now: the one that is last to say so finds each clash.
-        claims = {p.name: p.ready for p in self._run.peers.values() if p.ready} | {peer.name: message}
+        claims = {p.name: p.ready for p in self._run.members.values() if p.ready} | {member.name: message}
         try:
-            worlds = {n: r.prefixes for n, r in claims.items() if self._run.peers[n].role == "world"}
+            worlds = {n: r.prefixes for n, r in claims.items() if self._run.members[n].role == "world"}
             check_prefixes(worlds)
             check_actuators({n: r.actuators for n, r in claims.items()})
         except DeclarationError as error:
-            self._refuse(peer, "clash", str(error), now)
+            self._refuse(member, "clash", str(error), now)
             return False
         return True
 
-    def _refuse(self, peer: Peer, code: str, text: str, now: int) -> None:
-        self._run.send(peer, Refuse(code=code, message=text))
-        self._run.fail(text, peer.name, now)
+    def _refuse(self, member: Member, code: str, text: str, now: int) -> None:
+        self._run.send(member, Refuse(code=code, message=text))
+        self._run.fail(text, member.name, now)
 
 
-def _prefixes(worlds: Iterable[Peer]) -> dict[str, tuple[str, ...]]:
+def _prefixes(worlds: Iterable[Member]) -> dict[str, tuple[str, ...]]:
     """What each world that is ready declared of the names of its objects."""
     return {world.name: world.ready.prefixes for world in worlds if world.ready}
 
@@ -277,19 +277,19 @@ def _dotted(version: tuple[int, int]) -> str:
     return ".".join(map(str, version))
 
 
-def _contradiction(peer: Peer, hello: Hello) -> str:
+def _contradiction(member: Member, hello: Hello) -> str:
     """How a HELLO contradicts the scenario or what the service said before; empty if it does not."""
-    if hello.role != peer.role:
-        return f"{hello.name!r} is the run's {peer.role}, this one says that its role is {hello.role}"
-    if peer.plan.use and hello.implementation and hello.implementation != peer.plan.use:
+    if hello.role != member.role:
+        return f"{hello.name!r} is the run's {member.role}, this one says that its role is {hello.role}"
+    if member.plan.use and hello.implementation and hello.implementation != member.plan.use:
         return (
-            f"{hello.name!r} is {hello.implementation!r}, the scenario says use = {peer.plan.use!r}; "
+            f"{hello.name!r} is {hello.implementation!r}, the scenario says use = {member.plan.use!r}; "
             "start that one, or change the scenario, which is recorded with the run"
         )
     if unknown := _unknown_part(hello):
         return unknown
     # The graph was built from the declaration before, and products were granted by it.
-    before = peer.hello
+    before = member.hello
     if before is not None and (hello.inputs, hello.outputs) != (before.inputs, before.outputs):
         return f"{hello.name!r} came back with other inputs or outputs than it had before"
     return ""
@@ -332,55 +332,55 @@ class Liveness:
 
     def handle_heartbeat(self, event: ev.Progressed, now: int) -> None:
         """A heartbeat."""
-        self._run.peers[event.service].heartbeat(event.progress, event.phase, event.grace_ns, now)
+        self._run.members[event.service].heartbeat(event.progress, event.phase, event.grace_ns, now)
 
     def handle_violation(self, event: ev.Violated, now: int) -> None:
         """A service broke the protocol beyond repair."""
-        self._run.fail(f"{self._run.peers[event.service]} {event.text}", event.service, now)
+        self._run.fail(f"{self._run.members[event.service]} {event.text}", event.service, now)
 
     def handle_bye(self, event: ev.ByeReceived, now: int) -> None:
         """A service leaves: after SHUTDOWN, or on its own account."""
-        peer = self._run.peers[event.service]
-        if peer.present and self._run.over:
-            peer.move(ServiceEvent.BYE, now)
-        elif peer.present:
+        member = self._run.members[event.service]
+        if member.present and self._run.over:
+            member.move(ServiceEvent.BYE, now)
+        elif member.present:
             self.handle_loss(ev.Lost(event.service, f"it left: {event.reason or 'no reason given'}"), now)
 
     def handle_loss(self, event: ev.Lost, now: int) -> None:
         """A service died; the run ends, unless it can do without it or wait for its return."""
-        run, peer = self._run, self._run.peers[event.service]
+        run, member = self._run, self._run.members[event.service]
         # Several witnesses report one death: the descriptor of its process, the launcher, the connection.
-        if peer.state in (ServiceState.LOST, ServiceState.LEFT):
+        if member.state in (ServiceState.LOST, ServiceState.LEFT):
             return
-        dispatcher = self._episodes.dispatcher if run.takes_part(peer) else None
-        owed = dispatcher.outstanding(peer.name) if dispatcher else []
-        text = f"{peer} died while {peer.doing}: {event.verdict}; {peer.last_words(now)}"
+        dispatcher = self._episodes.dispatcher if run.takes_part(member) else None
+        owed = dispatcher.outstanding(member.name) if dispatcher else []
+        text = f"{member} died while {member.doing}: {event.verdict}; {member.last_words(now)}"
         if owed and dispatcher:
             died = f"died ({event.verdict})"
-            text = peer.blame_task(owed[0], died, now, dispatcher.table.describe_waiting(peer.name))
-        peer.verdict = event.verdict
+            text = member.blame_task(owed[0], died, now, dispatcher.table.describe_waiting(member.name))
+        member.verdict = event.verdict
         # Counted before it is asked whether the service may come back.
-        peer.losses += 1
-        peer.move(ServiceEvent.LOST, now)
+        member.losses += 1
+        member.move(ServiceEvent.LOST, now)
         if run.over:
             return
-        run.notice("lost", peer.name, text, owed[0].frame if owed else -1)
-        if not run.takes_part(peer):
+        run.notice("lost", member.name, text, owed[0].frame if owed else -1)
+        if not run.takes_part(member):
             return
-        if not self._may_return(peer):
-            run.fail(text, peer.name, now)
+        if not self._may_return(member):
+            run.fail(text, member.name, now)
             return
-        limit = peer.rejoin(run.plan.timeouts) / 1e9
-        text = f"{peer} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
-        run.notice("away", peer.name, text, owed[0].frame if owed else -1)
+        limit = member.rejoin(run.plan.timeouts) / 1e9
+        text = f"{member} is away; the run waits for it for at most {limit:g} s (timeouts.rejoin_s)"
+        run.notice("away", member.name, text, owed[0].frame if owed else -1)
         if dispatcher:
-            dispatcher.suspend_service(peer.name)
+            dispatcher.suspend_service(member.name)
 
-    def _may_return(self, peer: Peer) -> bool:
+    def _may_return(self, member: Member) -> bool:
         """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
         broker before, or is started by hand and can be again; and it got somewhere."""
-        was_ready = peer.ready is not None or peer.plan.remote or self._run.plan.epoch > 1
-        return peer.rejoin(self._run.plan.timeouts) > 0 and was_ready and peer.losses < MAX_LOSSES
+        was_ready = member.ready is not None or member.plan.remote or self._run.plan.epoch > 1
+        return member.rejoin(self._run.plan.timeouts) > 0 and was_ready and member.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
 
@@ -394,8 +394,8 @@ class Liveness:
         # A disk that takes nothing stalls the run as a service does.
         waiting = run.ledger.waiting_since
         earliest = None if waiting is None else waiting + run.plan.timeouts.stall
-        for peer in run.peers.values():
-            due = self._due(peer)
+        for member in run.members.values():
+            due = self._due(member)
             if due is not None and (earliest is None or due < earliest):
                 earliest = due
         return earliest
@@ -410,7 +410,7 @@ class Liveness:
         if run.over:
             return
         # The longest silence is the cause; others may be silent because they wait for that service.
-        silent = [(due, p) for p in run.peers.values() if (due := self._due(p)) is not None and due <= now]
+        silent = [(due, p) for p in run.members.values() if (due := self._due(p)) is not None and due <= now]
         if silent:
             _, culprit = min(silent, key=lambda pair: pair[0])
             run.fail(self._blame(culprit, now), culprit.name, now)
@@ -418,60 +418,60 @@ class Liveness:
             waited = run.plan.timeouts.stall / 1e9
             run.fail(f"the journal was not written for {waited:g} s; the disk may be full or gone", "", now)
 
-    def _due(self, peer: Peer) -> int | None:
+    def _due(self, member: Member) -> int | None:
         """When a service has to have shown life or progress [ns]."""
         timeouts = self._run.plan.timeouts
-        if not self._run.takes_part(peer):
+        if not self._run.takes_part(member):
             return None
-        match peer.state:
+        match member.state:
             case ServiceState.EXPECTED:
                 return self._run.since + timeouts.connect
             case ServiceState.PREPARING:
-                return peer.silent_until(peer.since, timeouts.ready)
+                return member.silent_until(member.since, timeouts.ready)
             case ServiceState.RESETTING | ServiceState.RESTORING:
-                return peer.silent_until(peer.since, timeouts.reset)
+                return member.silent_until(member.since, timeouts.reset)
             case ServiceState.LOST:
-                return peer.since + peer.rejoin(timeouts)
+                return member.since + member.rejoin(timeouts)
             case ServiceState.ACTIVE:
                 dispatcher = self._episodes.dispatcher
-                task = dispatcher.awaited(peer.name) if dispatcher else None
-                since = task.started_at if task else self._saving_since(peer)
-                return None if since is None else peer.silent_until(since, timeouts.stall)
+                task = dispatcher.awaited(member.name) if dispatcher else None
+                since = task.started_at if task else self._saving_since(member)
+                return None if since is None else member.silent_until(since, timeouts.stall)
             case _:
                 return None  # it waits for others
 
-    def _saving_since(self, peer: Peer) -> int | None:
+    def _saving_since(self, member: Member) -> int | None:
         """Since when a service without which the run cannot go on saves its state [ns]."""
-        return self._episodes.checkpoints.saving_since(peer) if peer.plan.is_indispensable else None
+        return self._episodes.checkpoints.saving_since(member) if member.plan.is_indispensable else None
 
-    def _blame(self, peer: Peer, now: int) -> str:
+    def _blame(self, member: Member, now: int) -> str:
         timeouts, dispatcher = self._run.plan.timeouts, self._episodes.dispatcher
-        task = dispatcher.awaited(peer.name) if dispatcher and peer.state is ServiceState.ACTIVE else None
+        task = dispatcher.awaited(member.name) if dispatcher and member.state is ServiceState.ACTIVE else None
         if dispatcher and task:
-            waiting = dispatcher.table.describe_waiting(peer.name)
-            return peer.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
-        match peer.state:
+            waiting = dispatcher.table.describe_waiting(member.name)
+            return member.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
+        match member.state:
             case ServiceState.ACTIVE:
-                since = (now - (self._saving_since(peer) or now)) / 1e9
+                since = (now - (self._saving_since(member) or now)) / 1e9
                 words = f"makes no progress (timeouts.stall_s): {since:.3g} s since CHECKPOINT"
-                return f"{peer} {words}; {peer.last_words(now)}"
+                return f"{member} {words}; {member.last_words(now)}"
             case ServiceState.EXPECTED:
-                missing = [p for p in self._run.peers.values() if p.state is ServiceState.EXPECTED]
+                missing = [p for p in self._run.members.values() if p.state is ServiceState.EXPECTED]
                 names = ", ".join(str(p) for p in missing)
                 remote = [p.name for p in missing if p.plan.remote]
                 hint = f"; start {' and '.join(remote)} while the run waits" if remote else ""
                 waited = f"{timeouts.connect / 1e9:g} s (timeouts.connect_s)"
                 return f"{names} did not connect within {waited}{hint}"
             case ServiceState.LOST:
-                waited = f"{peer.rejoin(timeouts) / 1e9:g} s (timeouts.rejoin_s)"
-                return f"{peer} died and did not come back within {waited}: {peer.verdict}"
+                waited = f"{member.rejoin(timeouts) / 1e9:g} s (timeouts.rejoin_s)"
+                return f"{member} died and did not come back within {waited}: {member.verdict}"
             case _:
-                key = "ready_s" if peer.state is ServiceState.PREPARING else "reset_s"
-                return peer.blame(f"makes no progress (timeouts.{key}) while {peer.doing}", now)
+                key = "ready_s" if member.state is ServiceState.PREPARING else "reset_s"
+                return member.blame(f"makes no progress (timeouts.{key}) while {member.doing}", now)
 
     def _give_up_waiting(self, now: int) -> None:
-        for peer in self._run.peers.values():
-            if peer.present:
-                text = f"{peer} did not say BYE in time (timeouts.shutdown_s); {peer.last_words(now)}"
-                self._run.notice("lost", peer.name, text)
-                peer.move(ServiceEvent.LOST, now)
+        for member in self._run.members.values():
+            if member.present:
+                text = f"{member} did not say BYE in time (timeouts.shutdown_s); {member.last_words(now)}"
+                self._run.notice("lost", member.name, text)
+                member.move(ServiceEvent.LOST, now)

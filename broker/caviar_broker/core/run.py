@@ -38,7 +38,7 @@ _DOING = {
 
 
 @dataclass(slots=True)
-class Peer:
+class Member:
     """What the broker knows of a service: its part in the run, its state, and what has been heard of it.
 
     What it may use of the broker, as its memory limit, is in `caviar_broker.security.limits.PeerLimits`.
@@ -216,7 +216,7 @@ class Run:
         self.state = RunState.JOINING
         self.since = now
         """When the present state began [ns]."""
-        self.peers = {service.name: Peer(service, since=now) for service in plan.services}
+        self.members = {service.name: Member(service, since=now) for service in plan.services}
         self.graph: Graph | None = None
         """Known once all services have joined."""
         self.episode = 0
@@ -225,7 +225,7 @@ class Run:
         self.seed_episode = 0
         """Episodes since the first one with this seed."""
         # Seed of the next episode, and the agent that chose it.
-        self._wished: tuple[int, Peer] | None = None
+        self._wished: tuple[int, Member] | None = None
         self.digest = RunDigest()
         self.finished_before = 0
         """Frames of the episodes that are over."""
@@ -245,23 +245,23 @@ class Run:
         self.digest, self.finished_before = before.digest, before.finished_before
         self.ledger.last = self.ledger.written = before.entries
         if before.wish is not None:
-            self._wished = before.wish[0], self.peers[before.wish[1]]
+            self._wished = before.wish[0], self.members[before.wish[1]]
 
-    def takes_part(self, peer: Peer) -> bool:
+    def takes_part(self, member: Member) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
-        return self.graph is None or peer.name in self.graph.inputs
+        return self.graph is None or member.name in self.graph.inputs
 
     # --- seeds (clause 16) -------------------------------------------------------------------------
 
-    def wish(self, seed: int, peer: Peer, now: int) -> None:
+    def wish(self, seed: int, member: Member, now: int) -> None:
         """An agent chooses the seed of the next episode."""
         # Two agents may end an episode in one frame; with the same seed there is nothing to decide.
-        if self._wished is not None and self._wished[0] != seed and self._wished[1] is not peer:
+        if self._wished is not None and self._wished[0] != seed and self._wished[1] is not member:
             other = self._wished[1]
             self.fail(
-                f"{other} and {peer} choose different seeds, {self._wished[0]} and {seed}", peer.name, now
+                f"{other} and {member} choose different seeds, {self._wished[0]} and {seed}", member.name, now
             )
-        self._wished = seed, peer
+        self._wished = seed, member
 
     def next_seed(self) -> None:
         """An episode begins: with the seed that was chosen, or the one before."""
@@ -294,13 +294,13 @@ class Run:
         """End the run: SHUTDOWN to every service."""
         self.enter(RunEvent.STOP, now)
         # Also those that are not ready yet: they have joined, and wait for a word.
-        for peer in self.peers.values():
-            if peer.present:
-                self.send(peer, Shutdown(reason=reason, grace_ns=self.plan.timeouts.shutdown))
+        for member in self.members.values():
+            if member.present:
+                self.send(member, Shutdown(reason=reason, grace_ns=self.plan.timeouts.shutdown))
 
     def finish_if_alone(self, now: int) -> None:
         """Finish the run once every service has left."""
-        if self.state is RunState.STOPPING and not any(peer.present for peer in self.peers.values()):
+        if self.state is RunState.STOPPING and not any(member.present for member in self.members.values()):
             self.enter(RunEvent.ALL_GONE, now)
             digest = "" if self.plan.ephemeral else self.digest.hexdigest()
             self.actions.append(Finished(self.error, self.culprit, digest))
@@ -308,21 +308,21 @@ class Run:
     # --- what goes out -------------------------------------------------------------------------------
 
     def send(
-        self, peer: Peer, message: Message, products: tuple[Product, ...] = (), attachment: Any = None
+        self, member: Member, message: Message, products: tuple[Product, ...] = (), attachment: Any = None
     ) -> None:
         """Have a message sent.
 
         Args:
-            peer: To which service.
+            member: To which service.
             message: The message.
             products: Follow it, two parts each.
             attachment: State of the service, in one part.
         """
-        self.actions.append(Send(peer.name, message, products, attachment))
+        self.actions.append(Send(member.name, message, products, attachment))
 
-    def ids(self, peer: Peer) -> dict[str, int]:
+    def ids(self, member: Member) -> dict[str, int]:
         """What every message of an episode to a service carries (clause 1)."""
-        return {"epoch": self.plan.epoch, "attempt": peer.attempt, "episode": self.episode}
+        return {"epoch": self.plan.epoch, "attempt": member.attempt, "episode": self.episode}
 
     def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:
         """Have something written down that is no decision about a task.
@@ -344,29 +344,29 @@ class Run:
 
     # --- what came out of turn -----------------------------------------------------------------------
 
-    def current(self, peer: Peer, epoch: int, attempt: int, kind: str, outstanding: int = -1) -> bool:
+    def current(self, member: Member, epoch: int, attempt: int, kind: str, outstanding: int = -1) -> bool:
         """Clause 1: whether a message is of this broker's and this service's present incarnation.
 
         Args:
-            peer: The sender.
+            member: The sender.
             epoch: Of the message.
             attempt: Of the message.
             kind: Name of the message, for the answer to a stale one.
             outstanding: Frame that the sender owes; −1: none.
         """
-        if peer.present and (epoch, attempt) == (self.plan.epoch, peer.attempt):
+        if member.present and (epoch, attempt) == (self.plan.epoch, member.attempt):
             return True
-        self.stale(peer, kind, f"{kind} of epoch {epoch}, attempt {attempt}", outstanding)
+        self.stale(member, kind, f"{kind} of epoch {epoch}, attempt {attempt}", outstanding)
         return False
 
-    def stale(self, peer: Peer, kind: str, what: str, outstanding: int = -1) -> None:
+    def stale(self, member: Member, kind: str, what: str, outstanding: int = -1) -> None:
         """Answer a message that matches nothing outstanding (clause 1)."""
-        self.notice("stale", peer.name, f"{what} matches nothing that is outstanding; not used")
-        if peer.present:
-            self.send(peer, Stale(of=kind, **self.ids(peer), frame=outstanding))
+        self.notice("stale", member.name, f"{what} matches nothing that is outstanding; not used")
+        if member.present:
+            self.send(member, Stale(of=kind, **self.ids(member), frame=outstanding))
 
-    def unexpected(self, peer: Peer, kind: str, when: str) -> None:
+    def unexpected(self, member: Member, kind: str, when: str) -> None:
         """Answer a message that came out of turn."""
-        self.notice("stale", peer.name, f"{kind} came out of turn: it is expected {when}; not used")
-        if peer.present:
-            self.send(peer, Error(code="unexpected", of=kind, message=f"{kind} is expected {when}"))
+        self.notice("stale", member.name, f"{kind} came out of turn: it is expected {when}; not used")
+        if member.present:
+            self.send(member, Error(code="unexpected", of=kind, message=f"{kind} is expected {when}"))

@@ -7,7 +7,7 @@ import msgspec
 from caviar_broker.core.decisions import Task
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.plan import duration
-from caviar_broker.core.run import Peer, Run
+from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunState, ServiceState, TaskState
 
 _UNDER_WAY = {
@@ -100,7 +100,9 @@ def status_of(run: Run, episodes: Episodes, now: int) -> RunStatus:
     """
     # Looked up in one go between two events, so that no figure contradicts another.
     dispatcher = episodes.dispatcher
-    waits = [wait for peer in run.peers.values() if (wait := _wait(run, episodes, peer, now)) is not None]
+    waits = [
+        wait for member in run.members.values() if (wait := _wait(run, episodes, member, now)) is not None
+    ]
     return RunStatus(
         run=run.plan.run,
         epoch=run.plan.epoch,
@@ -113,83 +115,83 @@ def status_of(run: Run, episodes: Episodes, now: int) -> RunStatus:
         frame=dispatcher.begun if dispatcher is not None else -1,
         frames=dispatcher.table.frames if dispatcher is not None else run.plan.frames,
         pace="realtime" if run.plan.realtime else "free",
-        services=tuple(_service(peer, episodes, now) for peer in run.peers.values()),
+        services=tuple(_service(member, episodes, now) for member in run.members.values()),
         waits=tuple(sorted(waits, key=lambda wait: (not wait.late, -wait.elapsed_s))),
         error=run.error,
         culprit=run.culprit,
     )
 
 
-def _service(peer: Peer, episodes: Episodes, now: int) -> ServiceStatus:
+def _service(member: Member, episodes: Episodes, now: int) -> ServiceStatus:
     return ServiceStatus(
-        name=peer.name,
-        role=peer.role,
-        use=peer.plan.use,
-        policy=peer.plan.policy,
-        state=peer.state.name.lower(),
-        since_s=_s(now - peer.since),
-        attempt=peer.attempt,
-        phase=peer.phase,
-        progress=peer.progress,
-        heartbeat_age_s=_age(peer, now),
+        name=member.name,
+        role=member.role,
+        use=member.plan.use,
+        policy=member.plan.policy,
+        state=member.state.name.lower(),
+        since_s=_s(now - member.since),
+        attempt=member.attempt,
+        phase=member.phase,
+        progress=member.progress,
+        heartbeat_age_s=_age(member, now),
         grants=tuple(
             GrantStatus(
                 frame=task.frame,
                 state=task.state.name.lower(),
                 elapsed_s=_s(now - task.started_at),
-                budget_s=_s(peer.plan.budget_ns),
+                budget_s=_s(member.plan.budget_ns),
             )
-            for task in _owed(peer, episodes)
+            for task in _owed(member, episodes)
         ),
     )
 
 
-def _wait(run: Run, episodes: Episodes, peer: Peer, now: int) -> Wait | None:
+def _wait(run: Run, episodes: Episodes, member: Member, now: int) -> Wait | None:
     """Whether the run waits for a service, and the words for that."""
-    if not run.takes_part(peer):
+    if not run.takes_part(member):
         return None
     # First what keeps the run from its end, then services that are not there, then those at work.
     if run.state is RunState.STOPPING:
-        if not peer.present:
+        if not member.present:
             return None
         limit = run.plan.timeouts.shutdown
-        text = f"{peer} has not said BYE for {duration(now - run.since)}; {peer.last_words(now)}"
-        return _of(peer, -1, now - run.since, limit, "", text, now)
+        text = f"{member} has not said BYE for {duration(now - run.since)}; {member.last_words(now)}"
+        return _of(member, -1, now - run.since, limit, "", text, now)
     # What an early end cut is not waited for, though its answer is due.
-    owed = [task for task in _owed(peer, episodes) if task.state is not TaskState.ABANDONED]
+    owed = [task for task in _owed(member, episodes) if task.state is not TaskState.ABANDONED]
     dispatcher = episodes.dispatcher
-    lacking = dispatcher.table.describe_waiting(peer.name) if dispatcher is not None else ""
+    lacking = dispatcher.table.describe_waiting(member.name) if dispatcher is not None else ""
     # Before what it owes: a service that is lost owes its grants too, and its return comes first.
-    if peer.state in _UNDER_WAY:
+    if member.state in _UNDER_WAY:
         timeouts = run.plan.timeouts
         limit = {
             ServiceState.EXPECTED: timeouts.connect,
             ServiceState.PREPARING: timeouts.ready,
             ServiceState.RESETTING: timeouts.reset,
-            ServiceState.LOST: peer.rejoin(timeouts),
-        }[peer.state]
-        text = f"{peer} {_UNDER_WAY[peer.state]}, for {duration(now - peer.since)} now, "
-        text += f"at most {duration(limit)}; {peer.last_words(now)}"
-        text += f"; {peer.verdict}" if peer.state is ServiceState.LOST else ""
+            ServiceState.LOST: member.rejoin(timeouts),
+        }[member.state]
+        text = f"{member} {_UNDER_WAY[member.state]}, for {duration(now - member.since)} now, "
+        text += f"at most {duration(limit)}; {member.last_words(now)}"
+        text += f"; {member.verdict}" if member.state is ServiceState.LOST else ""
         text += f"; {lacking}" if lacking and owed else ""
-        return _of(peer, owed[0].frame if owed else -1, now - peer.since, limit, lacking, text, now)
+        return _of(member, owed[0].frame if owed else -1, now - member.since, limit, lacking, text, now)
     if not owed:
         return None
     task = owed[0]
-    late = now - task.started_at > peer.plan.budget_ns
+    late = now - task.started_at > member.plan.budget_ns
     problem = "is late" if late else "is at work"
-    text = peer.blame_task(task, problem, now, lacking)
-    return _of(peer, task.frame, now - task.started_at, peer.plan.budget_ns, lacking, text, now)
+    text = member.blame_task(task, problem, now, lacking)
+    return _of(member, task.frame, now - task.started_at, member.plan.budget_ns, lacking, text, now)
 
 
-def _of(peer: Peer, frame: int, elapsed: int, limit: int, lacking: str, text: str, now: int) -> Wait:
+def _of(member: Member, frame: int, elapsed: int, limit: int, lacking: str, text: str, now: int) -> Wait:
     return Wait(
-        service=peer.name,
-        role=peer.role,
+        service=member.name,
+        role=member.role,
         frame=frame,
-        phase=peer.phase,
-        progress=peer.progress,
-        heartbeat_age_s=_age(peer, now),
+        phase=member.phase,
+        progress=member.progress,
+        heartbeat_age_s=_age(member, now),
         elapsed_s=_s(elapsed),
         limit_s=_s(limit),
         late=elapsed > limit,
@@ -198,15 +200,15 @@ def _of(peer: Peer, frame: int, elapsed: int, limit: int, lacking: str, text: st
     )
 
 
-def _owed(peer: Peer, episodes: Episodes) -> list[Task]:
+def _owed(member: Member, episodes: Episodes) -> list[Task]:
     dispatcher = episodes.dispatcher
-    if dispatcher is None or peer.name not in dispatcher.table.participants:
+    if dispatcher is None or member.name not in dispatcher.table.participants:
         return []
-    return dispatcher.outstanding(peer.name)
+    return dispatcher.outstanding(member.name)
 
 
-def _age(peer: Peer, now: int) -> float | None:
-    return None if peer.heard_at is None else _s(now - peer.heard_at)
+def _age(member: Member, now: int) -> float | None:
+    return None if member.heard_at is None else _s(now - member.heard_at)
 
 
 def _s(ns: int) -> float:

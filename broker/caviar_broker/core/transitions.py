@@ -2,7 +2,7 @@
 
 Three machines: the *run*, each *service* in it, and each *task* (one service's part of one
 frame). What is not in a table is not allowed; `step` raises `IllegalTransitionError`, which is a fault
-of the core itself, never of a peer: what peers send out of turn is sorted out before.
+of the core itself, never of a member: what members send out of turn is sorted out before.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ CHATTER = 1024
 class PeerLimits:
     """Limits of a peer: of its memory, messages and connections.
 
-    A peer is any process that connects, also one that is no service of the run (`core.run.Peer` is one that
+    A peer is any process that connects, also one that is no service of the run (`core.run.Member` is one
     is). The defaults are far more than a service needs, unless a scenario's ``[limits]`` differ;
     ``waiting_mib`` there is the memory limit `queued`.
     """
