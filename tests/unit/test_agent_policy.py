@@ -16,7 +16,7 @@ from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.learning.evaluate import evaluate, mean_of, student_95
 from caviar_clients.learning.export import card_of, export_module
 from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.errors import CaviarError, ScenarioError, SetupError
+from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.observations import Moment, Observer, Users
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.reader import recorded_decisions
@@ -247,3 +247,14 @@ def test_a_mean_leaves_out_episodes_without_such_frames() -> None:
     found = mean_of([1.0, float("nan"), 3.0])
     assert (found.mean, found.episodes) == (2.0, 2)
     assert found.half_width == pytest.approx(12.706, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [(".", "is a folder; name the ONNX"), ("taken/p.onnx", "cannot write")]
+)
+def test_an_export_that_cannot_be_written_is_refused(name: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("a file")
+    env = BeamSelectionEnv("geometric")
+    with pytest.raises(RunError, match=expected):
+        export_module(Constant(0), env.observation_space, tmp_path / name, card_of(env))
+    assert (tmp_path / "taken").read_text() == "a file"

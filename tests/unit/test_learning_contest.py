@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from typer.testing import CliRunner
 
+from caviar_clients.cli.learning import evaluate_command
 from caviar_clients.cli.main import app
 from caviar_clients.learning.contest import Contest, episodes_of, made_player
+from caviar_clients.learning.evaluate import evaluate
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
+from caviar_services.agent.policy import CARD_KEY, PolicyCard, write_card
 
 pytestmark = pytest.mark.slow
 
@@ -86,3 +91,71 @@ def test_a_setting_is_written_as_agent_setting_and_value() -> None:
     ended = CliRunner().invoke(app, asked)
     assert ended.exit_code != 0
     assert "write agent, setting and value" in str(ended.exception)
+
+
+def model_of(
+    file: Path, name: str, kind: int, shape: list[int], nodes: list[Any], output: str = "action"
+) -> Path:
+    """Write a model with a card for `geometric`."""
+    onnx = pytest.importorskip("onnx")
+    made = onnx.helper.make_graph(
+        nodes,
+        "policy",
+        [onnx.helper.make_tensor_value_info(name, kind, shape)],
+        [onnx.helper.make_tensor_value_info(output, onnx.TensorProto.INT64, None)],
+    )
+    model = onnx.helper.make_model(made, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    card = PolicyCard(observe=("aod",), codebooks=((64, 1),))
+    onnx.helper.set_model_props(model, {CARD_KEY: write_card(card)})
+    onnx.save(model, str(file))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "shape", "output", "expected"),
+    [
+        ("aod", "DOUBLE", [1, 1], "action", "Unexpected input data type"),
+        ("aod", "FLOAT", [1, 7], "action", r"takes aod \[1, 7\] .* observed is aod \[1, 1\]"),
+        ("aoa", "FLOAT", [1, 1], "action", r"takes aoa \[1, 1\] .* observed is aod"),
+        ("aod", "FLOAT", [1, 1], "beams", "gives beams; .* the output has to be called 'action'"),
+    ],
+)
+def test_a_model_that_does_not_fit_what_is_observed_is_refused(
+    name: str, kind: str, shape: list[int], output: str, expected: str, tmp_path: Path
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    node = onnx.helper.make_node("Cast", [name], [output], to=onnx.TensorProto.INT64)
+    file = model_of(tmp_path / "p.onnx", name, getattr(onnx.TensorProto, kind), shape, [node], output)
+    with pytest.raises(ScenarioError, match=rf"policy p\.onnx .*{expected}.*exported for another scenario\?"):
+        evaluate(file, "geometric", [1000])
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "expected"),
+    [
+        ("INT64", [], "gives 0 numbers of type int64 as 'action', and needed are 1 whole numbers"),
+        ("INT64", [1, 2], "gives 2 numbers of type int64"),
+        ("FLOAT", [math.nan], "gives 1 numbers of type float32"),
+        ("INT64", [-5], "chose pair -5 for uav/rx in frame 0; .* an index from 0 to 63: export it again"),
+        ("INT64", [64], "chose pair 64 for uav/rx in frame 0; .* an index from 0 to 63: export it again"),
+    ],
+)
+def test_a_model_that_gives_no_pair_of_beams_is_refused(
+    kind: str, values: list[float], expected: str, tmp_path: Path
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    tensor = onnx.helper.make_tensor("v", getattr(onnx.TensorProto, kind), [len(values)], values)
+    node = onnx.helper.make_node("Constant", [], ["action"], value=tensor)
+    file = model_of(tmp_path / "p.onnx", "aod", onnx.TensorProto.FLOAT, [1, 1], [node])
+    with pytest.raises(CaviarError, match=expected):
+        evaluate(file, "geometric", [1000])
+
+
+def test_settings_of_what_is_always_compared_with_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="'random' is compared with as it is, without users; name"):
+        evaluate(tmp_path / "p.onnx", "geometric", [1000], against={"random": {"users": "uav/*"}})
+
+
+def test_figures_that_cannot_be_written_are_known_before_the_first_episode(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"cannot write .*: Is a directory"):
+        evaluate_command(tmp_path / "none.onnx", "geometric", json=tmp_path)

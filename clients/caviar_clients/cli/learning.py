@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from caviar_clients.cli.shared import print_line, progress_bar, write_json
+from caviar_clients.cli.shared import print_line, progress_bar, require_writable, write_json
 from caviar_protocol.errors import ScenarioError, SetupError
 from caviar_protocol.host import install_command
 
@@ -196,6 +196,7 @@ def evaluate_command(
 
     rivals: dict[str, dict[str, Any]] = {name: {} for name in (BASELINES if against is None else against)}
     rivals |= _settings_of(settings or [])
+    require_writable(json)
     chosen = range(first_seed, first_seed + seeds)
     console = Console()
     with progress_bar(console, "{task.completed}/{task.total} episodes", transient=True) as bar:

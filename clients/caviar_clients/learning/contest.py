@@ -13,10 +13,11 @@ from typing import Any, Protocol
 
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from caviar_clients.session.connected import agent_of, open_session
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import GrantInput, Input, Status
 from caviar_protocol.observations import Moment, Observer, Users
 from caviar_protocol.scenario import Scenario, ServiceSpec
@@ -53,7 +54,8 @@ class PolicyPlayer:
         called: What errors call it.
 
     Raises:
-        ScenarioError: It was trained for other codebooks, or observes what the scenario does not have.
+        ScenarioError: It was trained for other codebooks, observes what the scenario does not have, or is
+            a model that takes or gives something else.
     """
 
     def __init__(
@@ -71,6 +73,8 @@ class PolicyPlayer:
                 "there"
             )
         self._observer = Observer(scenario, self._users, card.observe)
+        self._called = called
+        self._act({name: np.zeros(b.shape, b.dtype) for name, b in self._observer.bounds.items()})
         self.inputs = (
             Input(topic="scene"),
             Input(topic="link", lag=1, required=False),
@@ -84,14 +88,48 @@ class PolicyPlayer:
         """Its choice for each user, the same on all carriers."""
         scene = frame.scene()
         present = self._users.present(scene)
-        action = self._model.act(self._observer.read(Moment(frame, scene, frame.only("link", Link), present)))
-        chosen = action.tolist()
+        chosen = self._act(self._observer.read(Moment(frame, scene, frame.only("link", Link), present)))
         commands = []
         for place, pair in present:
+            count = self._users.places[place].beam_pairs
+            if not 0 <= chosen[place] < count:
+                raise PayloadError(
+                    f"{self._called} chose pair {chosen[place]} for {pair.rx.name} in frame {frame.number}; "
+                    f"its output 'action' has to be an index from 0 to {count - 1}: export it again"
+                )
             tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
             commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
         commands.sort(key=lambda choice: (choice.rx, choice.tx))
         return StepResult(products={"action": Action(commands=tuple(commands))})
+
+    def _act(self, observation: Mapping[str, NDArray[Any]]) -> list[int]:
+        """Index of a beam pair for each place.
+
+        Raises:
+            ScenarioError: The model cannot be run on what is observed, or gives something else.
+        """
+        try:
+            action = self._model.act(observation)
+        except Exception as error:  # those of ONNX Runtime have no common base
+            takes = (
+                ", ".join(f"{name} {list(shape)}" for name, shape in self._model.inputs.items()) or "nothing"
+            )
+            seen = ", ".join(f"{name} {[1, *value.shape]}" for name, value in observation.items())
+            reason = str(error).partition("\n")[0]
+            raise ScenarioError(
+                f"{self._called} takes {takes} and gives {', '.join(self._model.outputs)}; observed is "
+                f"{seen}, and the output has to be called 'action' ({reason}); was it exported for another "
+                "scenario?"
+            ) from error
+        places = len(self._users)
+        if len(action) != places or not np.issubdtype(action.dtype, np.integer):
+            raise ScenarioError(
+                f"{self._called} gives {len(action)} numbers of type {action.dtype} as 'action', and "
+                f"needed are {places} whole numbers, one for each place of a user; was it exported for "
+                "another scenario?"
+            )
+        chosen: list[int] = action.tolist()
+        return chosen
 
 
 @dataclass(frozen=True)

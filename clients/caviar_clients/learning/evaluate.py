@@ -17,6 +17,7 @@ import numpy as np
 from caviar_clients.learning.contest import Contest, Player, PolicyPlayer, episodes_of, made_player
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import ScenarioError
 from caviar_services.agent.policy import PolicyModel
 
 METHODS = ("policy", "los-beam", "random", "optimum")
@@ -132,10 +133,16 @@ def evaluate(
         ScenarioError: The file is no policy, has no card, or was trained for another codebook; or an agent to
             compare with does not fit the scenario.
     """
-    model = PolicyModel(file, f"policy {file.name}")
+    called = f"policy {file.name or file}"
+    for name, settings in (against or {}).items():
+        if name in METHODS and settings:
+            raise ScenarioError(
+                f"{name!r} is compared with as it is, without {', '.join(settings)}; name another agent"
+            )
+    model = PolicyModel(file, called)
     known = checked_scenario(Path(scenario))
     served = (users,) if isinstance(users, str) else tuple(users)
-    players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, f"policy {file.name}")}
+    players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, called)}
     for name, use in _AGENTS.items():
         players[name] = made_player(known, use, {}, served, agent)
     for name, settings in (against or {}).items():

@@ -19,8 +19,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from caviar_clients.envs.base import BeamSelectionEnv
+from caviar_clients.files import make_folder_of, writing
 from caviar_clients.learning.recorded import RecordedBeamsEnv
-from caviar_protocol.errors import SetupError
+from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_services.agent.policy import ACTION, CARD_KEY, PolicyCard, PolicyModel, write_card
@@ -75,6 +76,7 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
         The card, as it stands in the file.
 
     Raises:
+        RunError: The file cannot be written.
         SetupError: A package is missing, or the exported policy chooses otherwise than the model.
 
     Example:
@@ -127,6 +129,7 @@ def export_module(
         The card.
 
     Raises:
+        RunError: The file cannot be written.
         SetupError: A package is missing, or the exported policy chooses otherwise.
     """
     try:
@@ -136,6 +139,9 @@ def export_module(
         raise SetupError(
             f"policies are exported by PyTorch and onnx; run: {install_command('learning')}"
         ) from error
+    make_folder_of(file)
+    if file.is_dir():
+        raise RunError(f"{file} is a folder; name the ONNX file that is written")
     module = module.eval().cpu()
     shapes = {name: space[name].shape or () for name in card.observe}
     example = tuple(torch.zeros((1, *shape), dtype=torch.float32) for shape in shapes.values())
@@ -157,7 +163,8 @@ def export_module(
         made = Path(folder) / file.name
         onnx.save(model, str(made))
         _check(PolicyModel(made), module if choose is None else choose, space, card)
-        replace_file(file, made.read_bytes())
+        with writing(file):
+            replace_file(file, made.read_bytes())
     return card
 
 
