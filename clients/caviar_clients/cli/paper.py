@@ -6,7 +6,8 @@ calls `report`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +15,8 @@ import typer
 from rich.console import Console
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from caviar_clients.paper.comparison import Comparison
 
 app = typer.Typer(no_args_is_help=True, help="The paper's experiments: figures and tables beside its own.")
@@ -107,3 +110,114 @@ def radio_strike(
         picture = draw(found, out / "radiostrike.png")
     tables = comparisons(found, settings)
     report(console, "Radio-Strike", tables, [picture], "radiostrike", out, figures_of(found))
+
+
+@app.command("fig8")
+def fig8(
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="of each training: 1, 2, …")] = 5,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(help="geometric, quasi-static or munich; may be repeated; by default all"),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="two seeds, a fifteenth of the steps: to see that it works")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="trainings at a time; by default as many as there are cores")
+    ] = None,
+    out: Out = FOLDER,
+) -> None:
+    """Fig. 8, beams for a UAV: DQN as in the paper and tuned, los-beam, optimum, LOS and NLOS apart."""
+    from caviar_clients.cli.learning import cores
+    from caviar_clients.cli.shared import counted, print_line, require_installed, require_known
+    from caviar_clients.files import require_folder, reserved
+    from caviar_clients.paper.fig8 import CHANNELS, Settings, done_seeds, experiment
+    from caviar_clients.paper.fig8_figure import draw
+    from caviar_clients.paper.fig8_tables import comparisons, figures_of
+
+    require_folder("--out", out, "pictures, tables and figures")
+    for one in channel or ():
+        require_known("--channel", one, CHANNELS)
+    require_installed("the experiment", ("learning", "plot"))
+    name = "fig8-quick" if quick else "fig8"
+    channels = tuple(one for one in CHANNELS if not channel or one in channel)
+    settings = Settings(folder=out / name, seeds=seeds, channels=channels, jobs=jobs or cores())
+    settings = settings.quick() if quick else settings
+    console = Console()
+    with reserved(out / f"{name}.md", out / f"{name}.json"):
+        try:
+            with _time_left(console) as show:
+                found = experiment(settings, show)
+        except KeyboardInterrupt:
+            done = done_seeds(settings)
+            print_line(console, f"stopped with {counted(done, 'training')} done; the same command goes on")
+            raise
+        label = "quick form, of which little can be concluded" if quick else ""
+        pictures = draw(found, out, name, label)
+    title = "Fig. 8 of the paper" + (f": {label}" if label else "")
+    print_line(console, title, "yellow" if quick else "bold")
+    report(console, title, comparisons(found), pictures, name, out, figures_of(found))
+
+
+@contextmanager
+def _time_left(console: Console) -> Iterator[Callable[[str, float], None]]:
+    """Show a bar with the time left.
+
+    Args:
+        console: Where.
+
+    Yields:
+        What takes a text, and the share of the work that is done.
+    """
+    from rich.progress import TimeRemainingColumn
+
+    from caviar_clients.cli.shared import progress_bar
+
+    tasks: list[TaskID] = []
+    with progress_bar(console, TimeRemainingColumn(), transient=True) as bar:
+
+        def show(what: str, share: float) -> None:
+            if not tasks:
+                tasks.append(bar.add_task(what, total=1.0))
+                # What an earlier call has done says nothing about the time left.
+                bar.reset(tasks[0], completed=share)  # type: ignore[arg-type]  # of Rich: any number
+            bar.update(tasks[0], description=what, completed=share)
+
+        yield show
+
+
+_SCENES = "scenario, by name or file, or directory of a run that recorded `scene`"
+Scenes = Annotated[Path, typer.Argument(help=_SCENES)]
+TableFrames = Annotated[int, typer.Option(min=1, max=10_000, help="scenes, spread over the episode")]
+Minutes = Annotated[float, typer.Option(min=0.1, help="time for measuring")]
+
+
+@app.command("table3")
+def table3(
+    source: Scenes = Path("street-canyon"),
+    frames: TableFrames = 12,
+    minutes: Minutes = 12.0,
+    out: Out = FOLDER,
+) -> None:
+    """Table 3: time of ray tracing by ray spacing, with and without diffuse scattering (caviar tradeoff)."""
+    _tradeoff("table3", "spacing", source, frames, minutes, out)
+
+
+@app.command("table4")
+def table4(
+    source: Scenes = Path("street-canyon"),
+    frames: TableFrames = 12,
+    minutes: Minutes = 12.0,
+    out: Out = FOLDER,
+) -> None:
+    """Table 4: time of ray tracing by the elements of the arrays (caviar tradeoff)."""
+    _tradeoff("table4", "arrays", source, frames, minutes, out)
+
+
+def _tradeoff(name: str, part: str, source: Path, frames: int, minutes: float, out: Path) -> None:
+    from caviar_clients.cli.measure import trade, tradeoff_options
+    from caviar_clients.files import require_folder
+
+    require_folder("--out", out, "tables and pictures")
+    options = tradeoff_options(None, None, None, 2, minutes, [part])
+    trade(source, frames, options, out / name / "tradeoff.json", out / name, Console())

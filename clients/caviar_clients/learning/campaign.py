@@ -1,4 +1,4 @@
-"""All seeds of an experiment, several at a time, each in a process of its own; and the experiment's folder.
+"""All seeds of experiments, several at a time, each in a process of its own; and an experiment's folder.
 
 The folder has what the experiment was begun with, and a folder for each seed
 (`caviar_clients.learning.training`). A second call goes on where the first one ended, however it ended.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import multiprocessing
 import multiprocessing.connection
 import os
+import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -67,19 +69,60 @@ def train_experiment(
         ScenarioError: Environment or algorithm do not go with the options.
         SetupError: The extra ``learning`` is not installed.
     """
-    folder = prepare_folder(experiment, root)
-    seeds = experiment.experiment.seeds
-    left = [seed for seed in seeds if read_result(folder, seed) is None]
-    for seed in seeds:
-        if seed not in left:
-            report(Progress(seed=seed, steps=experiment.experiment.steps))
+    (found,) = train_experiments([experiment], root, jobs, lambda _, progress: report(progress))
+    return found
+
+
+def train_experiments(
+    experiments: Sequence[Experiment],
+    root: Path,
+    jobs: int = 1,
+    report: Callable[[str, Progress], None] = lambda name, progress: None,
+    keep_checkpoints: bool = True,
+) -> list[list[SeedResult]]:
+    """Train all seeds of several experiments, or go on with those that are left.
+
+    Args:
+        experiments: What is trained, in this order.
+        root: Folder in which those of the experiments are made.
+        jobs: Seeds at a time, of whatever experiments. 1: in this process; else each in a process of its own.
+        report: Called with the name of an experiment and the progress of a seed, a few times a second.
+        keep_checkpoints: Whether the last checkpoint of a seed stays when its policy is there; it has the
+            replay buffer, some 30 MB.
+
+    Returns:
+        What each seed led to, by experiment, in the order of its seeds.
+
+    Raises:
+        RunError: A folder was begun with other values, or a seed failed; the text says which.
+        ScenarioError: Environment or algorithm do not go with the options.
+        SetupError: The extra ``learning`` is not installed.
+    """
+    left: list[_Training] = []
+    for experiment in experiments:
+        folder, subject = prepare_folder(experiment, root), experiment.experiment
+        for seed in subject.seeds:
+            if read_result(folder, seed) is None:
+                left.append(_Training(experiment, seed, folder))
+            else:
+                report(subject.name, Progress(seed=seed, steps=subject.steps))
+
+    def done(training: _Training) -> None:
+        if not keep_checkpoints:
+            shutil.rmtree(seed_folder(training.folder, training.seed) / CHECKPOINTS, ignore_errors=True)
+
     if jobs == 1 or len(left) < 2:
-        for seed in left:
-            train_seed(experiment, seed, folder, report)
+        for one in left:
+            train_seed(one.experiment, one.seed, one.folder, partial(report, one.name))
+            done(one)
     else:
-        _train_in_processes(experiment, folder, left, jobs, report)
-    found = [read_result(folder, seed) for seed in seeds]
-    return [result for result in found if result is not None]
+        _train_in_processes(left, jobs, report, done)
+    found = []
+    for experiment in experiments:
+        folder = root / experiment.experiment.name
+        results = (read_result(folder, seed) for seed in experiment.experiment.seeds)
+        found.append([result for result in results if result is not None])
+    return found
 
 
 def prepare_folder(experiment: Experiment, root: Path) -> Path:
@@ -154,35 +197,53 @@ def _differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
 # --- processes ------------------------------------------------------------------------------------------
 
 
+class _Training(NamedTuple):
+    """The training of a seed."""
+
+    experiment: Experiment
+    seed: int
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return self.experiment.experiment.name
+
+
 def _train_in_processes(
-    experiment: Experiment, folder: Path, seeds: Sequence[int], jobs: int, report: Report
+    trainings: Sequence[_Training],
+    jobs: int,
+    report: Callable[[str, Progress], None],
+    done: Callable[[_Training], None],
 ) -> None:
-    waiting, running = list(seeds), dict[Connection, Any]()
+    waiting, running = list(trainings), dict[Connection, tuple[_Training, Any]]()
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
-                pipe, process = _start(experiment, folder, waiting.pop(0))
-                running[pipe] = process
+                training = waiting.pop(0)
+                pipe, process = _start(training)
+                running[pipe] = training, process
             ready = multiprocessing.connection.wait(list(running))
             for pipe in [pipe for pipe in running if pipe in ready]:
-                if not _take(pipe, report):
-                    process = running.pop(pipe)
+                training = running[pipe][0]
+                if not _take(pipe, partial(report, training.name)):
+                    _, process = running.pop(pipe)
                     process.join()
                     if process.exitcode:
                         raise RunError(_cause(process.exitcode))
+                    done(training)
     finally:
-        for process in running.values():
+        for _, process in running.values():
             process.terminate()
-        for process in running.values():
+        for _, process in running.values():
             process.join(_GOODBYE_S)
             if process.is_alive():
                 process.kill()
 
 
-def _start(experiment: Experiment, folder: Path, seed: int) -> tuple[Connection, Any]:
+def _start(training: _Training) -> tuple[Connection, Any]:
     context = multiprocessing.get_context("spawn")  # what is forked has the threads of PyTorch no more
     pipe, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(theirs, experiment, seed, folder), daemon=True)
+    process = context.Process(target=_serve, args=(theirs, *training), daemon=True)
     process.start()
     theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
     return pipe, process
