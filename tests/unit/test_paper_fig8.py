@@ -37,7 +37,7 @@ pytest.importorskip("onnxruntime")
 
 pytestmark = pytest.mark.slow
 
-TINY = 1e-4  # of the steps: 3 and 30
+TINY = 0.01  # of the steps: 300 and 3,000
 TUNED, ANGLE, DEFAULTS = "DQN, tuned", "DQN, tuned, angle alone", "DQN, defaults"
 
 
@@ -166,7 +166,7 @@ def test_the_same_seeds_lead_to_the_same_figures_elsewhere(
 
 def test_a_folder_of_other_steps_or_another_scenario_is_refused(settings: Settings, report: Report) -> None:
     del report  # has filled the folder
-    with pytest.raises(RunError, match=r"was begun with other values: .*experiment\.steps was 3 and is 6"):
+    with pytest.raises(RunError, match=r"begun with other values: .*experiment\.steps was 300 and is 600"):
         experiment(replace(settings, share=2 * TINY, channels=("geometric",)))
     copy = settings.folder / "geometric-quasi-static.toml"
     text = copy.read_text()
@@ -251,7 +251,7 @@ def test_the_quick_form_says_so_wherever_it_is_shown(tmp_path: Path, monkeypatch
     assert "quick form" in done.output
     assert "6.81" in done.output
     assert "quick form" in (tmp_path / "fig8-quick.md").read_text()
-    assert json.loads((tmp_path / "fig8-quick.json").read_text())["steps"] == {"geometric-defaults": 3}
+    assert json.loads((tmp_path / "fig8-quick.json").read_text())["steps"] == {"geometric-defaults": 300}
     assert (tmp_path / "fig8-quick-geometric.png").is_file()
 
 
