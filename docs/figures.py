@@ -137,6 +137,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "cell.md",
         {"cell-times": "Times"},
     ),
+    "policy": Measurement(
+        "python tests/bench/bench_policy.py --rounds 1 --markdown {out}/policy.md",
+        "python tests/bench/bench_policy.py --markdown {out}/policy.md",
+        "policy.md",
+        {"policy-times": ""},
+    ),
     "wideband": Measurement(
         "python tests/bench/bench_wideband.py --sionna --frames 5 --markdown {out}/wideband.md",
         "python tests/bench/bench_wideband.py --sionna --markdown {out}/wideband.md",

@@ -31,6 +31,7 @@ from caviar_broker.control.socket import locked, refuse_second_broker
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.event_loop import call_with_timeout, raise_priority
 from caviar_broker.journal import CheckpointFiles, JournalFile
+from caviar_broker.policies import given_policies
 from caviar_broker.resume import ResumeState, read_resumption
 from caviar_broker.run_record import (
     RunRecord,
@@ -115,7 +116,11 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     beside = _http_process(arguments, directory)
     plan = replace(plan_run(scenario, record.run, briefings(scenario, directory)), epoch=record.epoch)
     store = AssetStore()
-    plan = replace(with_replay(plan, scenario.replay), patterns=pattern_files(scenario, store))
+    plan = replace(
+        with_replay(plan, scenario.replay),
+        patterns=pattern_files(scenario, store),
+        policies=given_policies(scenario, store, directory),
+    )
     durability = record.scenario.run.durability
     # Under every durability but `none` a state is on the disk before an older one is removed.
     checkpoints = CheckpointFiles(directory, durable=durability != "none")

@@ -103,8 +103,10 @@ class BrokerServer:
         # [s] for which the disk had taken nothing at the last notice; 0: it takes what comes.
         self._disk_told = 0.0
         self._sign = SignOfLife()
+        self.store = store or AssetStore()
+        """Where files that services fetch are kept."""
         self._assets = AssetExchange(
-            store=store or AssetStore(),
+            store=self.store,
             clock=self.clock,
             feed=self.feed,
             reply=self._reply,

@@ -41,8 +41,8 @@ TOKENS = "tokens.toml"
 KEY_VARIABLE, BROKER_KEY_VARIABLE = "CAVIAR_KEY", "CAVIAR_BROKER_KEY"
 """Environment variables with the paths of a service's secret key and of its broker's public one."""
 ROLES: tuple[str, ...] = get_args(Role)
-VIEWER, OPERATOR = "viewer", "operator"
-TOKEN_ROLES = (VIEWER, OPERATOR, *ROLES)
+VIEWER, OPERATOR, TRAINER = "viewer", "operator", "trainer"
+TOKEN_ROLES = (VIEWER, OPERATOR, TRAINER, *ROLES)
 """What the holder of a token may be over HTTP."""
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
@@ -87,18 +87,19 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     name: Name
     """Of the user that holds it, or of the service that it is for."""
     role: str
-    """``viewer`` may read, ``operator`` may also pause, step and stop; a role of a service, such as
-    ``agent``, may take part through the gateway under that name and in that role, and nothing else."""
+    """``viewer`` may read, ``operator`` may also give every order, ``trainer`` may read and give agents other
+    policies; a role of a service, such as ``agent``, may take part through the gateway under that name and in
+    that role, and nothing else."""
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     """Of the token's text; the token itself is written nowhere."""
 
     def may(self, role: str) -> bool:
-        """Whether the token is good for what a viewer or an operator does.
+        """Whether the token is good for what a viewer, a trainer or an operator does.
 
         Args:
-            role: `VIEWER` or `OPERATOR`.
+            role: `VIEWER`, `TRAINER` or `OPERATOR`.
         """
-        return self.role == OPERATOR or self.role == role
+        return self.role in (OPERATOR, role) or (role == VIEWER and self.role == TRAINER)
 
     @property
     def of_service(self) -> bool:

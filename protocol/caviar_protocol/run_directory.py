@@ -41,6 +41,11 @@ class RunDirectory:
         return self.path / "checkpoints"
 
     @property
+    def policies(self) -> Path:
+        """Folder of the trained policies that agents of the run were given, a folder for each agent."""
+        return self.path / "policies"
+
+    @property
     def events(self) -> Path:
         """Notices of the run, one JSON object a line."""
         return self.path / "events.jsonl"

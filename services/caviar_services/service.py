@@ -14,7 +14,7 @@ same episode, and continues with the same bytes (`checkpoint` makes bytes of a s
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
@@ -118,6 +118,8 @@ class Preparation:
     """Files of scenery by name; all are in one local folder, at their names as relative paths."""
     producers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Topic to its sources in this run."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Files of `Service.own_files`, by SHA-256."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +223,28 @@ class Service(ABC, Generic[S]):
         """Whether the assets of the run are fetched before `prepare`: where the class uses scenery, or what
         it is to do in this run needs files."""
         return self.uses_scenery
+
+    @property
+    def own_files(self) -> Sequence[str]:
+        """SHA-256 of files for this service alone, which are fetched from the broker before `prepare`."""
+        return ()
+
+    def wanted_files(self, decisions: Mapping[str, str]) -> Sequence[str]:
+        """SHA-256 of files that are fetched from the broker beside the frames, for `take_file`.
+
+        Args:
+            decisions: Of a GRANT, after its frame was computed.
+        """
+        return ()
+
+    def take_file(self, digest: str, path: Path | None, reason: str) -> None:  # optional hook
+        """Take a file of `wanted_files`, between two frames.
+
+        Args:
+            digest: Its SHA-256.
+            path: Where it is; None: it could not be fetched.
+            reason: Why not.
+        """
 
     @property
     def parts(self) -> Mapping[str, frozenset[str]]:

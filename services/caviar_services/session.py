@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from caviar_protocol import messages as m
@@ -37,6 +39,7 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
+from caviar_services.own_files import OwnFiles
 from caviar_services.service import Frame, Preparation, Progress, Service, StepResult, no_progress
 
 _log = logging.getLogger("caviar.service")
@@ -109,9 +112,12 @@ class ServiceSession:
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}  # epoch and attempt, which stand in every message (clause 1)
         self._reset_to: m.Reset | None = None
+        # The service's own files, by digest.
+        self._found: dict[str, Path] = {}
         # When free memory is given back next [s].
         self._trim_at = 0.0
         self._fetch: _Fetch | None = None
+        self._files = OwnFiles(store, send, fetch_timeout_s)
         self._handlers: Mapping[type, Callable[[Any, Sequence[Any], float], None]] = {
             m.Welcome: self._welcome,
             m.Prepare: self._prepare,
@@ -143,7 +149,8 @@ class ServiceSession:
     @property
     def deadline(self) -> float | None:
         """When `expire` is due, on the clock of ``now`` [s]; None while nothing is awaited."""
-        return None if self._fetch is None else self._fetch.deadline
+        fetch = None if self._fetch is None else self._fetch.deadline
+        return min((d for d in (fetch, self._files.deadline) if d is not None), default=None)
 
     def hello(self, host: str = "", pid: int = 0) -> m.Hello:
         """HELLO, with which a service joins.
@@ -201,6 +208,7 @@ class ServiceSession:
 
     def expire(self, now: float) -> None:
         """Report the scenery that has not come by `deadline`."""
+        self._files.expire(now)
         fetch = self._fetch
         if fetch is None or now < fetch.deadline:
             return
@@ -246,12 +254,37 @@ class ServiceSession:
             offered = [self._store.add(name, content) for name, content in sorted(service.scenery().items())]
             if offered:
                 self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())
-            if service.needs_assets:
-                # By content, not by name: what an earlier run fetched is not fetched again.
-                missing = [asset for asset in order.assets if not self._store.holds(asset)]
-                self._fetch_assets(_Fetch(order, missing, len(missing)), now)
+            self._found = {}
+            if own := service.own_files:
+                self._files.fetch(own, partial(self._own_file, order, offered, len(own)), now)
             else:
-                self._load(order, offered)
+                self._fetch_scenery(order, offered, now)
+
+    def _own_file(
+        self,
+        order: m.Prepare,
+        offered: Sequence[m.Asset],
+        count: int,
+        digest: str,
+        path: Path | None,
+        reason: str,
+        now: float,
+    ) -> None:
+        """Take one of the service's own files; with the last one go on preparing."""
+        with self._reporting("prepare"):
+            if path is None:
+                raise AssetError(reason)
+            self._found[digest] = path
+            if len(self._found) == count:
+                self._fetch_scenery(order, offered, now)
+
+    def _fetch_scenery(self, order: m.Prepare, offered: Sequence[m.Asset], now: float) -> None:
+        if self.running.needs_assets:
+            # By content, not by name: what an earlier run fetched is not fetched again.
+            missing = [asset for asset in order.assets if not self._store.holds(asset)]
+            self._fetch_assets(_Fetch(order, missing, len(missing)), now)
+        else:
+            self._load(order, offered)
 
     def _fetch_assets(self, fetch: _Fetch, now: float) -> None:
         """Ask the broker for the next chunk that this machine does not hold yet (clause 4), or load."""
@@ -268,6 +301,9 @@ class ServiceSession:
         self._send(m.AssetGet(digest=fetch.asset.digest, offset=fetch.incoming.offset), ())
 
     def _asset_data(self, data: m.AssetData, parts: Sequence[Any], now: float) -> None:
+        if data.digest == self._files.awaited:
+            self._files.data(data, parts[0], now)
+            return
         fetch, self._fetch = self._fetch, None
         if fetch is None or fetch.incoming is None:
             self._unexpected(data, "no asset was asked for")
@@ -280,7 +316,9 @@ class ServiceSession:
                 fetch.incoming = None
             self._fetch_assets(fetch, now)
 
-    def _error(self, error: m.Error, _: Sequence[Any], __: float) -> None:
+    def _error(self, error: m.Error, _: Sequence[Any], now: float) -> None:
+        if error.subject and error.subject == self._files.awaited:
+            self._files.fail(error.message, now)
         fetch = self._fetch
         if fetch is not None and error.subject == fetch.asset.digest:
             self._fetch = None
@@ -290,7 +328,9 @@ class ServiceSession:
     def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
         files = self._store.folder_of(assets) if assets else {}
         demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
-        prepared = self.running.prepare(Preparation(demand=demand, assets=files, producers=order.producers))
+        prepared = self.running.prepare(
+            Preparation(demand=demand, assets=files, producers=order.producers, files=self._found)
+        )
         self._ready(
             m.Ready(
                 **self._identity,
@@ -345,12 +385,17 @@ class ServiceSession:
             self._send(*kept)
         else:
             self._unexpected(grant, f"frame {grant.frame} was answered long ago")
+        if grant.decisions and (wanted := self.running.wanted_files(grant.decisions)):
+            self._files.fetch(wanted, self._wanted_file, now)
         if grant.frame % TRIM_EVERY == TRIM_EVERY - 1:
             with self._reporting("release", grant.episode, grant.frame):
                 self.running.release_memory()
                 if self._tunes_memory and now >= self._trim_at:
                     trim_memory()
                     self._trim_at = now + TRIM_S
+
+    def _wanted_file(self, digest: str, path: Path | None, reason: str, _: float) -> None:
+        self.running.take_file(digest, path, reason)
 
     def compute(self, frame: Frame) -> StepResult | None:
         """Have the service compute a frame that no GRANT granted: in one process, without a clock.

@@ -22,6 +22,8 @@ from caviar_broker.control.socket import ControlSocket
 from caviar_broker.core import events as ev
 from caviar_broker.server import BrokerServer, Observer
 from caviar_broker.statistics import Statistics
+from caviar_protocol.errors import AssetError
+from caviar_protocol.policies import PolicyFolder
 
 MAX_REQUEST = 1 << 12
 """[B] of a request."""
@@ -56,6 +58,7 @@ class ControlServer:
     def __init__(self, directory: Path, observer: Observer) -> None:
         # Before the broker itself exists: a second broker is refused before it touches anything of the run.
         self._place = ControlSocket(directory)
+        self._given = PolicyFolder(directory)
         self._observer = observer
         self._server: BrokerServer | None = None
         self._callers: dict[int, _Caller] = {}
@@ -70,6 +73,8 @@ class ControlServer:
             "resume": lambda _: self._ordered(ev.ResumeRequested(), "the run goes on"),
             "step": self._step,
             "stop": self._stop,
+            "policies": self._policies,
+            "swap": self._swap,
             "gateway": self._gateway,
             "serving": self._note_serving,
             "note": self._note,
@@ -224,6 +229,27 @@ class ControlServer:
         if not isinstance(reason, str) or len(reason) > 500:
             return _refusal("reason is a text of at most 500 characters")
         return self._ordered(ev.StopRequested(reason), "")
+
+    def _policies(self, _: Mapping[str, Any]) -> Answer:
+        return {"ok": True, "policies": msgspec.to_builtins(self.server.clock.policies)}
+
+    def _swap(self, request: Mapping[str, Any]) -> Answer:
+        """Announce a policy that was put into the run's directory to the agent that shall serve it."""
+        agent, digest = request.get("agent"), request.get("sha256")
+        if not isinstance(agent, str) or agent not in self.server.clock.policies:
+            known = ", ".join(self.server.clock.policies) or "none"
+            return _refusal(f"agent is {agent!r:.80}; agents that serve policies: {known}")
+        path = self._given.files(agent).get(str(digest))
+        if path is None:
+            return _refusal(f"sha256 is {digest!r:.80}, and there is no such file in policies/{agent}")
+        try:
+            found = self.server.store.add(f"policies/{agent}.onnx", path)
+        except AssetError as error:
+            return _refusal(str(error))
+        if found.digest != digest:
+            return _refusal(f"{path} has the SHA-256 {found.digest}: it was changed")
+        text = f"policy {found.digest[:12]}… is offered to {agent}"
+        return self._ordered(ev.PolicyOffered(agent, found.digest), text)
 
     def _ordered(self, event: ev.Event, text: str) -> Answer:
         if self.server.outcome is not None or self.server.clock.over:

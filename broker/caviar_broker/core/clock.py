@@ -14,7 +14,7 @@ Real time is one such shell, the embedded run and the tests in virtual time are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from caviar_broker.core import events as ev
@@ -23,6 +23,7 @@ from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.membership import Liveness, Registration
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.policy_swaps import PolicyState
 from caviar_broker.core.run import Member, Resumption, Run, Snapshot
 from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.transitions import RunState, ServiceState
@@ -66,6 +67,7 @@ class FrameClock:
             ev.Progressed: self._liveness.handle_heartbeat,
             ev.Lost: self._liveness.handle_loss,
             ev.ByeReceived: self._liveness.handle_bye,
+            ev.PolicyOffered: lambda event, now: self._run.swaps.offer(event.service, event.digest),
             ev.StopRequested: self._stop_requested,
             ev.PauseRequested: self._episodes.handle_pause,
             ev.ResumeRequested: self._episodes.handle_pause,
@@ -150,6 +152,11 @@ class FrameClock:
         self._run.fail(event.reason, "", now)
 
     # --- what can be asked -------------------------------------------------------------------------
+
+    @property
+    def policies(self) -> Mapping[str, PolicyState]:
+        """Agents that serve policies, and which."""
+        return {agent: self._run.swaps.state(agent) for agent in self._run.swaps.agents}
 
     @property
     def state(self) -> RunState:

@@ -174,6 +174,10 @@ class Episodes:
                 counts=message.counts,
                 measured=message.measured,
             )
+        if member.name in run.plan.policies:
+            news = run.swaps.note(member.name, message.decisions, message.frame)
+            if news:
+                run.notice("note", member.name, news, message.frame)
         if message.seed >= 0:
             self._choose_seed(member, message, dispatcher, now)
         # Before the answer is taken: that forgets the order it answers.
@@ -343,6 +347,8 @@ class Episodes:
         run, member = self._run, self._run.members[order.service]
         # A replay imposes what was recorded; what a service chose before its restart goes before that.
         decisions = run.plan.imposed.get((order.service, run.episode, order.frame), {})
+        if order.service in run.plan.policies:
+            decisions = {**run.swaps.announced(order.service), **decisions}
         grant = Grant(
             epoch=run.plan.epoch,
             attempt=member.attempt,

@@ -88,6 +88,13 @@ class CheckpointReceived(msgspec.Struct, frozen=True):
     state: Any
 
 
+class PolicyOffered(msgspec.Struct, frozen=True):
+    """A user gives an agent another policy; the asset store holds the file."""
+
+    service: str
+    digest: str
+
+
 class Violated(msgspec.Struct, frozen=True):
     """A service sent what it may not, and no answer would mend it."""
 
@@ -148,7 +155,7 @@ class StepRequested(msgspec.Struct, frozen=True):
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
     | CheckpointReceived | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
-    | PauseRequested | ResumeRequested | StepRequested
+    | PauseRequested | ResumeRequested | StepRequested | PolicyOffered
 )  # fmt: skip
 
 

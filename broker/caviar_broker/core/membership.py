@@ -71,7 +71,7 @@ class Registration:
                 heartbeat_ns=run.plan.timeouts.heartbeat,
                 liveness_ns=run.plan.timeouts.liveness,
                 seed=run.plan.seed,
-                settings=dict(member.plan.settings),
+                settings=run.swaps.settings(member.name, member.plan.settings),
                 scenario=dict(member.plan.scenario),
                 rejoin_ns=self._held_open(member, event.local),
             ),

@@ -146,6 +146,8 @@ class RunPlan:
     """Where the scenario was read from, to name the lines of what services find wrong in it."""
     patterns: tuple[PatternFile, ...] = ()
     """Pattern files that the scenario names, each once; the broker offers those that no world does."""
+    policies: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """SHA-256 of the policies that agents were given, by name, the scenario's first (`policy_swaps`)."""
     checkpoint_frames: int = 0
     """Frames after which a service that can do so saves its state; 0: never."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)

@@ -11,6 +11,7 @@ from caviar_broker.core.decisions import Ledger, Task
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.plan import RunPlan, ServicePlan, Timeouts, duration
+from caviar_broker.core.policy_swaps import PolicySwaps
 from caviar_broker.core.transitions import (
     PRESENT,
     RUN,
@@ -230,6 +231,7 @@ class Run:
         self.finished_before = 0
         """Frames of the episodes that are over."""
         self.gate = PauseGate()
+        self.swaps = PolicySwaps(plan.policies)
         self.ledger = Ledger(kept=not plan.ephemeral)
         self.over = False
         """Whether the run has ended, although services may still be leaving."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
@@ -17,9 +18,11 @@ from caviar_broker.control.server import MAX_STEPS
 from caviar_broker.control.socket import Ask, RequestRefusedError
 from caviar_broker.http.auth import Tokens, foreign, token_of
 from caviar_broker.http.gateway import Gateway
+from caviar_broker.policies import awaited_outcome, offer_policy
 from caviar_protocol.errors import RunError
-from caviar_protocol.keys import OPERATOR, VIEWER
+from caviar_protocol.keys import OPERATOR, TRAINER, VIEWER
 from caviar_protocol.messages import PROTOCOL_VERSION
+from caviar_protocol.policies import MAX_POLICY
 
 # Version of the text format that every Prometheus reads; it makes no use of OpenMetrics.
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -120,8 +123,9 @@ ORDERS = {
 """Requests that change the run, and need no parameters."""
 ABOUT = """Look at a running CAVIAR broker, and have it pause, step or stop.
 
-Where there are tokens, `Authorization: Bearer TOKEN` is asked for: a *viewer* may read, an *operator* may
-give orders too. `/ws` is the WebSocket gateway (protocol/SPEC.md, section WebSocket)."""
+Where there are tokens, `Authorization: Bearer TOKEN` is asked for: a *viewer* may read, a *trainer* may
+also give agents other policies, an *operator* may give every order. `/ws` is the WebSocket gateway
+(protocol/SPEC.md, section WebSocket)."""
 READY = ("resetting", "running", "stopping")
 _bearer = HTTPBearer(auto_error=False, description="token of caviar keys token")
 
@@ -148,11 +152,12 @@ class LocalOnly:
             await self._app(scope, receive, send)
 
 
-def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
+def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> FastAPI:
     """Build the application.
 
     Args:
         ask: Asks the broker.
+        directory: Of the run, where policies are put.
         tokens: Which requests are allowed; without any, all from this machine.
         gateway: Serves ``/ws``.
     """
@@ -165,6 +170,7 @@ def make_app(ask: Ask, tokens: Tokens, gateway: Gateway) -> FastAPI:
     operator = [Depends(_bearer), Depends(_may(OPERATOR, tokens))]
     _questions(app, ask, gateway, viewer)
     _orders(app, ask, operator)
+    _policies(app, directory, [Depends(_bearer), Depends(_may(TRAINER, tokens))])
     _probes(app, ask)
 
     @app.websocket("/ws")
@@ -219,6 +225,29 @@ def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
     ) -> Any:
         """End the run in order: every service gets SHUTDOWN."""
         return _state(await ask(do="stop", reason=reason))
+
+
+def _policies(app: FastAPI, directory: Path, trainer: list[Any]) -> None:
+    done = _example("swap") | {409: {"description": "the agent, or the broker, refuses it"}}
+
+    @app.post("/policies/{agent}", dependencies=trainer, responses=done)
+    async def swap(
+        agent: str,
+        request: Request,
+        wait: Annotated[float, Query(ge=0, le=60, description="[s] for the agent to take it")] = 10.0,
+    ) -> Any:
+        """Give an agent of the kind `policy` another policy: the body is its ONNX file. Answers once a frame
+        was decided by it, or after `wait`; the run goes on meanwhile."""
+        content = bytearray()
+        async for chunk in request.stream():
+            content += chunk
+            if len(content) > MAX_POLICY:
+                raise HTTPException(413, f"a policy may have {MAX_POLICY} B")
+        name, digest = await asyncio.to_thread(offer_policy, directory, agent, bytes(content))
+        found = await asyncio.to_thread(awaited_outcome, directory, name, digest, wait)
+        if found["state"] == "refused":
+            raise HTTPException(409, found["reason"])
+        return {"agent": name, "sha256": digest, "state": found["state"], "frame": found["frame"]}
 
 
 def _probes(app: FastAPI, ask: Ask) -> None:

@@ -143,7 +143,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         notices.add(task)
         task.add_done_callback(notices.discard)
 
-    server = http_server(make_app(ask, tokens, gateway), notify_soon, own_process=True)
+    server = http_server(make_app(ask, run, tokens, gateway), notify_soon, own_process=True)
 
     def end() -> None:
         server.should_exit = True

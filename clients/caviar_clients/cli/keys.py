@@ -101,7 +101,11 @@ def revoke(
 def token(
     name: Annotated[str, typer.Argument(help="of who gets it", show_default=False)],
     role: Annotated[
-        str, typer.Option(help="viewer: look on; operator: also pause, step, stop; or the role of a service")
+        str,
+        typer.Option(
+            help="viewer: look on; operator: also give orders; trainer: look on and swap policies; "
+            "or the role of a service"
+        ),
     ] = k.VIEWER,
     directory: Directory = DEFAULT,
 ) -> None:

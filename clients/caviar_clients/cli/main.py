@@ -212,6 +212,21 @@ def why(
 
 
 @app.command(rich_help_panel=OPERATE)
+def swap(
+    policy: Annotated[Path, typer.Argument(help="ONNX file of the policy", show_default=False)],
+    run: Annotated[
+        Path | None, typer.Option(help="directory of the run; by default the newest in ./runs")
+    ] = None,
+    agent: Annotated[str, typer.Option(help="name of the agent; may be left out where there is one")] = "",
+    wait: Annotated[float, typer.Option(help="[s] for the agent to take it", min=0)] = 30.0,
+) -> None:
+    """Give an agent of a running run another policy; the run goes on meanwhile."""
+    from caviar_clients.cli.remote import swap_command
+
+    swap_command(policy, run, agent, wait)
+
+
+@app.command(rich_help_panel=OPERATE)
 def doctor(
     run: Annotated[Path | None, typer.Argument(help="directory of a damaged run", show_default=False)] = None,
 ) -> None:

@@ -24,6 +24,7 @@ from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import NO_BROKER
+from caviar_broker.policies import given_policies
 from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.files import make_folder_of
@@ -162,6 +163,7 @@ class EmbeddedRun:
             ephemeral=directory is None,
             imposed=imposed,
             patterns=pattern_files(scenario, store),
+            policies=given_policies(scenario, store, directory),
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._now = 0

@@ -10,29 +10,30 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, SetupError
+from caviar_protocol.fields import DigestOrNone as Digest
 from caviar_protocol.host import install_command
 from caviar_protocol.observations import KnownDevices, Moment, Observer, Users
+from caviar_protocol.policies import DECISION, NEXT, REFUSED
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
-from caviar_services.service import Frame, Preparation, Prepared, StepResult
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 CARD_KEY = "caviar.card"
 """Key of the card in the metadata of an ONNX file."""
 ACTION = "action"
 """Name of the output with the action."""
-DECISION = "policy"
-"""Name under which the digest of the policy stands in the decisions of every frame."""
 
 
 class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
@@ -149,105 +150,166 @@ class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     """Settings of ``policy``."""
 
     file: str
-    """``file:`` and the path of the ONNX file, relative to the folder of the scenario."""
+    """``file:`` and the path of the ONNX file, relative to the folder of the scenario. The agent gets it from
+    the broker, and looks for it on its own machine where the broker has none."""
     observe: tuple[str, ...] = ()
     """Parts of the observation; empty: those of the policy's card. Only for a file without a card."""
+    sha256: Digest = ""
+    """SHA-256 of the file; another file is refused. Empty: of the one that is there."""
+    earlier: tuple[Digest, ...] = ()
+    """SHA-256 of the policies that the agent was given since (``caviar swap``). Written by the broker."""
+
+
+class Served(NamedTuple):
+    """A policy that fits the scenario, and what it observes."""
+
+    model: PolicyModel
+    observer: Observer
 
 
 class PolicyAgent(Agent[PolicySettings]):
     """Serves a trained policy: `caviar_services.agent.policy` says what its file holds.
 
-    The digest of the file stands in the decisions of every frame. A replay refuses another file.
+    The digest of the file stands in the decisions of every frame, and a replay takes the files that decided.
+    Another policy that the agent is given while a run goes on (`caviar_protocol.policies`) is loaded beside
+    the frames; the first frame after that is decided by it.
 
     Raises:
         ScenarioError: The file is no policy, or does not fit the scenario; the text has both sides.
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = PolicySettings
-    _model: PolicyModel
-    _observer: Observer
+    _served: Served
     _places: Users
+    _known: KnownDevices
+
+    def __init__(self, settings: PolicySettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        # By SHA-256, as all below.
+        self._paths: dict[str, Path] = {}
+        self._loaded: dict[str, Served] = {}
+        self._refused: dict[str, str] = {}
+        self._asked: set[str] = set()
+
+    @property
+    def own_files(self) -> Sequence[str]:
+        """The policies that the broker has for this agent."""
+        return tuple(filter(None, dict.fromkeys((self.settings.sha256, *self.settings.earlier))))
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Load the policy, hold it against the scenario, and run it once."""
         prepared = super().prepare(preparation)
+        self._paths = dict(preparation.files)
+        self._known = KnownDevices(self.run.devices)
+        self._places = Users(self._known, self.settings.users, self.settings.except_users)
         path = Path(self.settings.file.removeprefix("file:"))
-        model = self._model = PolicyModel(path, f"policy {path.name}")
+        self._served = served = self._load(
+            self._paths.get(self.settings.sha256, path), f"policy {path.name}", self.settings.sha256
+        )
+        model, card = served.model, served.model.card
+        self._loaded[model.digest] = served
+        for digest in self.settings.earlier[-1:]:  # the one given last goes on serving
+            self._load_beside(digest, self._paths[digest])
+            self._served = self._loaded.get(digest, served)
+        made = f", {card.algorithm} of {card.steps} steps" if card and card.algorithm else ""
+        note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
+        return dataclasses.replace(prepared, notes=(*prepared.notes, note))
+
+    def _load(self, path: Path, called: str, digest: str = "") -> Served:
+        """Load a policy, hold it against the scenario, and run it once."""
+        model = PolicyModel(path, called)
+        if digest and model.digest != digest:
+            raise AssetError(f"{called} is damaged in {path}; remove that file, and give the policy again")
         key = self.run.settings_place.at("file").key
         card = model.card
         observe = self.settings.observe or (card.observe if card else ())
         if not observe:
             raise ScenarioError(
-                f"policy {path.name} has no card that says what it observes; write "
+                f"{called} has no card that says what it observes; write "
                 f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
                 key=key,
             )
-        known = KnownDevices(self.run.devices)
-        self._places = Users(known, self.settings.users, self.settings.except_users)
         sizes = tuple((place.tx.size, place.rx.size) for place in self._places.places)
         if card is not None and card.codebooks != sizes:
             raise ScenarioError(
-                f"policy {path.name} was trained for {_codebooks(card.codebooks)}, and the scenario has "
+                f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
                 key=key,
             )
-        self._observer = Observer(known, self._places, observe)
-        if self._observer.inputs:
-            topics = ", ".join(sorted(i.topic for i in self._observer.inputs))
+        observer = Observer(self._known, self._places, observe)
+        if observer.inputs:
+            topics = ", ".join(sorted(i.topic for i in observer.inputs))
             raise ScenarioError(
-                f"policy {path.name} observes {', '.join(observe)}, which needs {topics}: this agent "
+                f"{called} observes {', '.join(observe)}, which needs {topics}: this agent "
                 "takes the scene and the link alone; write an agent of your own with these inputs",
                 key=key,
             )
-        self._check_shapes(path.name, key)
+        _check_shapes(model, observer, called, key)
         # Buffers are made at the first run, which would else be late.
-        model.act({name: np.zeros(b.shape, b.dtype) for name, b in self._observer.bounds.items()})
-        made = f", {card.algorithm} of {card.steps} steps" if card and card.algorithm else ""
-        note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
-        return dataclasses.replace(prepared, notes=(*prepared.notes, note))
+        model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
+        return Served(model, observer)
 
-    def _check_shapes(self, name: str, key: str) -> None:
-        """Refuse a model that takes other inputs than are observed, or gives no action."""
-        model, bounds = self._model, self._observer.bounds
-        if not model.inputs.keys() <= bounds.keys():
-            raise ScenarioError(
-                f"policy {name} takes {', '.join(sorted(model.inputs))}, and {', '.join(sorted(bounds))} is "
-                "observed; name inputs after the parts of the observation",
-                key=key,
-            )
-        for part, given in model.inputs.items():
-            needed = (1, *bounds[part].shape)
-            # A size that is a name, or none, may be any.
-            sizes = zip(given, needed, strict=True) if len(given) == len(needed) else [(0, 1)]
-            if any(isinstance(size, int) and size != wanted for size, wanted in sizes):
-                raise ScenarioError(
-                    f"policy {name} takes {part!r} of shape {list(given)}, and the scenario's is "
-                    f"{list(needed)}: it was trained for other users",
-                    key=key,
-                )
-        if ACTION not in model.outputs:
-            raise ScenarioError(
-                f"policy {name} gives {', '.join(model.outputs)} and no {ACTION!r}; name its output so",
-                key=key,
-            )
+    def wanted_files(self, decisions: Mapping[str, str]) -> Sequence[str]:
+        """The policy that it is to change to, once."""
+        digest = decisions.get(NEXT, "")
+        if not digest or digest in self._asked or digest in self._loaded:
+            return ()
+        self._asked.add(digest)
+        return (digest,)
+
+    def take_file(self, digest: str, path: Path | None, reason: str) -> None:
+        """Load a policy in a thread of its own, beside the frames."""
+        if path is None:
+            self._refused[digest] = reason
+            return
+        self._paths[digest] = path
+        load = threading.Thread(target=self._load_beside, args=(digest, path), name="policy", daemon=True)
+        load.start()
+
+    def _load_beside(self, digest: str, path: Path) -> None:
+        called = f"policy {digest[:12]}…"
+        try:
+            served = self._load(path, called, digest)
+        except Exception as error:  # whatever a strange file brings about: the run goes on with what it has
+            self._refused[digest] = (str(error) or type(error).__name__).partition("\n")[0]
+        else:
+            self._loaded[digest] = served
 
     def step(self, frame: Frame) -> StepResult:
         """The policy's choice for each user; its digest among the decisions."""
-        imposed = frame.imposed.get(DECISION, "")
-        if imposed and imposed != self._model.digest:
+        imposed, wanted = frame.imposed.get(DECISION, ""), frame.imposed.get(NEXT, "")
+        if imposed:
+            self._served = self._imposed(imposed, frame.number)
+        elif wanted:
+            self._served = self._loaded.get(wanted, self._served)
+        made = super().step(frame)
+        if frame.final:
+            return made
+        decisions = {DECISION: self._served.model.digest}
+        if wanted in self._refused:
+            # Given once more, it is looked at once more: what was missing may be there.
+            self._asked.discard(wanted)
+            decisions[REFUSED] = f"{wanted} {self._refused.pop(wanted)}"
+        return replace(made, decisions=decisions)
+
+    def _imposed(self, digest: str, frame: int) -> Served:
+        """The policy that decided a frame that is computed again."""
+        if digest not in self._loaded and digest in self._paths:
+            self._loaded[digest] = self._load(self._paths[digest], f"policy {digest[:12]}…", digest)
+        if digest not in self._loaded:
             raise ScenarioError(
-                f"frame {frame.number} was decided by the policy of SHA-256 {imposed}, and this file has "
-                f"{self._model.digest}; give the replay the same file",
+                f"frame {frame} was decided by the policy of SHA-256 {digest}, and this file has "
+                f"{self._served.model.digest}; give the replay the same file",
                 key=self.run.settings_place.at("file").key,
             )
-        made = super().step(frame)
-        return made if frame.final else replace(made, decisions={DECISION: self._model.digest})
+        return self._loaded[digest]
 
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
         """The policy's choice for each user, the same on every carrier."""
         users = self._places.present(scene)
         moment = Moment(frame, scene, frame.only("link", Link), users)
-        action = self._model.act(self._observer.read(moment)).tolist()
+        model, observer = self._served
+        action = model.act(observer.read(moment)).tolist()
         for place, pair in users:
             size = self._places.places[place].beam_pairs
             index = action[place] if place < len(action) else -1
@@ -263,3 +325,28 @@ class PolicyAgent(Agent[PolicySettings]):
 def _codebooks(sizes: Sequence[tuple[int, int]]) -> str:
     shown = ", ".join(f"{tx} × {rx}" for tx, rx in sizes[:4]) + (", …" if len(sizes) > 4 else "")
     return f"{len(sizes)} user(s) with beams {shown}"
+
+
+def _check_shapes(model: PolicyModel, observer: Observer, called: str, key: str) -> None:
+    """Refuse a model that takes other inputs than are observed, or gives no action."""
+    bounds = observer.bounds
+    if not model.inputs.keys() <= bounds.keys():
+        raise ScenarioError(
+            f"{called} takes {', '.join(sorted(model.inputs))}, and {', '.join(sorted(bounds))} is "
+            "observed; name inputs after the parts of the observation",
+            key=key,
+        )
+    for part, given in model.inputs.items():
+        needed = (1, *bounds[part].shape)
+        # A size that is a name, or none, may be any.
+        sizes = zip(given, needed, strict=True) if len(given) == len(needed) else [(0, 1)]
+        if any(isinstance(size, int) and size != wanted for size, wanted in sizes):
+            raise ScenarioError(
+                f"{called} takes {part!r} of shape {list(given)}, and the scenario's is "
+                f"{list(needed)}: it was trained for other users",
+                key=key,
+            )
+    if ACTION not in model.outputs:
+        raise ScenarioError(
+            f"{called} gives {', '.join(model.outputs)} and no {ACTION!r}; name its output so", key=key
+        )
