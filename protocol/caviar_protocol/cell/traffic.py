@@ -7,7 +7,6 @@ has piece by piece. ``constant`` traffic and ``trace`` send a packet whenever th
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.conversion import FILE, Place, csv_rows
 
 TrafficModel = Literal["full", "constant", "poisson", "alternating", "trace"]
 
@@ -29,8 +28,6 @@ MAX_RATE_BIT_S = 1e15
 """A rate beyond this is a mistake of units, and would overflow the packets of a run."""
 
 _Rate = Annotated[float, quantity("bit/s", "mean rate of the traffic", ge=0, le=MAX_RATE_BIT_S)]
-
-FILE = "file:"
 
 
 class Traffic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -233,24 +230,9 @@ def read_trace(file: str, place: Place) -> tuple[Float64Array, Float64Array]:
     name = str(path)
     if not path.is_absolute():
         raise place.error(f'{name!r} is relative to nothing; write "{FILE}{name}"')
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise place.error(f"the trace {name} cannot be read: {why}; name a CSV file") from error
     rows: list[tuple[float, float]] = []
-    has_header = False
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        if not has_header:
-            has_header = True
-            if tuple(cells) != COLUMNS:
-                text = f"the first line is {line!r}; write {','.join(COLUMNS)}"
-                raise ScenarioError(text, name, line=number)
-            continue
-        rows.append(_row(cells, line, rows, name, number))
+    for row in csv_rows(path, place, [COLUMNS], "the trace ")[1:]:
+        rows.append(_row(row.cells, row.text, rows, name, row.number))
     if not rows:
         raise ScenarioError(f"holds no rate; write {','.join(COLUMNS)}, then one a line", name, place.key)
     begins, rates = np.array(rows, np.float64).T

@@ -51,7 +51,6 @@ from caviar_protocol.recording.topics import (
 )
 from caviar_protocol.run_directory import RunDirectory
 
-P = TypeVar("P", bound=Payload)
 T = TypeVar("T", bound=str)
 Key: TypeAlias = T | tuple[T, str]
 """A topic, or a topic and a source."""

@@ -26,8 +26,8 @@ import msgspec
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.fields import MAX_SUBCARRIERS
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario.conversion import Place, Source, convert_table
-from caviar_protocol.scenario.instants import FILE, instants_ns, with_instants
+from caviar_protocol.scenario.conversion import FILE, Place, Source, convert_table
+from caviar_protocol.scenario.instants import instants_ns, with_instants
 from caviar_protocol.scenario.rules import check_scenario, settings_place
 from caviar_protocol.scenario.schema import (
     REMOTE,

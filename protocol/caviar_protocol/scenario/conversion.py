@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import re
 import threading
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -15,6 +17,8 @@ from caviar_protocol.errors import ScenarioError, suggestion
 
 T = TypeVar("T", bound=msgspec.Struct)
 
+FILE = "file:"
+"""Before a path that is relative to the folder of the scenario."""
 _NAME = r'([A-Za-z0-9_-]+|"[^"]*")'
 # A dotted key.
 _KEY = re.compile(rf"{_NAME}(\.{_NAME}|\[\d+\])*")
@@ -348,6 +352,61 @@ def _example(field: inspect.Field, place: Place) -> str:
         case inspect.BoolType() | inspect.StrType() | inspect.IntType() | inspect.FloatType():
             return f"{field.encode_name} = … ({_describe(kind)})"
     return f"{field.encode_name} = …"
+
+
+class CsvRow(NamedTuple):
+    """A row of a CSV file that a scenario names."""
+
+    number: int
+    """Of its line, from 1."""
+    text: str
+    """The whole line."""
+    cells: list[str]
+    """Without the spaces around them."""
+
+
+def csv_rows(
+    path: Path, place: Place, headers: Sequence[Sequence[str]], what: str = "", form: str = ""
+) -> list[CsvRow]:
+    """Read a CSV file; empty lines and those that begin with ``#`` are left out.
+
+    Args:
+        path: The file.
+        place: Key of the scenario that names it, for the error.
+        headers: What may stand in the first row.
+        what: Stands before the file's name in an error.
+        form: What to write as the first row; empty: the first of ``headers``.
+
+    Returns:
+        The rows, the header first; none of a file without any.
+
+    Raises:
+        ScenarioError: The file cannot be read, or begins with another row; names file and line.
+
+    Example:
+        >>> _ = Path("video.csv").write_text("t_s,rate\\n# at night\\n0, 2e6\\n")
+        >>> [(row.number, row.cells) for row in csv_rows(Path("video.csv"), Place("file"), [("t_s", "rate")])]
+        [(1, ['t_s', 'rate']), (3, ['0', '2e6'])]
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise place.error(f"{what}{path} cannot be read: {why}; name a CSV file") from error
+    rows = []
+    # Line by line, not the file at once: an error names the line, comments and empty ones counted.
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            cells = next(csv.reader([line]))
+        except csv.Error as error:  # a field is longer than 131,072 letters
+            raise ScenarioError(f"is no CSV: {error}", str(path), line=number) from error
+        rows.append(CsvRow(number, line, [cell.strip() for cell in cells]))
+    if rows and rows[0].cells not in [list(header) for header in headers]:
+        text = f"the first line is {rows[0].text!r}; write {form or ','.join(headers[0])}"
+        raise ScenarioError(text, str(path), line=rows[0].number)
+    return rows
 
 
 def show(value: object) -> str:

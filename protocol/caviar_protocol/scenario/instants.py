@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.conversion import FILE, Place, csv_rows
 
-FILE = "file:"
-"""Before a path that is relative to the folder of the scenario."""
 KEY = "instants_s"
 NANOSECONDS = "instants_ns"
 """The same as whole nanoseconds; read into `KEY`."""
@@ -96,21 +94,10 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
 
 def _lines_of(path: Path, place: Place) -> list[tuple[Any, Refuse]]:
     """Lines of a CSV file of instants, each with the error about it, which names file and line."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise place.error(f"{path} cannot be read: {why}; name a CSV file") from error
-    found: list[tuple[Any, Refuse]] = [
-        (text, partial(ScenarioError, file=str(path), line=number))
-        for number, text in enumerate(map(str.strip, lines), 1)
-        if text and not text.startswith("#")
-    ]
-    if found and found[0][0] != COLUMN:
-        raise found[0][1](f"the first line is {found[0][0]!r}; write {COLUMN}")
-    if len(found) < 2:
+    rows = csv_rows(path, place, [(COLUMN,)])
+    if len(rows) < 2:
         raise ScenarioError(f"holds no instant; write {COLUMN}, then one a line", str(path), place.key)
-    return found[1:]
+    return [(row.text.strip(), partial(ScenarioError, file=str(path), line=row.number)) for row in rows[1:]]
 
 
 def _instant(value: Any, key: str, refuse: Refuse) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from bisect import bisect_right
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario.conversion import Place, csv_rows
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Preparation, Prepared, RunInfo
@@ -353,27 +353,11 @@ def _from_csv(path: Path, key: str) -> list[Waypoint]:
     file = str(path)
     if not path.is_absolute():
         raise ScenarioError(f'{file!r} is relative to nothing; write "file:{file}"', key=key)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ScenarioError(f"waypoints cannot be read: {why}; name a CSV file", file, key) from error
+    form = f"{','.join(COLUMNS)} or add ,{YAW_COLUMN}"
+    read = csv_rows(path, Place(key), [COLUMNS, (*COLUMNS, YAW_COLUMN)], "waypoints: ", form)
     rows: list[_Row] = []
-    header: list[str] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        # Line by line, not the file at once: an error names the line, comments and empty ones counted.
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        if not header:
-            header = cells
-            if tuple(header) not in (COLUMNS, (*COLUMNS, YAW_COLUMN)):
-                raise ScenarioError(
-                    f"the first line is {line!r}; write {','.join(COLUMNS)} or add ,{YAW_COLUMN}",
-                    file,
-                    line=number,
-                )
-            continue
+    header = read[0].cells if read else []
+    for number, line, cells in read[1:]:
         if len(cells) != len(header):
             raise ScenarioError(
                 f"has {len(cells)} columns, write {len(header)}: {','.join(header)}", file, line=number
