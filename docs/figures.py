@@ -84,6 +84,17 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "enumerated.md",
         {"enumerated": ""},
     ),
+    "fig8": Measurement(
+        "caviar paper fig8 --seeds 1 --out {out}",
+        "caviar paper fig8 --out {out}",
+        "fig8.md",
+        {
+            "fig8-geometric": "drawn in each frame",
+            "fig8-quasi-static": "drawn once an episode",
+            "fig8-munich": "Munich",
+            "fig8-worst-seed": "worst seed",
+        },
+    ),
     "follow": Measurement(
         f"{_FOLLOW} --frames 60 --markdown {{out}}/follow.md",
         f"{_FOLLOW} --markdown {{out}}/follow.md",

@@ -16,7 +16,7 @@ TUNED, ANGLE = "DQN, tuned", "DQN, tuned, angle alone"
 
 _SEEDS = (
     "Means over frames of {episodes} episodes that no policy was trained on; ± is the 95 % interval over "
-    "{seeds} seeds of training, all judged on the same episodes. «of los-beam»: ratio of the means."
+    "{seeds} seeds of training, all judged on the same episodes. «of los-beam»: ratio of means."
 )
 _PAPER = (
     "The paper refers to others for the distributions of its multipath components, and says nothing of their "
@@ -76,7 +76,7 @@ def _means(report: Report, channel: ChannelName) -> Comparison:
             if kind != "all":
                 cells.append(with_interval(ratios(played, method, kind), 3))
         rows.append((*cells, PAPER.get(method, NOTHING)) if like_paper else tuple(cells))
-    columns = ("mean |y|", "all", "LOS", "of los-beam", "NLOS", "of los-beam ")
+    columns = ("mean |y|", "all", "LOS", "LOS, of los-beam", "NLOS", "NLOS, of los-beam")
     counts = {kind: int(played.frames(kind).sum()) for kind in KINDS}
     notes = [
         _SEEDS.format(episodes=len(played.los), seeds=len(report.seeds)),
