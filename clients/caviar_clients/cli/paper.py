@@ -221,3 +221,44 @@ def _tradeoff(name: str, part: str, source: Path, frames: int, minutes: float, o
     require_folder("--out", out, "tables and pictures")
     options = tradeoff_options(None, None, None, 2, minutes, [part])
     trade(source, frames, options, out / name / "tradeoff.json", out / name, Console())
+
+
+@app.command("pizza")
+def pizza(
+    episodes: Annotated[int | None, typer.Option(min=2, help="held out; by default 20")] = None,
+    addresses: Annotated[int | None, typer.Option(min=2, max=8, help="of an episode; by default 4")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="two episodes, a training of seconds: to see that it works")
+    ] = False,
+    seed: Seed = 1,
+    out: Out = FOLDER,
+) -> None:
+    """A drone delivers pizzas: a trained pair of agents against nearest-address order with los-beam."""
+    from dataclasses import replace
+
+    from caviar_clients.cli.shared import print_line, require_installed
+    from caviar_clients.files import require_folder, reserved
+    from caviar_clients.session.checks import checked_scenario
+
+    require_folder("--out", out, "pictures, tables and figures")
+    require_installed("the experiment", ("channel", "plot"))
+    # They need SciPy, which comes with the channel.
+    from caviar_clients.paper.pizza import SCENARIO, Settings, experiment
+    from caviar_clients.paper.pizza_figure import draw, film
+    from caviar_clients.paper.pizza_tables import comparisons, figures_of
+
+    settings = Settings(seed=seed)
+    settings = settings.trial() if quick else settings
+    settings = replace(
+        settings, episodes=episodes or settings.episodes, addresses=addresses or settings.addresses
+    )
+    scenario = checked_scenario(Path(SCENARIO))
+    name = "pizza-quick" if quick else "pizza"
+    console = Console()
+    with reserved(out / f"{name}.md", out / f"{name}.json"):
+        with _time_left(console) as show:
+            found = experiment(settings, show)
+        pictures = [draw(found, scenario, out / f"{name}.png"), film(found, scenario, out / f"{name}.gif")]
+    title = "Pizzas by drone" + (": a trial, whose figures say nothing" if quick else "")
+    print_line(console, title, "yellow" if quick else "bold")
+    report(console, title, comparisons(found), pictures, name, out, figures_of(found))
