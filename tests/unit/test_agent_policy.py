@@ -51,6 +51,13 @@ class Constant(torch.nn.Module):  # type: ignore[misc]
         return aod[:, 0].to(torch.int64) * 0 + self.pair
 
 
+class BeyondLater(torch.nn.Module):  # type: ignore[misc]
+    """A pair that is not there, but where nothing is observed."""
+
+    def forward(self, aod: Any) -> Any:
+        return (aod[:, 0] != 0).to(torch.int64) * BEAMS
+
+
 class NoSensors:
     """A frame of which scene and link alone are observed."""
 
@@ -166,9 +173,11 @@ def test_what_does_not_fit_is_refused_with_both_sides(tmp_path: Path) -> None:
     assert "services.agent.settings.file" in other or "scenario.toml" in other
     missing = refused(with_policy(tmp_path, "none.onnx"), tmp_path / "c")
     assert "none.onnx" in missing
-    beyond = made(tmp_path, Constant(BEAMS), "beyond.onnx")
-    assert beyond.exists()
+    made(tmp_path, Constant(BEAMS), "beyond.onnx")
     text = refused(with_policy(tmp_path, "beyond.onnx"), tmp_path / "d")
+    assert "policy beyond.onnx chooses pair 64 of 64 for place 0" in text
+    made(tmp_path, BeyondLater(), "later.onnx")
+    text = refused(with_policy(tmp_path, "later.onnx"), tmp_path / "e")
     assert "the policy chose pair 64 of 64 for uav/rx" in text
 
 

@@ -208,9 +208,11 @@ class PolicyAgent(Agent[PolicySettings]):
         )
         model, card = served.model, served.model.card
         self._loaded[model.digest] = served
-        for digest in self.settings.earlier[-1:]:  # the one given last goes on serving
+        for digest in reversed(self.settings.earlier):  # the one given last that can be served goes on
             self._load_beside(digest, self._paths[digest])
-            self._served = self._loaded.get(digest, served)
+            if digest in self._loaded:
+                self._served = self._loaded[digest]
+                break
         made = f", {card.algorithm} of {card.steps} steps" if card and card.algorithm else ""
         note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
         return dataclasses.replace(prepared, notes=(*prepared.notes, note))
@@ -246,8 +248,26 @@ class PolicyAgent(Agent[PolicySettings]):
             )
         _check_shapes(model, observer, called, key)
         # Buffers are made at the first run, which would else be late.
-        model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
+        action = model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
+        self._check_action(action, called, key)
         return Served(model, observer)
+
+    def _check_action(self, action: NDArray[np.int64], called: str, key: str) -> None:
+        """Refuse a model whose action is none: before it serves, while the run still has another."""
+        places = self._places.places
+        if len(action) < len(places):
+            raise ScenarioError(
+                f"{called} gives {len(action)} index(es), and the scenario has {len(places)} user(s); give "
+                "one for each",
+                key=key,
+            )
+        for number, (place, index) in enumerate(zip(places, action.tolist(), strict=False)):
+            if not 0 <= index < place.beam_pairs:
+                raise ScenarioError(
+                    f"{called} chooses pair {index} of {place.beam_pairs} for place {number} where all that "
+                    "it observes is 0; it gives indices from 0 on",
+                    key=key,
+                )
 
     def wanted_files(self, decisions: Mapping[str, str]) -> Sequence[str]:
         """The policy that it is to change to, once."""
