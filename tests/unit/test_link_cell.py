@@ -14,12 +14,13 @@ from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ProductError, ScenarioError
-from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
 from caviar_services.link.cell import CellLink
 from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
-from caviar_services.service import Frame, FrameInput, RunInfo
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)
 A = antenna("a", "rx", (1, 1), (20.0, 10.0, 0.0))
@@ -371,3 +372,30 @@ def test_association_and_lost_slots_outlive_the_process() -> None:
         state, link = link.checkpoint(), link_of(**rule)
         link.restore(state)
         assert encode_payload(link.step(frame).products["link"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("users", "expected"),
+    [
+        (
+            ("*", "c/*"),
+            r"traffic\[1\]\.users\[1\]: 'c/\*' is no receiver of the scenario; known: a, car\.\*/rx",
+        ),
+        ((), r"traffic\[1\]\.users: is empty, so that nothing arrives"),
+    ],
+)
+def test_traffic_of_a_receiver_that_is_not_there_is_refused(users: tuple[str, ...], expected: str) -> None:
+    devices = (
+        DeviceSpec(name="bs", kind="antenna", role="tx"),
+        DeviceSpec(name="a", kind="antenna", role="rx"),
+        DeviceSpec(name="rx", on="car.*", kind="antenna", role="rx"),
+    )
+    wrong = CellSettings(traffic=(Traffic(users=("car.3/*",)), Traffic(users=users)))
+    link = CellLink(wrong, RunInfo(name="link", carriers=(CARRIER,), devices=devices))
+    with pytest.raises(ScenarioError, match=expected):
+        link.prepare(Preparation(demand={"link": frozenset()}))
+
+
+def test_a_reward_that_is_not_there_is_refused_with_all_that_are() -> None:
+    with pytest.raises(ScenarioError, match=r"'dlay' is not possible here; did you mean 'delay'\? One of"):
+        convert_settings(CellSettings, {"reward": "dlay"})

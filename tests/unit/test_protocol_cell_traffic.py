@@ -78,6 +78,17 @@ def test_a_trace_that_is_wrong_is_refused_with_file_and_line(
     assert where in str(refused.value)
 
 
+def test_a_trace_of_a_spreadsheet_begins_with_a_mark(tmp_path: Path) -> None:
+    (tmp_path / "video.csv").write_bytes(b"\xef\xbb\xbft_s,rate_bit_s\r\n0,2e6\r\n")
+    assert read_trace(f"file:{tmp_path / 'video.csv'}", PLACE)[1].tolist() == [2e6]
+
+
+def test_a_row_that_is_no_csv_is_refused_with_file_and_line(tmp_path: Path) -> None:
+    (tmp_path / "video.csv").write_text("t_s,rate_bit_s\n0," + "1" * 200_000)
+    with pytest.raises(ScenarioError, match=r"video\.csv:2: is no CSV: field larger"):
+        read_trace(f"file:{tmp_path / 'video.csv'}", PLACE)
+
+
 def test_a_trace_that_cannot_be_read_is_refused_with_its_key(tmp_path: Path) -> None:
     with pytest.raises(
         ScenarioError, match=r"traffic\[1\]\.file: the trace .*none.csv cannot be read: No such"

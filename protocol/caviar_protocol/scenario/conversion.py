@@ -242,6 +242,9 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
         plain = [choice for choice in choices if not isinstance(choice, inspect.NoneType)]
         if isinstance(value, list):
             plain = [choice for choice in plain if isinstance(choice, _ARRAYS)] or plain
+        words = [choice for choice in plain if isinstance(choice, inspect.LiteralType)]
+        if plain and len(words) == len(plain):
+            plain = [inspect.LiteralType(tuple(word for choice in words for word in choice.values))]
         if len(plain) == 1:
             _check(value, plain[0], place)
         elif len(plain) == 2 and isinstance(plain[0], inspect.LiteralType):
@@ -389,7 +392,8 @@ def csv_rows(
         [(1, ['t_s', 'rate']), (3, ['0', '2e6'])]
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        # Spreadsheets write a mark before the first letter.
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise place.error(f"{what}{path} cannot be read: {why}; name a CSV file") from error

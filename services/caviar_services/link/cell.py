@@ -34,7 +34,7 @@ from caviar_services.checkpoint import restored, saved
 from caviar_services.link.association import Layout, associate
 from caviar_services.link.base import wrong_choice
 from caviar_services.link.beam_scores import Scored, SweepingLink
-from caviar_services.link.cell_settings import CellSettings, check_cell_settings
+from caviar_services.link.cell_settings import CellSettings, check_cell_settings, check_traffic_users
 from caviar_services.link.nr import Blocks, NrRates, load_blocks
 from caviar_services.link.slot_channel import band_points, responses
 from caviar_services.link.slot_rates import (
@@ -120,9 +120,11 @@ class CellLink(SweepingLink[CellSettings]):
 
         Raises:
             SetupError: Sionna SYS is not installed.
-            ScenarioError: The band is to be looked at, and no carrier has subcarriers; names the key.
+            ScenarioError: The band is to be looked at, and no carrier has subcarriers, or traffic is of no
+                receiver; names the key.
         """
         prepared, settings = super().prepare(preparation), self.settings
+        check_traffic_users(settings, self.run.devices, self.run.settings_place)
         if "frequency" in settings.selective and band_points(self.run.carriers).shape[1] == 1:
             key = self.run.settings_place.at("selective").key
             text = "'frequency' needs a carrier with 24 subcarriers or more; write `subcarriers` of a carrier"

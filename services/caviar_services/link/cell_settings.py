@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -9,7 +10,10 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.cell.scheduling import Scheduler
 from caviar_protocol.cell.traffic import Traffic, check_traffic
+from caviar_protocol.errors import suggestion
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_services.link.association import AssociationRule
 from caviar_services.link.beam_scores import RewardKind, SweepSettings
 from caviar_services.link.slot_rates import Sharing
@@ -66,6 +70,39 @@ class CellSettings(SweepSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     """A handover is a change of the transmitter; packets stay in the buffer."""
     average_slots: Annotated[float, quantity("slot", "that the average of fairness forgets in", ge=1)] = 100.0
     """Of ``proportional-fair``."""
+
+
+def check_traffic_users(settings: CellSettings, devices: Sequence[DeviceSpec], place: Place) -> None:
+    """Refuse traffic of receivers that the scenario cannot have: a name that is misspelt would send nothing.
+
+    Args:
+        settings: The settings.
+        devices: Of the scenario; none where they are not known.
+        place: Where the settings stand.
+
+    Raises:
+        ScenarioError: No receiver fits; names the key, and the receivers.
+
+    Example:
+        >>> from caviar_protocol.errors import ScenarioError
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> wrong = CellSettings(traffic=(Traffic(users=("car/*",)),))
+        >>> try:
+        ...     check_traffic_users(wrong, load_scenario("geometric").devices, Place("settings"))
+        ... except ScenarioError as error:
+        ...     print(error)
+        settings.traffic[0].users[0]: 'car/*' is no receiver of the scenario; known: uav/rx
+    """
+    receivers = [device for device in devices if device.kind == "antenna" and device.role in ("rx", "both")]
+    names = [f"{device.on}/{device.name}" if device.on else device.name for device in receivers]
+    for index, entry in enumerate(settings.traffic if names else ()):
+        mine = place.at("traffic").at(index).at("users")
+        if not entry.users:
+            raise mine.error('is empty, so that nothing arrives; write users = ["*"], or leave the entry out')
+        for position, pattern in enumerate(entry.users):
+            if not any(patterns_overlap(name, pattern) for name in names):
+                text = f"{pattern!r} is no receiver of the scenario; {suggestion(pattern, names)}"
+                raise mine.at(position).error(text)
 
 
 def check_cell_settings(settings: CellSettings, place: Place) -> None:
