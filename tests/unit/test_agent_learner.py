@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
 
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Status
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Link, Scene
@@ -160,3 +161,16 @@ def test_a_step_goes_down_the_gradient_of_the_squared_error(hidden: tuple[int, .
 def test_what_it_cannot_observe_is_refused(settings: LearnerSettings, words: str) -> None:
     with pytest.raises(CaviarError, match=words):
         LearnerAgent(settings, RUN).prepare(Preparation(demand={}))
+
+
+def test_a_part_that_does_not_exist_is_refused_with_its_key() -> None:
+    with pytest.raises(
+        ScenarioError, match=r"settings\.observe: no observation is called 'aodd'; did you mean"
+    ):
+        LearnerAgent(LearnerSettings(observe=("aodd",)), RUN).prepare(Preparation(demand={}))
+
+
+def test_a_perceptron_that_could_not_serve_in_time_is_refused() -> None:
+    settings = LearnerSettings(hidden=(4096, 4096))
+    with pytest.raises(ScenarioError, match=r"settings\.hidden: has 16,777,216 weights between its layers"):
+        LearnerAgent.check_settings(settings, Place("settings"))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.observations import FAR, KnownDevices, Moment, Observer, Users
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
@@ -33,6 +35,10 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo
 
 Units = Annotated[int, quantity("1", "units of a hidden layer", ge=1, le=4096)]
 Scale = Annotated[float, quantity("1", "what a part is divided by, in its unit", gt=0)]
+
+
+MOST_WEIGHTS = 2**22
+"""Between hidden layers: with more, an update takes longer than frames are apart."""
 
 
 class LearnerSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -165,14 +171,27 @@ class LearnerAgent(Agent[LearnerSettings]):
         self._asked: tuple[_Asked, ...] = ()
         self._episode = 0, 0
 
+    @classmethod
+    def check_settings(cls, settings: LearnerSettings, place: Place) -> None:
+        """Refuse a perceptron that could not serve in time."""
+        weights = sum(a * b for a, b in pairwise(settings.hidden))
+        if weights > MOST_WEIGHTS:
+            raise place.at("hidden").error(
+                f"has {weights:,} weights between its layers; write fewer units or layers, with "
+                f"{MOST_WEIGHTS:,} at most"
+            )
+
     def prepare(self, preparation: Preparation) -> Prepared:
         """Look the parts of the observation up."""
         place = self.run.settings_place
         known = KnownDevices(self.run.devices)
         self._places = Users(known, self.settings.users, self.settings.except_users)
-        self._observer = Observer(known, self._places, self.settings.observe)
         if not self.settings.observe:
             raise ScenarioError('is empty; write observe = ["aod"]', key=place.at("observe").key)
+        try:
+            self._observer = Observer(known, self._places, self.settings.observe)
+        except ScenarioError as error:
+            raise ScenarioError(str(error), key=place.at("observe").key) from error
         if self._observer.inputs:
             topics = ", ".join(sorted(i.topic for i in self._observer.inputs))
             raise ScenarioError(
