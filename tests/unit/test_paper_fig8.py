@@ -255,6 +255,22 @@ def test_the_quick_form_says_so_wherever_it_is_shown(tmp_path: Path, monkeypatch
     assert (tmp_path / "fig8-quick-geometric.png").is_file()
 
 
+def test_ctrl_c_says_what_is_done_and_leaves_no_empty_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("caviar_clients.paper.fig8.train_experiments", interrupted)
+    words = ["paper", "fig8", "--channel", "geometric", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code != 0
+    assert "stopped with 0 trainings done; the same command goes on" in " ".join(done.output.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["fig8"]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
