@@ -1,0 +1,166 @@
+"""Policies on their way: to agents on other machines, over deaths of the broker, and at a real pace."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from scenarios_support import (
+    Finished,
+    caviar,
+    environment,
+    eventually,
+    marked,
+    recorded_below,
+    running,
+)
+from test_network_outage import endpoint_below
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+from policy_files import constant_policy, scenario_with
+
+from caviar_protocol.recording import Recording
+from caviar_protocol.recording.reader import recorded_decisions
+from caviar_services.agent.policy import PolicyModel
+
+WITHIN_S = 40.0
+OTHERS = {
+    "world": "world:trajectory",
+    "channel": "channel:geometric",
+    "link": "link:beams",
+    "recorder": "recorder:mcap",
+}
+"""Services of `geometric` beside its agent."""
+
+
+def decided(directory: Path) -> list[str]:
+    """SHA-256 of the policy of each frame."""
+    found = recorded_decisions(Recording(directory))
+    return [found["agent", 0, frame]["policy"] for frame in range(len(found))]
+
+
+def replayed(directory: Path, out: Path) -> None:
+    """A replay that computes everything again makes the same bytes."""
+    again = caviar("replay", directory, "--again", "--out", out)
+    assert again.status == 0, again.output
+    assert "byte for byte" in again.output
+    assert decided(next(out.glob("*/"))) == decided(directory)
+
+
+def swapped(directory: Path, file: Path) -> Finished:
+    done = caviar("swap", file, "--run", directory)
+    assert done.status == 0, done.output
+    return done
+
+
+@contextlib.contextmanager
+def service(name: str, use: str, endpoint: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A service as on a machine of its own: another folder, and an empty cache."""
+    folder.mkdir()
+    command = [sys.executable, "-m", "caviar_clients", "service", name, "--use", use, "--broker", endpoint]
+    with subprocess.Popen(
+        command, cwd=folder, env=environment("travels", XDG_CACHE_HOME=str(folder / "cache")),
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_an_agent_over_tcp_needs_no_copy_and_takes_a_swap(tmp_path: Path) -> None:
+    first, second = (constant_policy(tmp_path / f"{pair}.onnx", pair) for pair in (3, 5))
+    digests = [PolicyModel(file).digest for file in (first, second)]
+    scenario, out = scenario_with(tmp_path, first.name, 400), tmp_path / "out"
+    command = [sys.executable, "-m", "caviar_clients", "broker", str(scenario), "--out", str(out)]
+    with contextlib.ExitStack() as started:
+        broker = started.enter_context(
+            subprocess.Popen(
+                [*command, "--bind", "tcp://127.0.0.1:0", "--pace", "4"],
+                env=environment("travels", XDG_CACHE_HOME=str(tmp_path / "here")),
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )
+        )  # fmt: skip
+        started.callback(broker.kill)
+        eventually(lambda: endpoint_below(out), WITHIN_S, "the broker listens")
+        directory, endpoint = next(out.glob("*/")), endpoint_below(out)
+        first.unlink()  # what travels is the run's own copy
+        for name, use in OTHERS.items():
+            started.enter_context(service(name, use, endpoint, tmp_path / name))
+        agent = started.enter_context(service("agent", "agent:policy", endpoint, tmp_path / "there"))
+        eventually(lambda: recorded_below(out) > 5, WITHIN_S, "frames are recorded")
+        swapped(directory, second)
+        second.unlink()
+        assert broker.wait(120) == 0
+        assert agent.wait(WITHIN_S) == 0
+    cached = " ".join(str(path) for path in (tmp_path / "there" / "cache").rglob("*") if path.is_file())
+    assert all(digest in cached for digest in digests), "both came over the network"
+    before = decided(directory)
+    assert {*before} == {*digests}
+    assert sum(a != b for a, b in pairwise(before)) == 1
+    replayed(directory, tmp_path / "again")
+
+
+def test_a_broker_that_dies_after_a_swap_is_followed_by_one_that_knows_it(tmp_path: Path) -> None:
+    """And what was refused to somebody who did not wait is not what the agent comes back with."""
+    first, second, torn = (tmp_path / f"{name}.onnx" for name in ("first", "second", "torn"))
+    constant_policy(first, 3)
+    constant_policy(second, 5)
+    torn.write_bytes(second.read_bytes()[:150])
+    digests = [PolicyModel(file).digest for file in (first, second)]
+    scenario, out = scenario_with(tmp_path, first.name, 1500), tmp_path / "out"
+    with running(scenario, out, "--pace", "20") as (process, mark):
+        eventually(lambda: recorded_below(out) > 20, WITHIN_S, "frames are recorded")
+        directory = next(out.glob("*/"))
+        swapped(directory, second)
+        # Nobody waits for what comes of it, so the run keeps the torn file.
+        assert caviar("swap", torn, "--run", directory, "--wait", "0").status == 1
+        events = directory / "events.jsonl"
+        eventually(lambda: "is refused" in events.read_text(), WITHIN_S, "the agent refuses it")
+        seen = recorded_below(out)
+        for entry in [f"{process.pid} ", *marked(mark)]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(entry.split()[0]), signal.SIGKILL)
+        process.communicate(timeout=10)
+    second.unlink()
+    resumed = caviar("run", "--resume", directory, timeout=180)
+    assert resumed.status == 0, resumed.output
+    assert resumed.leftovers == []
+    before = decided(directory)
+    assert len(before) == 1500 > seen
+    assert sum(a != b for a, b in pairwise(before)) == 1
+    assert (before[0], before[-1]) == tuple(digests)
+    replayed(directory, tmp_path / "again")
+
+
+def test_at_a_real_pace_no_frame_is_missed_while_policies_are_swapped(tmp_path: Path) -> None:
+    files = [constant_policy(tmp_path / f"{pair}.onnx", pair) for pair in (3, 5, 9)]
+    scenario, out = scenario_with(tmp_path, files[0].name, 120), tmp_path / "out"
+    text = scenario.read_text()
+    for name in ("agent", "link"):
+        text = text.replace(f'role = "{name}"', f'role = "{name}"\npolicy = "hold"', 1)
+    scenario.write_text(text.replace("budget_ms = 20", "budget_ms = 80"))
+    with running(scenario, out, "--pace", "realtime") as (process, _):
+        eventually(lambda: recorded_below(out) > 10, WITHIN_S, "frames are recorded")
+        directory = next(out.glob("*/"))
+        for file in files[1:]:
+            swapped(directory, file)
+        output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, output
+    assert len({*decided(directory)}) == 3
+    summary = json.loads((directory / "summary.json").read_text())
+    assert summary["frames"] == 120
+    assert {name: summary["services"][name]["misses"] for name in ("agent", "link")} == {
+        "agent": 0,
+        "link": 0,
+    }
