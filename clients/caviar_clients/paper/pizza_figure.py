@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from caviar_protocol.scenario import Scenario
 _COLOURS = {BASELINE: BLUE, TRAINED: AGENT}
 _NAMES = {BASELINE: "nearest first, los-beam", TRAINED: "trained pair"}
 _MAP = "viridis"
+_WHITE = "#ffffff"
 _FILM_FPS = 8.0
 _STILLS = 12
 """Frames that the end of the film stands still."""
@@ -123,11 +123,11 @@ def _all_ratios(axes: Any, report: Report, index: int) -> None:
     axes.set_xlabel("time, trained over baseline")
     axes.set_ylabel("mean rate, trained over baseline")
     axes.set_title(f"All {len(times)} episodes", loc="left")
-    axes.legend(loc="upper right")
+    axes.legend(loc="best")
 
 
 def film(report: Report, scenario: Scenario, file: Path) -> Path:
-    """Film the episode that is drawn: both pairs side by side, at twice or four times the speed.
+    """Film the episode that is drawn: both pairs side by side, at four times the speed.
 
     Args:
         report: What was played.
@@ -143,13 +143,10 @@ def film(report: Report, scenario: Scenario, file: Path) -> Path:
         pictures = _Pictures(report, scenario, index)
         samples = [pictures.at(frame) for frame in (longest // 3, longest)]
         every = (pictures.at(min(frame, longest)) for frame in range(1, longest + 1 + _STILLS))
-        keys = np.unique(samples[0][:2].reshape(-1, 3), axis=0)[:8]
-        write_gif(Reel(_as_iterator(every), longest + _STILLS, _FILM_FPS, samples, keys), file)
+        colours = (_WHITE, BLACK, *_COLOURS.values())
+        keys = np.array([[int(text[at : at + 2], 16) for at in (1, 3, 5)] for text in colours], np.uint8)
+        write_gif(Reel(every, longest + _STILLS, _FILM_FPS, samples, keys), file)
     return file
-
-
-def _as_iterator(pictures: Iterator[UInt8Array]) -> Iterator[UInt8Array]:
-    yield from pictures
 
 
 class _Pictures:

@@ -96,8 +96,8 @@ class Course:
 
     Example:
         >>> course = Course(np.array([[0.0, 0.0], [40.0, 0.0]]), 8.0)
-        >>> [course.velocity(np.array([x, 0.0]))[0].round(1).item() for x in (2.0, 39.9)]
-        [8.0, 2.1]
+        >>> [course.velocity(np.array([x, 0.0]))[0].round(1).item() for x in (2.0, 16.0, 30.0, 39.0)]
+        [8.0, 8.0, 8.0, 3.2]
     """
 
     def __init__(self, way: Float64Array, speed_m_s: float) -> None:
