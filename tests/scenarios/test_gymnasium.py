@@ -21,7 +21,7 @@ from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_clients.session.connected import ConnectedSession
-from caviar_protocol.errors import PayloadError, RunError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, VelocityCommand
@@ -219,6 +219,23 @@ def test_an_agent_that_the_run_does_not_wait_for_is_refused(tmp_path: Path) -> N
         session = ConnectedSession(run.endpoint, "agnet", (Input(topic="scene"),))
         with closing(session), pytest.raises(RunError, match=r"no service 'agnet'; did you mean 'agent'\?"):
             session.reset()
+
+
+def test_an_environment_of_another_scenario_does_not_begin_and_the_run_goes_on_without_it(
+    tmp_path: Path,
+) -> None:
+    with waiting(tmp_path, frames=4, episodes=1) as run:
+        with (
+            closing(BeamSelectionEnv("smoke", broker=run.endpoint)) as wrong,
+            pytest.raises(ScenarioError, match=r"has .*64 elements.* that scenario 'smoke' lacks, which has"),
+        ):
+            wrong.reset(seed=1)
+        with closing(run.environment()) as env:
+            env.reset(seed=1)
+            for _ in range(4):
+                truncated = env.step(np.int64(0))[3]
+            assert truncated
+        assert run.ended()[0] == 0
 
 
 def test_a_broker_that_is_killed_ends_the_next_step_and_not_this_process(tmp_path: Path) -> None:

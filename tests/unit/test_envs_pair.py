@@ -103,3 +103,23 @@ def test_mistakes_are_named() -> None:
         env.step({"pilot": STILL, "beams": np.int64(31)})
         with pytest.warns(UserWarning, match=r"no options of reset are called \['strat'\]; there are: start"):
             env.reset(seed=1, options={"strat": 1})
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"scenario": None}, "scenario=None; write a path"),
+        ({"flight": {"delivery": 2}}, "flight has no option 'delivery'; did you mean 'deliveries'"),
+        ({"flight": [1]}, r"flight=\[1\]; write options by name"),
+        ({"selection": {"obsrve": ("aod",)}}, "selection has no option 'obsrve'; did you mean 'observe'"),
+        ({"selection": {"broker": "tcp://127.0.0.1:5570"}}, "selection has no option 'broker'"),
+    ],
+)
+def test_options_that_are_not_there_are_named(options: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ScenarioError, match=expected):
+        UavPairEnv(**{"scenario": "uav-pair", **options})
+
+
+def test_actions_that_are_no_mapping_are_refused() -> None:
+    with pair() as env, pytest.raises(PayloadError, match="actions are None; write one for 'pilot'"):
+        env.step(None)  # type: ignore[arg-type]

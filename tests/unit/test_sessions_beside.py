@@ -11,8 +11,9 @@ import pytest
 from msgspec.structs import replace
 
 from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.connected import open_session
 from caviar_clients.session.embedded import EmbeddedSession
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Action, BeamChoice, Link, VelocityCommand
@@ -94,3 +95,19 @@ def test_an_agent_that_is_not_beside_is_named() -> None:
         session.reset(seed=1)
         with pytest.raises(PayloadError, match="no agent beside this one is 'beam'; there are: beams"):
             session.step({"action": EAST}, {"beam": {"action": beams(0)}})
+
+
+@pytest.mark.parametrize(
+    ("agent", "beside", "expected"),
+    [
+        ("pilto", (), "has no agent 'pilto'; its agents are: pilot, beams"),
+        ("pilot", ("beam",), "has no agent 'beam'; its agents are"),
+        ("pilot", ("world",), "has no agent 'world'; its agents are"),
+        ("pilot", ("pilot",), "write a tuple of names, each of them once"),
+        ("pilot", ("beams", "beams"), "write a tuple of names, each of them once"),
+        ("pilot", "beams", "beside='beams'; write a tuple of names"),
+    ],
+)
+def test_places_that_are_not_there_are_refused(agent: str, beside: tuple[str, ...], expected: str) -> None:
+    with pytest.raises(ScenarioError, match=expected):
+        open_session(checked_scenario("uav-pair"), agent, (Input(topic="scene"),), beside=beside)

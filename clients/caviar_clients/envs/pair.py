@@ -5,6 +5,7 @@ A `pettingzoo.ParallelEnv`: both agents decide each frame together.
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,13 +13,14 @@ from typing import Any
 
 import gymnasium
 
+from caviar_clients.envs.arguments import checked_path
 from caviar_clients.envs.base import BeamSelectionEnv, Observation, SessionEnv
 from caviar_clients.envs.uav_path import MOTION
 from caviar_clients.envs.uav_path_v1 import UavPathV1Env
 from caviar_clients.session.base import Session
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import open_session
-from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError, suggestion
 from caviar_protocol.host import install_command
 from caviar_protocol.scenario import Scenario
 
@@ -79,7 +81,9 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
         directory: str | Path | None = None,
         render_mode: str | None = None,
     ) -> None:
-        pilot, beams = _roles(checked_scenario(Path(scenario)), pilot, beams)
+        pilot, beams = _roles(checked_scenario(checked_path("scenario", scenario)), pilot, beams)
+        _check_options("selection", selection, BeamSelectionEnv)
+        _check_options("flight", flight, UavPathV1Env)
         at = {"broker": broker, "directory": directory, "render_mode": render_mode}
         self._selection = BeamSelectionEnv(scenario, agent=beams, **(selection or {}))
         self._pilot = _Pilot(scenario, self._selection, agent=pilot, **{**(flight or {}), **at})
@@ -137,10 +141,9 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
             RunError: No episode has begun, or the run has ended.
         """
         pilot, beams = self.possible_agents
-        if set(actions) != {pilot, beams}:
-            raise PayloadError(
-                f"actions are of {sorted(actions)}; write one for {pilot!r} and one for {beams!r}"
-            )
+        if not isinstance(actions, Mapping) or set(actions) != {pilot, beams}:
+            given = f"of {sorted(map(str, actions))}" if isinstance(actions, Mapping) else repr(actions)
+            raise PayloadError(f"actions are {given}; write one for {pilot!r} and one for {beams!r}")
         decided = {name: self._of[name].decided(actions[name]) for name in self.possible_agents}
         frame = self._pilot.session.step({"action": decided[pilot]}, {beams: {"action": decided[beams]}})
         moved = {name: self._of[name].moved(frame) for name in self.possible_agents}
@@ -186,6 +189,21 @@ class _Pilot(UavPathV1Env):
             beside=(self._selection.agent,),
             connect_timeout_s=self._connect_timeout_s,
         )
+
+
+def _check_options(name: str, given: object, environment: type[SessionEnv[Any]]) -> None:
+    """Raise `ScenarioError` for options that an environment does not take, or that the pair chooses."""
+    if given is None:
+        return
+    if not isinstance(given, Mapping):
+        raise ScenarioError(f"{name}={given!r}; write options by name: {name}={{'observe': ('aod',)}}")
+    ours = ("self", "scenario", "agent", "broker", "directory", "render_mode", "options")
+    inits = (vars(cls).get("__init__") for cls in inspect.getmro(environment) if cls is not object)
+    known = {name for init in inits if init is not None for name in inspect.signature(init).parameters}
+    for option in given:
+        if option not in known or option in ours:
+            hint = suggestion(str(option), sorted(known.difference(ours)))
+            raise ScenarioError(f"{name} has no option {option!r}; {hint}")
 
 
 def _roles(scenario: Scenario, pilot: str | None, beams: str | None) -> tuple[str, str]:

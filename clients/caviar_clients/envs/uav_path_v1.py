@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from caviar_clients.envs.arguments import checked_names
 from caviar_clients.envs.base import Moment, Observation
 from caviar_clients.envs.deliveries import MOST_ADDRESSES, Box, Deliveries, greatest_power, rotary_wing_power
 from caviar_clients.envs.uav_path import FlightEnv, point
@@ -159,6 +160,7 @@ class UavPathV1Env(FlightEnv):
         if "reward" in options:
             raise ScenarioError("the reward has parts of its own; leave reward=… out, or write weights={…}")
         # Under one name an observation has one shape, and these are scaled.
+        observe = checked_names("observe", observe)
         own = sorted(set(observe) & set(OWN_PARTS))
         if own:
             raise ScenarioError(f"{', '.join(own)} of observe is always observed; leave it out")

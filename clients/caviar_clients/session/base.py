@@ -15,7 +15,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario.rules import BEAM
 from caviar_services.service import Frame as Frame
-from caviar_services.service import Preparation, Prepared, Service, StepResult
+from caviar_services.service import Preparation, Prepared, RunInfo, Service, StepResult
 
 # On the wire: the agent chooses no seed, and the episode has that of the run.
 _NO_SEED = -1
@@ -173,9 +173,11 @@ class OutsideAgent(Service[OutsideSettings]):
     decide: ClassVar[Callable[[Frame], StepResult]]
     scenery_here: ClassVar[Callable[[Mapping[str, Path]], None]]
     first_seed: ClassVar[Callable[[], int]]
+    joined: ClassVar[Callable[[RunInfo], None]]
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Declare the actuators and, once `Session.reset` was called, the seed of the first episode."""
+        type(self).joined(self.run)
         type(self).scenery_here(preparation.assets)
         self.run.progress("waiting for the first reset", PATIENCE_S)
         seed = type(self).first_seed()
@@ -197,6 +199,7 @@ def declared(
     first_seed: Callable[[], int],
     decide: Callable[[Frame], StepResult],
     scenery_here: Callable[[Mapping[str, Path]], None] | None = None,
+    joined: Callable[[RunInfo], None] = lambda run: None,
 ) -> type[OutsideAgent]:
     """Make the class of an agent that decides outside of the run.
 
@@ -206,6 +209,7 @@ def declared(
         decide: Answers a frame.
         scenery_here: Gets the files of the run's scenery by asset name, before the first frame. None: they
             are not fetched.
+        joined: Gets what the run says about itself, before anything else.
     """
     fields = {
         "inputs": inputs,
@@ -213,5 +217,6 @@ def declared(
         "decide": staticmethod(decide),
         "uses_scenery": scenery_here is not None,
         "scenery_here": staticmethod(scenery_here or (lambda _: None)),
+        "joined": staticmethod(joined),
     }
     return type("OutsideAgent", (OutsideAgent,), fields)

@@ -19,7 +19,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_services.connection import Terminated, Termination
 from caviar_services.runner import CONNECT_TIMEOUT_S as CONNECT_TIMEOUT_S
 from caviar_services.runner import Runner
-from caviar_services.service import StepResult
+from caviar_services.service import RunInfo, StepResult
 
 IMPLEMENTATION = "gymnasium"
 LEAVE_S = 5.0
@@ -41,6 +41,7 @@ class ConnectedSession(Session):
         credentials: For a broker with keys; None: what the environment says.
         with_scenery: Whether `Session.scenery` is fetched.
         beside: Further services of that kind; with keys, those of ``credentials`` are all of theirs.
+        scenario: What the agent was made for; the first `reset` refuses a run of other devices. None: any.
     """
 
     def __init__(
@@ -52,8 +53,10 @@ class ConnectedSession(Session):
         credentials: Credentials | None = None,
         with_scenery: bool = False,
         beside: Sequence[str] = (),
+        scenario: Scenario | None = None,
     ) -> None:
         super().__init__(beside)
+        self._broker, self._scenario = broker, scenario
         self._grants: SimpleQueue[Frame | CaviarError] = SimpleQueue()
         self._results: SimpleQueue[StepResult | None] = SimpleQueue()
         self._seeds: SimpleQueue[int | None] = SimpleQueue()
@@ -63,7 +66,7 @@ class ConnectedSession(Session):
         self._decisions: OrderedDict[tuple[int, int], StepResult] = OrderedDict()
         self._termination = _Leaving(self)
         scenery_here = self._take_scenery if with_scenery else None
-        cls = declared(inputs, self._first_seed, self._decided, scenery_here)
+        cls = declared(inputs, self._first_seed, self._decided, scenery_here, self._joined)
         runner = Runner(
             agent,
             cls,
@@ -156,6 +159,20 @@ class ConnectedSession(Session):
             more = "; with more episodes (run.episodes of the scenario) it could be reset again"
             self._grants.put(RunError(f"the broker ended the run: {runner.ended}{more}"))
 
+    def _joined(self, run: RunInfo) -> None:
+        """Leave a run of another scenario: observations and actions would be of other users."""
+        if self._scenario is None:
+            return
+        here, there = _arrays(self._scenario), _arrays(run)
+        if here != there:
+            error = ScenarioError(
+                f"the run at {self._broker} has {_listed(there - here)} that scenario "
+                f"{self._scenario.run.name!r} lacks, which has {_listed(here - there)}; give the environment "
+                "the scenario that the broker runs"
+            )
+            self.leave(error)
+            raise Terminated(str(error))
+
     def _first_seed(self) -> int:
         if self._seed is None:
             self._seed = self._seeds.get()
@@ -185,6 +202,21 @@ class _Leaving(Termination):
 
     def end(self, status: int, last_words: str) -> None:
         self._session.leave(RunError(last_words))
+
+
+def _arrays(known: Scenario | RunInfo) -> frozenset[str]:
+    """Carriers and antennas, as what decides about observations and actions."""
+    antennas = (device for device in known.devices if device.kind == "antenna")
+    found = [
+        f"{device.role} {f'{device.on}/' if device.on else ''}{device.name} ({device.count} × "
+        f"{1 if device.array is None else device.array.size} elements)"
+        for device in antennas
+    ]
+    return frozenset([*found, *(f"carrier {carrier.name}" for carrier in known.carriers)])
+
+
+def _listed(names: frozenset[str]) -> str:
+    return ", ".join(sorted(names)[:6]) or "nothing else"
 
 
 def agent_of(scenario: Scenario, agent: str | None) -> str:
@@ -242,14 +274,22 @@ def open_session(
         connect_timeout_s: Time in which a broker has to answer [s].
 
     Raises:
-        ScenarioError: A broker and a directory are given; a broker records where it was started.
+        ScenarioError: The scenario has no such agents; or a broker and a directory are given, and a broker
+            records where it was started.
 
     Example:
         >>> from caviar_protocol.scenario import load_scenario
         >>> open_session(load_scenario("smoke"), "agent", (Input(topic="scene"),)).close()
     """
+    places = (agent, *((beside,) if isinstance(beside, str) else beside))
+    for place in places:
+        agent_of(scenario, place)
+    if isinstance(beside, str) or len(set(places)) != len(places):
+        raise ScenarioError(f"agent={agent!r}, beside={beside!r}; write a tuple of names, each of them once")
     if broker is None:
         return EmbeddedSession(scenario, agent, inputs, directory, with_scenery, beside)
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
-    return ConnectedSession(broker, agent, inputs, connect_timeout_s, credentials, with_scenery, beside)
+    return ConnectedSession(
+        broker, agent, inputs, connect_timeout_s, credentials, with_scenery, beside, scenario
+    )
