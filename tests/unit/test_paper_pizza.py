@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 pytest.importorskip("scipy", reason="SciPy is not installed")
 pytest.importorskip("matplotlib", reason="Matplotlib is not installed")
 from caviar_clients.cli.main import app
+from caviar_clients.paper.pizza import PAIRS, TRAINED, Report, Settings, Trained
 from caviar_clients.paper.pizza_beams import train_beams
-from caviar_clients.paper.pizza_flight import legs_between, train_pilot
-from caviar_clients.paper.pizza_play import Course, nearest_first
+from caviar_clients.paper.pizza_flight import Pilot, legs_between, train_pilot
+from caviar_clients.paper.pizza_play import Course, Flight, nearest_first
 from caviar_clients.paper.pizza_radio import RadioTable
-from caviar_clients.paper.pizza_tables import ratio_of
+from caviar_clients.paper.pizza_tables import comparisons, ratio_of
 from caviar_clients.paper.pizza_town import Ways, draw_places, draw_round, is_clear, is_free, points_along
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
@@ -81,6 +82,7 @@ def test_rounds_are_drawn_by_their_generator_alone_and_apart() -> None:
     assert is_free(first.places).all()
     apart = [math.dist(a, b) for a, b in itertools.combinations(first.places.tolist(), 2)]
     assert min(apart) >= 25.0
+    assert len(draw_round(5, np.random.default_rng(5), 8).addresses) == 8
     other = draw_round(4, np.random.default_rng(4), 4)
     assert not np.array_equal(first.places, other.places)
 
@@ -146,6 +148,37 @@ def test_ratios_have_the_interval_of_paired_logarithms() -> None:
     assert (found.low, found.high) == pytest.approx(
         (math.exp(logs.mean() - half), math.exp(logs.mean() + half)), rel=1e-5
     )
+
+
+def flight(seconds: float, efficiency: float, delivered: int) -> Flight:
+    """A flight at one rate, all of it out of sight."""
+    frames = round(2 * seconds)
+    never, rates = np.zeros(frames, np.bool_), np.full(frames, efficiency)
+    return Flight(seconds, delivered, (1, 2), (0, 0), np.zeros((frames, 2)), rates, never, never)
+
+
+def report(trained: list[Flight]) -> Report:
+    """Two episodes of two addresses, in which all but the trained pair need 40 s at 2 bit/s/Hz."""
+    draws = np.random.default_rng(0)
+    agent, experience = train_beams(town_of_two_beams(), 1, 5, draws)
+    pair = Trained(town_of_two_beams(), agent, experience, Pilot(2, draws), [])
+    flights = {name: [flight(40.0, 2.0, 2)] * 2 for name in PAIRS} | {TRAINED: trained}
+    rounds = [draw_round(seed, draws, 2) for seed in range(2)]
+    return Report(Settings(episodes=2, addresses=2), pair, rounds, flights, 100e6, 0.5, 1.0, 1.0)
+
+
+def test_tables_say_whether_targets_are_reached_and_by_how_much_one_is_missed() -> None:
+    good = "\n".join(one.markdown() for one in comparisons(report([flight(42.0, 3.0, 2)] * 2)))
+    assert "| time | 1.050 [1.050, 1.050] | ≤ 1.10 | yes |" in good
+    assert "| mean rate | 1.500 [1.500, 1.500] | ≥ 1.20 | yes |" in good
+    assert "misses" not in good
+    bad = "\n".join(
+        one.markdown() for one in comparisons(report([flight(50.0, 2.2, 1), flight(50.0, 0.0, 2)]))
+    )
+    assert "The time misses its target by 0.150." in bad
+    assert "The mean rate misses its target by 0.100." in bad
+    assert "before the last delivery, whose time is the whole episode: 1." in bad
+    assert "The ratio of rates is of 1 of 2 episodes" in bad
 
 
 @pytest.fixture(scope="module")

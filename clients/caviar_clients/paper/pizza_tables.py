@@ -151,8 +151,16 @@ def _missed(report: Report, times: Ratio, rates: Ratio) -> list[str]:
         notes.append(f"The time misses its target by {times.mean - MOST_TIME:.3f}.")
     if not rates.mean >= LEAST_RATE:
         notes.append(f"The mean rate misses its target by {LEAST_RATE - rates.mean:.3f}.")
+    asked = report.settings.addresses
+    unfinished = sum(flight.delivered < asked for pair in PAIRS for flight in report.flights[pair])
+    if unfinished:
+        notes.append(
+            f"Flights that ended before the last delivery, whose time is the whole episode: {unfinished}."
+        )
     if rates.episodes < len(report.rounds):
-        notes.append(f"The ratio of rates is of {rates.episodes} episodes: in the others one pair had none.")
+        notes.append(
+            f"The ratio of rates is of {rates.episodes} of {len(report.rounds)} episodes: in others one had none."
+        )
     return notes
 
 

@@ -40,6 +40,8 @@ _TURN_M = 3.0
 """Metres that a turn counts: the drone brakes for it."""
 _APART_M = 25.0
 """Least distance of the places of an episode."""
+_TRIES = 10_000
+"""Places that are drawn before all are drawn anew."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,11 @@ def draw_places(draws: np.random.Generator, count: int, apart_m: float = 0.0) ->
         x and y [m], Shape ``[count, 2]``.
     """
     found: list[Float64Array] = []
+    tries = 0
     while len(found) < count:
+        tries += 1
+        if tries % _TRIES == 0:  # those that were drawn leave no room for another one
+            found.clear()
         place = draws.uniform(_LOW_M, _HIGH_M).round(1)
         if is_free(place) and all(np.hypot(*(place - other)) >= apart_m for other in found):
             found.append(place)
