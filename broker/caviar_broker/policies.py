@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,7 @@ from caviar_broker.control.socket import RequestRefusedError, ask
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.policies import FILE, SHA256, USE, PolicyFolder
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
 
 POLL_S = 0.05
@@ -33,7 +38,7 @@ def given_policies(
 
     Raises:
         ScenarioError: A file is not the one of ``sha256`` in the settings.
-        RunError: A file is too large, or cannot be kept.
+        RunError: A file is too large, cannot be kept, or was changed since a run kept it.
         AssetError: A file cannot be stored.
     """
     kept = PolicyFolder(directory) if directory is not None else None
@@ -42,10 +47,11 @@ def given_policies(
         if spec.role != "agent" or spec.use != USE:
             continue
         contents: list[bytes] = []
+        goes_on = kept is not None and bool(kept.digests(agent))
         if scenario.replay is not None and agent in scenario.replay.imposed:
             recorded = PolicyFolder(Path(scenario.replay.recording))
             contents = _contents(recorded, agent)
-        if kept is not None and kept.digests(agent):  # the broker of a run that goes on
+        if kept is not None and goes_on:
             contents = _contents(kept, agent)
         path = Path(str(spec.settings.get(FILE, "")).removeprefix("file:"))
         if not contents and path.is_file():
@@ -53,7 +59,7 @@ def given_policies(
         digests = []
         for content in contents:
             digests.append(store.add(f"policies/{agent}.onnx", content).digest)
-            if kept is not None:
+            if kept is not None and not goes_on:
                 kept.add(agent, content)
         pinned = spec.settings.get(SHA256)
         if pinned and digests and digests[0] != pinned:
@@ -70,7 +76,16 @@ def given_policies(
 
 def _contents(folder: PolicyFolder, agent: str) -> list[bytes]:
     files = folder.files(agent)
-    return [files[digest].read_bytes() for digest in folder.digests(agent)]
+    found = []
+    for digest in folder.digests(agent):
+        content = files[digest].read_bytes()
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise RunError(
+                f"{files[digest]} was changed since the run kept it: its SHA-256 is not the one in its name; "
+                "put the policy of that SHA-256 there"
+            )
+        found.append(content)
+    return found
 
 
 def offer_policy(directory: Path, agent: str, content: bytes) -> tuple[str, str]:
@@ -97,13 +112,33 @@ def offer_policy(directory: Path, agent: str, content: bytes) -> tuple[str, str]
         which = f"no agent {agent!r} serves policies" if agent else "several agents serve policies"
         raise RequestRefusedError(directory, f"{which}; name one of {', '.join(agents)}")
     folder = PolicyFolder(directory)
-    new = folder.add(agent, content)
-    try:
-        ask(directory, do="swap", agent=agent, sha256=new)
-    except RunError:
-        folder.remove(agent, new)
-        raise
+    with _alone(directory):
+        before = folder.digests(agent)
+        new = folder.add(agent, content)
+        try:
+            ask(directory, do="swap", agent=agent, sha256=new)
+        except RunError:
+            # A file that was there already may have decided frames.
+            if folder.digests(agent) != before:
+                folder.remove(agent, new)
+            raise
     return agent, new
+
+
+@contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Have one policy at a time kept and announced: the last file is the one that was announced last.
+
+    A broker that resumes the run goes by the files. A file system without locks locks nothing.
+    """
+    folder = RunDirectory(directory).policies
+    fd = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
 
 
 def policy_outcome(directory: Path, agent: str, digest: str) -> Mapping[str, Any]:

@@ -31,7 +31,9 @@ def token_file(**tokens: tuple[str, str]) -> str:
     return "\n".join(entries)
 
 
-TOKENS = token_file(look=("grafana", "viewer"), act=("ana", "operator"), part=("world", "world"))
+TOKENS = token_file(
+    look=("grafana", "viewer"), act=("ana", "operator"), part=("world", "world"), train=("gym", "trainer")
+)
 
 
 def test_questions_and_orders(tmp_path: Path) -> None:
@@ -127,6 +129,13 @@ def test_the_interface_describes_itself_with_examples(tmp_path: Path) -> None:
         ("/pause", "POST", "look", 403),
         ("/pause", "POST", "part", 403),
         ("/pause", "POST", "act", 200),
+        ("/pause", "POST", "train", 403),
+        ("/status", "GET", "train", 200),
+        ("/policies/agent", "POST", "", 401),
+        ("/policies/agent", "POST", "look", 403),
+        ("/policies/agent", "POST", "part", 403),
+        ("/policies/agent", "POST", "train", 409),  # let in: no agent of this run serves policies
+        ("/policies/agent", "POST", "act", 409),
         ("/healthz", "GET", "", 200),
     ],
 )

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from caviar_broker.policies import given_policies
+from caviar_broker import policies
+from caviar_broker.control.socket import RequestRefusedError
+from caviar_broker.policies import given_policies, offer_policy
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.policies import MAX_POLICY, PolicyFolder
@@ -80,6 +85,59 @@ def test_a_run_that_goes_on_has_what_it_was_given_and_not_the_file_of_today(tmp_
     store = AssetStore(tmp_path / "cache")
     assert given_policies(scenario, store, run) == {"agent": (digest_of(FIRST), digest_of(SECOND))}
     assert store.path(digest_of(SECOND)).read_bytes() == SECOND
+    assert len(PolicyFolder(run).digests("agent")) == 2, "brokers that follow one another add none"
+
+
+def test_a_kept_file_that_was_changed_is_named(tmp_path: Path) -> None:
+    scenario, run = serving(tmp_path), tmp_path / "run"
+    PolicyFolder(run).add("agent", FIRST)
+    file = PolicyFolder(run).files("agent")[digest_of(FIRST)]
+    file.write_bytes(FIRST[:-1])
+    with pytest.raises(RunError, match=r"0000-.*\.onnx was changed since the run kept it") as refused:
+        given_policies(scenario, AssetStore(tmp_path / "cache"), run)
+    assert str(file) in str(refused.value)
+
+
+class Broker:
+    """Answers what `offer_policy` asks; the order of what it announces is kept."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, refuses: str = "") -> None:
+        self.announced: list[str] = []
+        self._refuses = refuses
+        monkeypatch.setattr(policies, "ask", self.ask)
+
+    def ask(self, directory: Path, do: str, **given: str) -> dict[str, Any]:
+        if do == "policies":
+            return {"policies": {"agent": {}}}
+        if self._refuses:
+            raise RequestRefusedError(directory, self._refuses)
+        # Others come in between here, if they can.
+        for _ in range(200):
+            os.sched_yield()
+        self.announced.append(given["sha256"])
+        return {}
+
+
+def test_policies_given_at_once_are_kept_in_the_order_of_their_announcement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    PolicyFolder(tmp_path).add("agent", FIRST)
+    broker = Broker(monkeypatch)
+    with ThreadPoolExecutor(8) as several:
+        offered = [several.submit(offer_policy, tmp_path, "", bytes([n])) for n in range(8)]
+        assert {one.result()[1] for one in offered} == {digest_of(bytes([n])) for n in range(8)}
+    assert PolicyFolder(tmp_path).digests("agent") == (digest_of(FIRST), *broker.announced)
+
+
+def test_an_order_that_is_refused_keeps_what_was_there_and_nothing_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    PolicyFolder(tmp_path).add("agent", FIRST)
+    Broker(monkeypatch, refuses="the run is over")
+    for content in (FIRST, SECOND):
+        with pytest.raises(RequestRefusedError, match="the run is over"):
+            offer_policy(tmp_path, "agent", content)
+        assert PolicyFolder(tmp_path).digests("agent") == (digest_of(FIRST),)
 
 
 def test_a_file_that_is_not_the_pinned_one_is_refused_with_both(tmp_path: Path) -> None:
