@@ -8,9 +8,11 @@ import os
 import signal
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from scenarios_support import (
@@ -19,6 +21,7 @@ from scenarios_support import (
     environment,
     eventually,
     marked,
+    pid_of,
     recorded_below,
     running,
 )
@@ -164,3 +167,50 @@ def test_at_a_real_pace_no_frame_is_missed_while_policies_are_swapped(tmp_path: 
         "agent": 0,
         "link": 0,
     }
+
+
+def test_swaps_while_a_run_is_paused_and_its_agent_dies_begin_with_its_next_frames(tmp_path: Path) -> None:
+    files = [constant_policy(tmp_path / f"{pair}.onnx", pair) for pair in (3, 5, 9)]
+    digests = [PolicyModel(file).digest for file in files]
+    more = "\n[timeouts]\nrejoin_s = 30.0\n"
+    scenario, out = scenario_with(tmp_path, files[0].name, 4000, more), tmp_path / "out"
+    with running(scenario, out, "--http", "127.0.0.1:0", "--pace", "10") as (process, mark):
+        eventually(lambda: recorded_below(out) > 5, WITHIN_S, "frames are recorded")
+        directory = next(out.glob("*/"))
+        eventually(lambda: noted_url(directory), WITHIN_S, "HTTP is served")
+        url = noted_url(directory)
+        assert post(f"{url}/pause")[1]["paused"] is True
+        for file in files[1:]:
+            status, answer = post(f"{url}/policies/agent?wait=0", file.read_bytes())
+            assert (status, answer["state"]) == (200, "offered")
+        os.kill(pid_of(mark, "caviar_services agent"), signal.SIGKILL)
+        assert post(f"{url}/resume")[1]["paused"] is False
+        # Answered once a frame was decided by it: the same file again is no other order.
+        status, answer = post(f"{url}/policies/agent?wait=40", files[2].read_bytes())
+        assert (status, answer["state"]) == (200, "serving")
+        seen = recorded_below(out)
+        eventually(lambda: recorded_below(out) > seen + 5, WITHIN_S, "the run goes on")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+    before = decided(directory)
+    assert len(before) > seen, output
+    # The one in between was overtaken before it could decide a frame.
+    assert [before[0], before[-1]] == [digests[0], digests[2]]
+    assert before[answer["frame"] - 1 : answer["frame"] + 1] == [digests[0], digests[2]]
+    assert {*before} == {digests[0], digests[2]}
+    replayed(directory, tmp_path / "again")
+
+
+def noted_url(directory: Path) -> str:
+    """Where the HTTP process of a run serves; empty before it does."""
+    try:
+        return str(json.loads((directory / "control.json").read_text()).get("http", ""))
+    except (OSError, json.JSONDecodeError):
+        return ""
+
+
+def post(url: str, content: bytes = b"") -> tuple[int, dict[str, Any]]:
+    """Give an order over HTTP."""
+    request = urllib.request.Request(url, content, method="POST")  # noqa: S310
+    with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310
+        return answer.status, json.loads(answer.read())
