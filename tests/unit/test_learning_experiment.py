@@ -171,3 +171,19 @@ def test_other_algorithms_have_keys_of_their_own() -> None:
     found = parse_experiment(text).algorithm
     assert isinstance(found, Ppo)
     assert found.given() == {"gamma": 0.0, "n_steps": 64, "batch_size": 64, "clip_range": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("message", "key"),
+    [
+        ("no receiver of the scenario is last_beam", "my.toml:10: environment.options:"),
+        ("observe=3: 3 is no text", "my.toml:12: environment.options.observe:"),
+        ("observer is no option", "my.toml:10: environment.options:"),
+        ("'last_beam' is of packets", "my.toml:12: environment.options.observe:"),
+        ("'geometric' has no link", "my.toml:11: environment.options.scenario:"),
+        ("'geometric' and 'last_beam' do not fit", "my.toml:10: environment.options:"),
+    ],
+)
+def test_an_error_of_the_environment_is_placed_at_its_option(message: str, key: str) -> None:
+    place = parse_experiment(TEXT, "my.toml").place_of_option(message)
+    assert str(place.error(message)).startswith(key)

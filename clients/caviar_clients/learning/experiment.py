@@ -30,7 +30,8 @@ import hashlib
 import importlib
 import inspect
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -230,12 +231,36 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         encoded = msgspec.json.encode(made, order="deterministic")
         return hashlib.sha256(encoded + b"\n" + content).hexdigest()
 
+    def place_of_option(self, message: str) -> Place:
+        """Where the option of the environment stands that an error is about.
+
+        Args:
+            message: Of the error. It is about an option with whose name it begins, or whose value it quotes.
+        """
+        options, place = self.environment.options, self.place("environment", "options")
+        named = [name for name in options if re.match(rf"{re.escape(name)}(?![\w])", message)]
+        quoted = [name for name, value in options.items() if any(repr(t) in message for t in _texts(value))]
+        found = named or quoted
+        return place.at(found[0]) if len(found) == 1 else place
+
     def place(self, *names: str) -> Place:
         """Where a key stands in the file."""
         place = Place("", self.source)
         for name in names:
             place = place.at(name)
         return place
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All texts of an option."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _texts(item)
 
 
 def load_experiment(path: Path | str) -> Experiment:

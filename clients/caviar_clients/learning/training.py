@@ -138,7 +138,7 @@ def make_envs(experiment: Experiment) -> Any:
     except CaviarError as error:
         if isinstance(error, ScenarioError) and error.file:
             raise
-        raise place.error(str(error)) from error
+        raise experiment.place_of_option(str(error)).error(str(error)) from error
     except TypeError as error:
         raise place.error(f"{environment.id} does not take them: {error}") from error
     check_encodings(envs.observation_space, experiment.features, experiment.place("features"))
