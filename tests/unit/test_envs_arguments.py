@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -18,6 +20,7 @@ from caviar_clients.envs.arguments import (
     whole_numbers,
 )
 from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.scenario import find_scenario
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, "3", None, True, MOST_MEMBERS + 1, 10**9])
@@ -92,6 +95,16 @@ def test_an_environment_names_the_argument_that_is_wrong(
     if "broker" not in given:  # there vectors are refused for another reason
         with pytest.raises(ScenarioError, match=expected):
             gymnasium.make_vec(f"caviar/{name}-v0", num_envs=2, **given)
+
+
+def test_a_scenario_without_a_link_is_refused_when_the_environment_is_made(tmp_path: Path) -> None:
+    text = find_scenario("geometric").read_text().replace(', "link"', "")
+    before, _, after = text.partition("[services.link]")
+    file = tmp_path / "without.toml"
+    file.write_text(before + after[after.index("[services.agent]") :])
+    for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
+        with pytest.raises(ScenarioError, match=r"without\.toml:\d+: services: no service is a link, .*;"):
+            make("caviar/BeamSelection-v0", scenario=str(file))
 
 
 def test_an_action_of_radio_strike_is_two_whole_numbers() -> None:

@@ -28,6 +28,7 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.keys import credentials
 from caviar_protocol.messages import Input, Status
 from caviar_protocol.observations import Observer, Users, require_packets
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Action, BeamChoice, Link
 from caviar_protocol.topics.link import Command
 
@@ -109,6 +110,11 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
         self.scenario = checked_scenario(checked_path("scenario", scenario))
+        if not any(spec.role == "link" for spec in self.scenario.services.values()):
+            raise Place("services", self.scenario.source).error(
+                "no service is a link, which says what beams achieve; add [services.link] with "
+                'role = "link", use = "beams" and budget_ms'
+            )
         if reward in OF_PACKETS:
             require_packets(self.scenario, f"reward {reward!r}")
         # A program may make hundreds of environments: Python shows the same warning once.
