@@ -8,17 +8,15 @@ over ZeroMQ, and the embedded run between the frame clock and the services of on
 from __future__ import annotations
 
 import gc
-import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore, IncomingAsset
+from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import message_type
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError, ProtocolError, RunError
@@ -26,6 +24,7 @@ from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.validation import ContentCheck
+from caviar_services.asset_fetcher import AssetFetcher, FetchedFile
 from caviar_services.conversion import (
     Answer,
     Answers,
@@ -39,10 +38,7 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
-from caviar_services.own_files import OwnFiles
 from caviar_services.service import Frame, Preparation, Progress, Service, StepResult, no_progress
-
-_log = logging.getLogger("caviar.service")
 
 TRIM_EVERY = 10
 """Frames after which a service releases what it does not need."""
@@ -105,19 +101,18 @@ class ServiceSession:
     ) -> None:
         self.name, self.use, self.cls = name, use, cls
         self._send, self._store, self._progress = send, store, progress
-        self._encodes, self._tunes_memory, self._fetch_timeout_s = encodes, tunes_memory, fetch_timeout_s
+        self._encodes, self._tunes_memory = encodes, tunes_memory
         self._check = check or ContentCheck()
         # A frame clock in the same process repeats no GRANT: answers would be kept for nothing.
         self._answers = Answers() if check is None else None
         self._service: Service[Any] | None = None
         self._identity: dict[str, Any] = {}  # epoch and attempt, which stand in every message (clause 1)
         self._reset_to: m.Reset | None = None
-        # The service's own files, by digest.
-        self._found: dict[str, Path] = {}
+        self._found: dict[str, Path] = {}  # the service's own files, by digest
         # When free memory is given back next [s].
         self._trim_at = 0.0
-        self._fetch: _Fetch | None = None
-        self._files = OwnFiles(store, send, fetch_timeout_s)
+        self._files = AssetFetcher(store, send, fetch_timeout_s)
+        self._scenery = AssetFetcher(store, send, fetch_timeout_s, self._note_fetching)
         self._handlers: Mapping[type, Callable[[Any, Sequence[Any], float], None]] = {
             m.Welcome: self._welcome,
             m.Prepare: self._prepare,
@@ -149,8 +144,8 @@ class ServiceSession:
     @property
     def deadline(self) -> float | None:
         """When `expire` is due, on the clock of ``now`` [s]; None while nothing is awaited."""
-        fetch = None if self._fetch is None else self._fetch.deadline
-        return min((d for d in (fetch, self._files.deadline) if d is not None), default=None)
+        both = (self._scenery.deadline, self._files.deadline)
+        return min((due for due in both if due is not None), default=None)
 
     def hello(self, host: str = "", pid: int = 0) -> m.Hello:
         """HELLO, with which a service joins.
@@ -199,25 +194,15 @@ class ServiceSession:
         handler = self._handlers.get(type(message))
         if handler is None:
             self._unexpected(message, "it is not for a service that is in the run")
-        elif self._fetch is not None and type(message) not in _WHILE_FETCHING:
-            asset, self._fetch = self._fetch.asset, None
-            with self._reporting("prepare"):
-                raise ProtocolError(f"asked for asset {asset.name!r}, got {message_type(message)}")
+        elif self._scenery.awaited and type(message) not in _WHILE_FETCHING:
+            self._refuse_scenery(message_type(message))
         else:
             handler(message, parts, now)
 
     def expire(self, now: float) -> None:
-        """Report the scenery that has not come by `deadline`."""
+        """Report the files that have not come by `deadline`."""
         self._files.expire(now)
-        fetch = self._fetch
-        if fetch is None or now < fetch.deadline:
-            return
-        # First, so that an answer that comes after all is «not asked for» instead of half of a file.
-        self._fetch = None
-        with self._reporting("prepare"):
-            raise AssetError(
-                f"the broker did not deliver asset {fetch.asset.name!r} within {self._fetch_timeout_s:g} s"
-            )
+        self._scenery.expire(now)
 
     def leave(self, reason: str) -> None:
         """Say BYE, if the service is in the run."""
@@ -256,74 +241,65 @@ class ServiceSession:
                 self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())
             self._found = {}
             if own := service.own_files:
-                self._files.fetch(own, partial(self._own_file, order, offered, len(own)), now)
+                self._files.fetch(own, partial(self._own_file, order, offered), now)
             else:
                 self._fetch_scenery(order, offered, now)
 
-    def _own_file(
-        self,
-        order: m.Prepare,
-        offered: Sequence[m.Asset],
-        count: int,
-        digest: str,
-        path: Path | None,
-        reason: str,
-        now: float,
-    ) -> None:
+    def _own_file(self, order: m.Prepare, offered: Sequence[m.Asset], file: FetchedFile, now: float) -> None:
         """Take one of the service's own files; with the last one go on preparing."""
         with self._reporting("prepare"):
-            if path is None:
-                raise AssetError(reason)
-            self._found[digest] = path
-            if len(self._found) == count:
+            if file.path is None:
+                self._files.stop()
+                raise AssetError(file.reason)
+            self._found[file.digest] = file.path
+            if not self._files.awaited:
                 self._fetch_scenery(order, offered, now)
 
     def _fetch_scenery(self, order: m.Prepare, offered: Sequence[m.Asset], now: float) -> None:
-        if self.running.needs_assets:
-            # By content, not by name: what an earlier run fetched is not fetched again.
-            missing = [asset for asset in order.assets if not self._store.holds(asset)]
-            self._fetch_assets(_Fetch(order, missing, len(missing)), now)
-        else:
+        # By content, not by name: what an earlier run fetched is not fetched again.
+        if not self.running.needs_assets:
             self._load(order, offered)
+        elif missing := [asset for asset in order.assets if not self._store.holds(asset)]:
+            self._scenery.fetch(missing, partial(self._scenery_file, order), now)
+        else:
+            self._load(order, order.assets)
 
-    def _fetch_assets(self, fetch: _Fetch, now: float) -> None:
-        """Ask the broker for the next chunk that this machine does not hold yet (clause 4), or load."""
-        if not fetch.missing:
-            self._load(fetch.order, fetch.order.assets)
-            return
-        if fetch.incoming is None:
-            number = fetch.count - len(fetch.missing) + 1
-            self._progress(f"fetching scenery, file {number} of {fetch.count}", 0.0)
-            fetch.incoming = IncomingAsset(self._store, fetch.asset)
-        # Chunk by chunk, each asked for: large scenery does not fill the queues that control messages take.
-        fetch.deadline = now + self._fetch_timeout_s
-        self._fetch = fetch
-        self._send(m.AssetGet(digest=fetch.asset.digest, offset=fetch.incoming.offset), ())
+    def _note_fetching(self, number: int, count: int) -> None:
+        self._progress(f"fetching scenery, file {number} of {count}", 0.0)
+
+    def _scenery_file(self, order: m.Prepare, file: FetchedFile, _: float) -> None:
+        """Take one file of the scenery; with the last one go on preparing."""
+        with self._reporting("prepare"):
+            if file.path is None:
+                # So that an answer that comes after all is «not asked for» instead of half of a file.
+                self._scenery.stop()
+                raise AssetError(file.reason)
+            if not self._scenery.awaited:
+                self._load(order, order.assets)
+
+    def _refuse_scenery(self, what: str) -> None:
+        """Report what came in place of a file of the scenery, and fetch no more of it."""
+        name = self._scenery.name
+        self._scenery.stop()
+        with self._reporting("prepare"):
+            raise ProtocolError(f"asked for {name}, got {what}")
 
     def _asset_data(self, data: m.AssetData, parts: Sequence[Any], now: float) -> None:
         if data.digest == self._files.awaited:
             self._files.data(data, parts[0], now)
-            return
-        fetch, self._fetch = self._fetch, None
-        if fetch is None or fetch.incoming is None:
+        elif not self._scenery.awaited:
             self._unexpected(data, "no asset was asked for")
-            return
-        with self._reporting("prepare"):
-            if data.digest != fetch.asset.digest:
-                raise ProtocolError(f"asked for asset {fetch.asset.name!r}, got that of digest {data.digest}")
-            if fetch.incoming.add_chunk(data.offset, data.size, parts[0]):
-                fetch.missing.pop(0)
-                fetch.incoming = None
-            self._fetch_assets(fetch, now)
+        elif data.digest != self._scenery.awaited:
+            self._refuse_scenery(f"that of digest {data.digest}")
+        else:
+            with self._reporting("prepare"):
+                self._scenery.data(data, parts[0], now)
 
     def _error(self, error: m.Error, _: Sequence[Any], now: float) -> None:
         if error.subject and error.subject == self._files.awaited:
             self._files.fail(error.message, now)
-        fetch = self._fetch
-        if fetch is not None and error.subject == fetch.asset.digest:
-            self._fetch = None
-            with self._reporting("prepare"):
-                raise AssetError(f"the broker cannot deliver asset {fetch.asset.name!r}: {error.message}")
+        if error.subject and error.subject == self._scenery.awaited:
+            self._scenery.fail(f"the broker cannot deliver {self._scenery.name}: {error.message}", now)
 
     def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
         files = self._store.folder_of(assets) if assets else {}
@@ -394,8 +370,8 @@ class ServiceSession:
                     trim_memory()
                     self._trim_at = now + TRIM_S
 
-    def _wanted_file(self, digest: str, path: Path | None, reason: str, _: float) -> None:
-        self.running.take_file(digest, path, reason)
+    def _wanted_file(self, file: FetchedFile, _: float) -> None:
+        self.running.take_file(file.digest, file.path, file.reason)
 
     def compute(self, frame: Frame) -> StepResult | None:
         """Have the service compute a frame that no GRANT granted: in one process, without a clock.
@@ -514,21 +490,6 @@ class ServiceSession:
     def _unexpected(self, message: m.Message, why: str) -> None:
         kind = message_type(message)
         self._send(m.Error(code="unexpected", of=kind, message=f"{kind} is not used: {why}"), ())
-
-
-@dataclass
-class _Fetch:
-    """Scenery on its way from the broker."""
-
-    order: m.Prepare
-    missing: list[m.Asset]
-    count: int
-    incoming: IncomingAsset | None = None
-    deadline: float = 0.0
-
-    @property
-    def asset(self) -> m.Asset:
-        return self.missing[0]
 
 
 # What may come between a request for scenery and its answer; anything else is a mistake of the broker.
