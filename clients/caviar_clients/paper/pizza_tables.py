@@ -158,9 +158,8 @@ def _missed(report: Report, times: Ratio, rates: Ratio) -> list[str]:
             f"Flights that ended before the last delivery, whose time is the whole episode: {unfinished}."
         )
     if rates.episodes < len(report.rounds):
-        notes.append(
-            f"The ratio of rates is of {rates.episodes} of {len(report.rounds)} episodes: in others one had none."
-        )
+        kept = f"{rates.episodes} of {len(report.rounds)} episodes"
+        notes.append(f"The ratio of rates is of {kept}: in others one pair had none.")
     return notes
 
 
