@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array  # type: ignore[import-untyped]
-from scipy.sparse.csgraph import dijkstra  # type: ignore[import-untyped]
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.errors import ScenarioError
@@ -192,6 +190,10 @@ class Ways:
         Returns:
             The ways; a metre at the best rate costs 1.
         """
+        # Late: the base install has no SciPy.
+        from scipy.sparse import csr_array  # type: ignore[import-untyped]
+        from scipy.sparse.csgraph import dijkstra  # type: ignore[import-untyped]
+
         one, other = self.nodes[self._ends[0]], self.nodes[self._ends[1]]
         length = self._length[tuple(self._ends)]
         along = np.ones_like(length)
