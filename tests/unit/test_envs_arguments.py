@@ -85,6 +85,9 @@ def test_actions_have_one_of_the_shapes() -> None:
         ("BeamSelection", {"scenario": "geometric", "broker": 3}, "broker=3; write its address"),
         ("RadioStrike", {"episodes": 3}, "episodes=3; write a path, or a list"),
         ("RadioStrike", {"episodes": [3]}, "episodes has 3; write paths"),
+        ("RadioStrike", {"users": 3}, "users=3: 3 is no text"),
+        ("RadioStrike", {"users": ("uav", "car", "bus")}, r"users=\('uav', 'car', 'bus'\) is of a recording"),
+        ("RadioStrike", {"base_station": "bs"}, "base_station='bs' is of a recording; name its directory"),
     ],
 )
 def test_an_environment_names_the_argument_that_is_wrong(

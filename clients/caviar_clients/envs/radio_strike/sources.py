@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from caviar_clients.envs.arguments import checked_names
 from caviar_clients.envs.radio_strike.rules import USERS
 from caviar_clients.envs.radio_strike.trajectories import SLOT_S, Episode, read_episode
 from caviar_protocol.arrays import Float64Array
@@ -168,7 +169,14 @@ def episode_loaders(
         >>> [load().steps for load in episode_loaders(Episode("hover", np.full((7, 3, 3), 10.0)))]
         [7]
     """
+    if users is not None:
+        users = checked_names("users", users)
     if sources is None:
+        for name, value in (("users", users), ("base_station", base_station)):
+            if value is not None:
+                raise ScenarioError(
+                    f"{name}={value!r} is of a recording; name its directory as episodes=…, or leave it out"
+                )
         return [partial(synthetic_episode, number) for number in range(SYNTHETIC_EPISODES)]
     kinds = str | Path | Episode | Recording
     if not isinstance(sources, kinds | Iterable) or isinstance(sources, bytes):
