@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from scenarios_support import (
     Finished,
     caviar,
@@ -34,7 +35,7 @@ from policy_files import constant_policy, scenario_with
 
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.reader import recorded_decisions
-from caviar_services.agent.policy import PolicyModel
+from caviar_services.agent.policy import CARD_KEY, PolicyModel, read_card, write_card
 
 WITHIN_S = 40.0
 OTHERS = {
@@ -64,6 +65,18 @@ def swapped(directory: Path, file: Path) -> Finished:
     done = caviar("swap", file, "--run", directory)
     assert done.status == 0, done.output
     return done
+
+
+def carded(policy: Path, file: Path, observe: tuple[str, ...]) -> Path:
+    """A policy as it is, with a card that says that it observes something else."""
+    import onnx
+
+    model = onnx.load(str(policy))
+    card = replace(read_card(model.metadata_props[0].value), observe=observe)
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {CARD_KEY: write_card(card)})
+    file.write_bytes(model.SerializeToString())
+    return file
 
 
 @contextlib.contextmanager
@@ -158,6 +171,13 @@ def test_at_a_real_pace_no_frame_is_missed_while_policies_are_swapped(tmp_path: 
         directory = next(out.glob("*/"))
         for file in files[1:]:
             swapped(directory, file)
+        # Its refusal quotes the card, which is longer than any message may be.
+        refused = caviar(
+            "swap", carded(files[0], tmp_path / "long.onnx", ("x" * 1_200_000,)), "--run", directory
+        )
+        assert refused.status == 1
+        assert "no observation is called 'xxx" in refused.output
+        assert len(refused.output) < 1000
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 0, output
     assert len({*decided(directory)}) == 3

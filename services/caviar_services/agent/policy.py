@@ -34,6 +34,8 @@ CARD_KEY = "caviar.card"
 """Key of the card in the metadata of an ONNX file."""
 ACTION = "action"
 """Name of the output with the action."""
+MAX_REASON = 500
+"""Characters of the reason for which a policy is refused: it travels in the header of a DONE."""
 
 
 class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
@@ -280,7 +282,7 @@ class PolicyAgent(Agent[PolicySettings]):
     def take_file(self, digest: str, path: Path | None, reason: str) -> None:
         """Load a policy in a thread of its own, beside the frames."""
         if path is None:
-            self._refused[digest] = reason
+            self._refused[digest] = _reason(reason)
             return
         self._paths[digest] = path
         load = threading.Thread(target=self._load_beside, args=(digest, path), name="policy", daemon=True)
@@ -291,7 +293,7 @@ class PolicyAgent(Agent[PolicySettings]):
         try:
             served = self._load(path, called, digest)
         except Exception as error:  # whatever a strange file brings about: the run goes on with what it has
-            self._refused[digest] = (str(error) or type(error).__name__).partition("\n")[0]
+            self._refused[digest] = _reason(str(error) or type(error).__name__)
         else:
             self._loaded[digest] = served
 
@@ -340,6 +342,12 @@ class PolicyAgent(Agent[PolicySettings]):
                 )
             tx_beam, rx_beam = divmod(int(index), pair.rx.array.size)
             yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
+
+
+def _reason(text: str) -> str:
+    """What a refusal says: its text has what stands in the file, which may be anything of any length."""
+    line = "".join(c if c.isprintable() else "?" for c in text.partition("\n")[0][: MAX_REASON + 1])
+    return line if len(line) <= MAX_REASON else line[:MAX_REASON] + "…"
 
 
 def _codebooks(sizes: Sequence[tuple[int, int]]) -> str:
