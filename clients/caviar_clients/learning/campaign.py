@@ -83,7 +83,8 @@ def train_experiments(
     """Train all seeds of several experiments, or go on with those that are left.
 
     Args:
-        experiments: What is trained, in this order.
+        experiments: What is trained, in this order: the first seed of each, then the second ones, so that
+            a training that is stopped has as many seeds of each as there was time for.
         root: Folder in which those of the experiments are made.
         jobs: Seeds at a time, of whatever experiments. 1: in this process; else each in a process of its own.
         report: Called with the name of an experiment and the progress of a seed, a few times a second.
@@ -101,11 +102,12 @@ def train_experiments(
     left: list[_Training] = []
     for experiment in experiments:
         folder, subject = prepare_folder(experiment, root), experiment.experiment
-        for seed in subject.seeds:
+        for index, seed in enumerate(subject.seeds):
             if read_result(folder, seed) is None:
-                left.append(_Training(experiment, seed, folder))
+                left.append(_Training(experiment, seed, folder, index))
             else:
                 report(subject.name, Progress(seed=seed, steps=subject.steps))
+    left.sort(key=lambda training: training.turn)
 
     def done(training: _Training) -> None:
         if not keep_checkpoints:
@@ -203,6 +205,8 @@ class _Training(NamedTuple):
     experiment: Experiment
     seed: int
     folder: Path
+    turn: int
+    """Place of the seed in the list of the experiment."""
 
     @property
     def name(self) -> str:
@@ -243,7 +247,7 @@ def _train_in_processes(
 def _start(training: _Training) -> tuple[Connection, Any]:
     context = multiprocessing.get_context("spawn")  # what is forked has the threads of PyTorch no more
     pipe, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(theirs, *training), daemon=True)
+    process = context.Process(target=_serve, args=(theirs, *training[:3]), daemon=True)
     process.start()
     theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
     return pipe, process

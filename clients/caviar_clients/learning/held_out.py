@@ -123,9 +123,14 @@ def recorded_episodes(recording: Path, users: Sequence[str]) -> Episodes:
 
     Args:
         recording: Directory of a run.
-        users: Their receivers, as names with ``*`` and ``?``.
+        users: Names of their receivers, in the order of the episodes.
+
+    Raises:
+        ScenarioError: The recording has none of these users.
+        RecordingError: The recording cannot be read.
     """
     envs = RecordedBeamsVectorEnv(len(users), [recording], OBSERVED, users=users, normalization="unit")
-    tracks = list(range(len(users)))
+    found = [track.user[1] for track in envs.tracks.tracks]
+    tracks = sorted(range(len(found)), key=lambda index: users.index(found[index]))
     period_s = envs.tracks.scenario.run.sampling_period_ns * 1e-9
     return Episodes(envs, {"seed": 0, "options": {"tracks": tracks}}, period_s)

@@ -46,8 +46,8 @@ _SCENARIOS: Mapping[ChannelName, str] = {
 }
 FLIGHTS = "munich-flights"
 """Folder of the recorded flights."""
-HELD_OUT = ("uav0/*", "uav5/*", "uav10/*", "uav15/*")
-"""Flights that no policy is trained on; the first is that of ``uav-munich``."""
+HELD_OUT = ("uav10/rx10", "uav0/rx0", "uav5/rx5", "uav15/rx15")
+"""Receivers on flights that no policy is trained on; the first is drawn: no other UAV ever shadows it."""
 FIRST_EPISODE = 1000
 """Seed of the first episode of the geometric channel that policies are judged on."""
 QUICK = 1 / 15
