@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -347,3 +348,22 @@ def test_a_copy_of_a_checkpoint_is_none(tmp_path: Path) -> None:
     for name in ("000000000035", "000000000070.old", "000000000070 (copy)"):
         (tmp_path / name).mkdir()
     assert newest_checkpoint(tmp_path) == tmp_path / "000000000035"
+
+
+def test_a_disk_that_is_full_at_the_end_is_named_and_the_checkpoint_stays(
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    save = BaseAlgorithm.save
+
+    def full(model: Any, path: Path, *others: Any, **options: Any) -> None:
+        if path == tmp_path / "seed-1" / "model.zip":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(model, path, *others, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(BaseAlgorithm, "save", full)
+        with pytest.raises(RunError, match=r"cannot write .*model\.zip: No space left on device"):
+            train_seed(experiment(short), 1, tmp_path)
+    assert train_seed(experiment(short), 1, tmp_path).steps >= STEPS

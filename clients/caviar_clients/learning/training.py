@@ -208,7 +208,8 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
                     _train_chunk(model, total, seed, callback)
                 save_checkpoint(mine / CHECKPOINTS, model)
         report(_progress(model, seed))
-        model.save(mine / MODEL)
+        with writing(mine / MODEL):
+            model.save(mine / MODEL)
         policy = _export(experiment, model, mine / POLICY, seed)
     finally:
         envs.close()
