@@ -49,7 +49,7 @@ class Settings:
     """Between the receivers of the radio table that the agents are trained in [m]."""
     beam_steps: int = 12_000
     """Of training of the agent that chooses beams, of 64 drones each."""
-    pilot_steps: int = 12_000
+    pilot_steps: int = 8_000
     """Of training of the agent that flies, of 64 episodes each."""
     places: int = 240
     """Drawn at random, which training flies between."""
@@ -135,7 +135,7 @@ def experiment(
     rounds = [
         draw_round(
             derive_seed(settings.seed, index, "pizza/episode"),
-            generator(settings.seed, index, "pizza/held-out"),
+            generator(settings.seed, index, "pizza/round"),
             settings.addresses,
         )
         for index in range(settings.episodes)
