@@ -13,7 +13,7 @@ from typing import Any
 
 from caviar_broker.control.socket import RequestRefusedError, ask
 from caviar_protocol.assets import AssetStore
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.errors import AssetError, RunError, ScenarioError
 from caviar_protocol.policies import FILE, SHA256, USE, PolicyFolder
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
@@ -103,7 +103,8 @@ def offer_policy(directory: Path, agent: str, content: bytes) -> tuple[str, str]
         RequestRefusedError: The broker refuses it; the text says why.
         RunError: No broker runs there, or the file cannot be kept.
     """
-    agents = ask(directory, do="policies")["policies"]
+    known = ask(directory, do="policies")
+    agents = known["policies"]
     if not agents:
         raise RequestRefusedError(directory, 'no agent of the run serves policies (use = "policy")')
     if not agent and len(agents) == 1:
@@ -116,6 +117,8 @@ def offer_policy(directory: Path, agent: str, content: bytes) -> tuple[str, str]
         before = folder.digests(agent)
         new = folder.add(agent, content)
         try:
+            # Hashed and stored here, and not between the frames of the broker.
+            _store(Path(known["store"]), agent, content)
             ask(directory, do="swap", agent=agent, sha256=new)
         except RunError:
             # A file that was there already may have decided frames.
@@ -123,6 +126,14 @@ def offer_policy(directory: Path, agent: str, content: bytes) -> tuple[str, str]
                 folder.remove(agent, new)
             raise
     return agent, new
+
+
+def _store(folder: Path, agent: str, content: bytes) -> None:
+    """Put a policy where the broker's peers fetch files from."""
+    try:
+        AssetStore(folder).add(f"policies/{agent}.onnx", content)
+    except AssetError as error:
+        raise RunError(str(error)) from error
 
 
 @contextmanager

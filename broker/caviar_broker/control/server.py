@@ -231,7 +231,8 @@ class ControlServer:
         return self._ordered(ev.StopRequested(reason), "")
 
     def _policies(self, _: Mapping[str, Any]) -> Answer:
-        return {"ok": True, "policies": msgspec.to_builtins(self.server.clock.policies)}
+        served = msgspec.to_builtins(self.server.clock.policies)
+        return {"ok": True, "policies": served, "store": str(self.server.store.folder)}
 
     def _swap(self, request: Mapping[str, Any]) -> Answer:
         """Announce a policy that was put into the run's directory to the agent that shall serve it."""
@@ -242,14 +243,17 @@ class ControlServer:
         path = self._given.files(agent).get(str(digest))
         if path is None:
             return _refusal(f"sha256 is {digest!r:.80}, and there is no such file in policies/{agent}")
-        try:
-            found = self.server.store.add(f"policies/{agent}.onnx", path)
-        except AssetError as error:
-            return _refusal(str(error))
-        if found.digest != digest:
-            return _refusal(f"{path} has the SHA-256 {found.digest}: it was changed")
-        text = f"policy {found.digest[:12]}… is offered to {agent}"
-        return self._ordered(ev.PolicyOffered(agent, found.digest), text)
+        # Who asks has put it there: to hash a large file here would hold up the frames of everybody. The
+        # agent looks at the hash too.
+        if not self.server.store.path(wanted := str(digest)).is_file():
+            try:
+                found = self.server.store.add(f"policies/{agent}.onnx", path)
+            except AssetError as error:
+                return _refusal(str(error))
+            if found.digest != wanted:
+                return _refusal(f"{path} has the SHA-256 {found.digest}: it was changed")
+        text = f"policy {wanted[:12]}… is offered to {agent}"
+        return self._ordered(ev.PolicyOffered(agent, wanted), text)
 
     def _ordered(self, event: ev.Event, text: str) -> Answer:
         if self.server.outcome is not None or self.server.clock.over:
