@@ -16,7 +16,7 @@ TUNED, ANGLE = "DQN, tuned", "DQN, tuned, angle alone"
 
 _SEEDS = (
     "Means over frames of {episodes} episodes that no policy was trained on; ± is the 95 % interval over "
-    "{seeds} seeds of training, all judged on the same episodes. «of los-beam»: ratio of means."
+    "the seeds of training ({seeds}), all judged on the same episodes. «of los-beam»: ratio of means."
 )
 _PAPER = (
     "The paper refers to others for the distributions of its multipath components, and says nothing of their "
