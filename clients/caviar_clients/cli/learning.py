@@ -1,4 +1,4 @@
-"""``caviar train``, ``caviar export-policy`` and ``caviar evaluate``: trained policies."""
+"""``caviar train``, ``caviar export-policy``, ``caviar evaluate`` and ``caviar swap``: trained policies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from caviar_clients.cli.shared import print_line, progress_bar, require_writable, write_json
-from caviar_protocol.errors import ScenarioError, SetupError
+from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 
 if TYPE_CHECKING:
@@ -241,3 +241,34 @@ def _settings_of(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
             )
         found.setdefault(agent, {})[key] = value.strip()
     return {agent: typed(changes, load("agent", agent).Settings) for agent, changes in found.items()}
+
+
+def swap_command(
+    policy: Annotated[Path, typer.Argument(help="ONNX file of the policy", show_default=False)],
+    run: Annotated[
+        Path | None, typer.Option(help="directory of the run; by default the newest in ./runs")
+    ] = None,
+    agent: Annotated[str, typer.Option(help="name of the agent; may be left out where there is one")] = "",
+    wait: Annotated[float, typer.Option(help="seconds that the agent may take", min=0)] = 30.0,
+) -> None:
+    """Give an agent of a running run another policy; the run goes on meanwhile."""
+    from caviar_broker.policies import awaited_outcome, offer_policy
+    from caviar_clients.cli.remote import RUNS, newest_run
+
+    directory = run if run is not None else newest_run(RUNS)
+    try:
+        content = policy.read_bytes()
+    except OSError as error:
+        raise RunError(
+            f"{policy} cannot be read: {error.strerror}; give the ONNX file of a policy"
+        ) from error
+    name, digest = offer_policy(directory, agent, content)
+    found = awaited_outcome(directory, name, digest, wait)
+    if found["state"] == "refused":
+        raise RunError(f"agent {name!r} refuses {policy}, and stays with its policy: {found['reason']}")
+    if found["state"] == "offered":
+        raise RunError(
+            f"agent {name!r} has not decided a frame with {policy} within {wait:g} s, and will as soon "
+            f"as it can: caviar why {directory} says what the run waits for"
+        )
+    typer.echo(f"{name} serves {policy} (SHA-256 {digest[:12]}…) from frame {found['frame']} on")

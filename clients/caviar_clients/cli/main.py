@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from caviar_clients.cli.keys import app as keys
-from caviar_clients.cli.learning import evaluate_command, export_command, train_command
+from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
 from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
     Embedded,
@@ -209,21 +209,6 @@ def why(
     from caviar_clients.cli.remote import why_command
 
     why_command(run, _console)
-
-
-@app.command(rich_help_panel=OPERATE)
-def swap(
-    policy: Annotated[Path, typer.Argument(help="ONNX file of the policy", show_default=False)],
-    run: Annotated[
-        Path | None, typer.Option(help="directory of the run; by default the newest in ./runs")
-    ] = None,
-    agent: Annotated[str, typer.Option(help="name of the agent; may be left out where there is one")] = "",
-    wait: Annotated[float, typer.Option(help="[s] for the agent to take it", min=0)] = 30.0,
-) -> None:
-    """Give an agent of a running run another policy; the run goes on meanwhile."""
-    from caviar_clients.cli.remote import swap_command
-
-    swap_command(policy, run, agent, wait)
 
 
 @app.command(rich_help_panel=OPERATE)
@@ -490,6 +475,7 @@ def tradeoff(
 app.command("train", rich_help_panel=RUN)(train_command)
 app.command("evaluate", rich_help_panel=MEASURE)(evaluate_command)
 app.command("export-policy", rich_help_panel=OPERATE)(export_command)
+app.command("swap", rich_help_panel=OPERATE)(swap_command)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -150,39 +150,6 @@ def why_command(run: Path | None, console: Console) -> None:
         print_line(console, line)
 
 
-def swap_command(policy: Path, run: Path | None, agent: str, wait_s: float) -> None:
-    """Give an agent another policy, and print from which frame on it serves.
-
-    Args:
-        policy: The ONNX file.
-        run: The run's directory; None: that of the newest one that runs below ``./runs``.
-        agent: Name of the agent; empty: the only one that serves policies.
-        wait_s: How long the agent may take [s].
-
-    Raises:
-        RunError: No broker runs there, the file cannot be read, or the policy is refused.
-    """
-    from caviar_broker.policies import awaited_outcome, offer_policy
-
-    directory = run if run is not None else newest_run(RUNS)
-    try:
-        content = policy.read_bytes()
-    except OSError as error:
-        raise RunError(
-            f"{policy} cannot be read: {error.strerror}; give the ONNX file of a policy"
-        ) from error
-    name, digest = offer_policy(directory, agent, content)
-    found = awaited_outcome(directory, name, digest, wait_s)
-    if found["state"] == "refused":
-        raise RunError(f"agent {name!r} refuses {policy}, and stays with its policy: {found['reason']}")
-    if found["state"] == "offered":
-        raise RunError(
-            f"agent {name!r} has not decided a frame with {policy} within {wait_s:g} s, and will as soon "
-            f"as it can: caviar why {directory} says what the run waits for"
-        )
-    typer.echo(f"{name} serves {policy} (SHA-256 {digest[:12]}…) from frame {found['frame']} on")
-
-
 def newest_run(root: Path) -> Path:
     """Find the run below a folder whose broker was started last and is still noted there.
 
