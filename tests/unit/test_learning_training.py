@@ -224,7 +224,7 @@ def test_a_seed_is_trained_by_one_process_at_a_time(
         (
             '"last_beam"',
             '"last_bean"',
-            "my.toml:10: environment.options: no observation is called 'last_bean'",
+            "my.toml:13: environment.options.observe: no observation is called 'last_bean'",
         ),
         ("features.position", "features.positon", "my.toml:16: features.positon: 'positon' is not observed"),
         (
