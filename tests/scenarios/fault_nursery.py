@@ -203,14 +203,14 @@ _case = Case(scenario="", directory="")
 
 def follow(case: Case) -> Result:
     """Run a case as ``caviar run`` would."""
-    from caviar_clients.cli import launch
+    from caviar_clients.cli import launch, processes
     from caviar_protocol.errors import CaviarError
     from caviar_protocol.scenario import load_scenario
 
     global _case
     _case = case
-    # Of the broker, and of the services.
-    launch.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": Forked})  # type: ignore[attr-defined]
+    for module in (launch, processes):  # of the broker, and of the services
+        module.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": Forked})  # type: ignore[attr-defined]
     path, directory = Path(case.scenario), Path(case.directory)
     launcher = launch.Launcher(load_scenario(path), path, directory)
     notices: list[dict[str, Any]] = []
