@@ -111,5 +111,5 @@ def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch
 def test_what_goes_wrong_in_a_process_is_one_line_of_the_command(tmp_path: Path) -> None:
     status, output = finish(train(written(tmp_path, steps=100, observe="aodd"), "training"))
     assert status == 1
-    assert "environment.options: no observation is called 'aodd'; did you mean 'aod'?" in output
+    assert "environment.options.observe: no observation is called 'aodd'; did you mean 'aod'?" in output
     assert "Traceback" not in output
