@@ -108,6 +108,62 @@ def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch
     assert policies.items() < results(tmp_path / "training").items()
 
 
+OWN = """
+import gymnasium, numpy
+
+class Mine(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), numpy.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, length=10):
+        self.length, self.done = length, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.done = 0
+        return self.np_random.uniform(-1, 1, 2).astype(numpy.float32), {}
+
+    def step(self, action):
+        self.done += 1
+        seen = self.np_random.uniform(-1, 1, 2).astype(numpy.float32)
+        return seen, float(action), False, self.done >= self.length, {}
+
+gymnasium.register("Mine-v0", entry_point=Mine)
+"""
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_environment_of_ones_own_beside_the_file_is_trained_and_gone_on_with(
+    jobs: int, tmp_path: Path
+) -> None:
+    """From another folder than that of the file, in this process and in others."""
+    beside, elsewhere = tmp_path / "beside", tmp_path / "elsewhere"
+    beside.mkdir()
+    elsewhere.mkdir()
+    (beside / "my_env.py").write_text(OWN)
+    file = beside / "mine.toml"
+    file.write_text("""
+        experiment = { name = "beams", seeds = [1, 2], steps = 1500, checkpoint_steps = 200 }
+        environment = { id = "my_env:Mine-v0", members = 2, options = { length = 5 } }
+        algorithm = { name = "a2c" }
+        """)
+    command = [
+        Path(sys.executable).parent / "caviar", "train", file, "--out", tmp_path / "out", "--jobs", str(jobs),
+    ]  # fmt: skip
+    first = subprocess.Popen(
+        command, cwd=elsewhere, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    wait_for_checkpoint(tmp_path / "out", first)
+    os.killpg(first.pid, signal.SIGKILL)
+    finish(first)
+    second = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert second.returncode == 0, second.stdout + second.stderr
+    assert "goes on: seed 1 from step " in second.stdout
+    for seed in (1, 2):
+        assert (tmp_path / "out" / "beams" / f"seed-{seed}" / "model.zip").is_file()
+
+
 def test_what_goes_wrong_in_a_process_is_one_line_of_the_command(tmp_path: Path) -> None:
     status, output = finish(train(written(tmp_path, steps=100, observe="aodd"), "training"))
     assert status == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,23 @@ def test_a_module_that_breaks_is_named(tmp_path: Path, monkeypatch: pytest.Monke
     text = TEXT.replace("caviar/BeamSelection-v0", "breaks_at_import:Mine-v0")
     with pytest.raises(ScenarioError, match=r"'breaks_at_import' cannot be imported: ZeroDivisionError"):
         parse_experiment(text, "my.toml")
+
+
+def test_an_environment_of_a_module_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    (tmp_path / "beside_the_file.py").write_text(
+        "import gymnasium\n"
+        "def made(length=3): ...\n"
+        "gymnasium.register('BesideTheFile-v0', entry_point=made)\n"
+    )
+    file = tmp_path / "my.toml"
+    text = TEXT.replace("caviar/BeamSelection-v0", "beside_the_file:BesideTheFile-v0")
+    text = text.replace('scenario = "geometric"\nobserve = ["position", "last_beam"]\n', "length = 5\n")
+    file.write_text(text)
+    assert load_experiment(file).environment.options == {"length": 5}
+    file.write_text(text.replace("BesideTheFile", "BesideFile"))
+    with pytest.raises(ScenarioError, match=r"'beside_the_file' registers no .*mean 'BesideTheFile-v0'\?"):
+        load_experiment(file)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ from caviar_protocol.arrays import described, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.scenario import absolute_paths, find_scenario, load_scenario, read_toml
 from caviar_protocol.scenario.conversion import Place, Source, convert_table
+from caviar_services.registry import find_modules_in
 
 Count = Annotated[int, quantity("1", "whole number above 0", ge=1, le=2**40)]
 Rows = Annotated[int, quantity("1", "whole number above 0", ge=1, le=2**20)]
@@ -88,10 +89,23 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Table ``[environment]``: what is learned in."""
 
     id: str
-    """As ``gymnasium.make`` takes it: ``caviar/BeamSelection-v0``, or ``module:Name-v0`` of your own."""
+    """As ``gymnasium.make`` takes it: ``caviar/BeamSelection-v0``, or ``module:Name-v0`` of your own, whose
+    module is imported, from the folder of the file too, and registers it."""
     members: Annotated[int, quantity("1", "environments at once", ge=1, le=4096)] = 1
     options: Mapping[str, Any] = {}
     """Arguments of the environment; a text ``file:PATH`` is a path relative to the folder of the file."""
+
+    def spec(self) -> gymnasium.envs.registration.EnvSpec:
+        """What is registered for the environment, of whose id ``gymnasium.spec`` takes no module.
+
+        Raises:
+            ImportError: Its module cannot be imported; the text says why.
+            gymnasium.error.Error: Nothing is registered by this name.
+        """
+        module, separator, name = self.id.rpartition(":")
+        if separator:
+            _import(module)
+        return gymnasium.spec(name)
 
 
 class _Algorithm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
@@ -306,6 +320,7 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
     options = absolute_paths(dict(made.environment.options), folder or Path(), place)
     environment = msgspec.structs.replace(made.environment, options=options)
     made = msgspec.structs.replace(made, environment=environment, source=source)
+    find_modules_in(folder or Path())  # processes that are started from here look there, too
     _check_options(made)
     _check_steps(made)
     _check_encodings(made)
@@ -315,19 +330,20 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
 def _check_options(experiment: Experiment) -> None:
     """Refuse an environment that does not exist, and options that it does not take."""
     place, given = experiment.place("environment"), experiment.environment.options
-    module, separator, _ = experiment.environment.id.rpartition(":")
     try:
-        if separator:
-            _import(module)
-        spec = gymnasium.spec(experiment.environment.id)
+        spec = experiment.environment.spec()
     except ImportError as error:
         raise place.at("id").error(str(error)) from error
     except gymnasium.error.Error as error:
-        ids = [name for name in gymnasium.registry if name.startswith("caviar/")]
-        raise place.at("id").error(
-            f"no environment is called {experiment.environment.id!r}; "
-            f"{suggestion(experiment.environment.id, ids)}"
-        ) from error
+        module, separator, name = experiment.environment.id.rpartition(":")
+        registered = [one.id for one in gymnasium.registry.values() if _is_of(one, module)]
+        registered = registered or [one for one in gymnasium.registry if one.startswith("caviar/")]
+        where = (
+            f"module {module!r} registers no environment {name!r}"
+            if separator
+            else (f"no environment is called {name!r}")
+        )
+        raise place.at("id").error(f"{where}; {suggestion(name, registered)}") from error
     known, takes_any = _arguments(spec.entry_point)
     for name in given:
         if name not in known and not takes_any:
@@ -382,13 +398,21 @@ def _import(module: str) -> None:
         importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"module {module!r} cannot be imported: {error}; is it installed, or in PYTHONPATH?"
+            f"module {module!r} cannot be imported: {error}; is it beside the experiment's file, installed, "
+            "or in PYTHONPATH?"
         ) from error
     except Exception as error:  # whatever the module of a user raises, or a name that is none
         raise ImportError(
             f"module {module!r} cannot be imported: {type(error).__name__}: {error}; write "
             "module:Name-v0, and look whether python -c 'import MODULE' succeeds"
         ) from error
+
+
+def _is_of(spec: gymnasium.envs.registration.EnvSpec, module: str) -> bool:
+    """Whether an environment is defined in a module, or in one below it."""
+    made = spec.entry_point
+    name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", "")
+    return name == module or name.startswith(f"{module}.")
 
 
 _NOT_OPTIONS = ("self", "render_mode", "num_envs")

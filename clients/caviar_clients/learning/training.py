@@ -122,7 +122,7 @@ def make_envs(experiment: Experiment) -> Any:
 
     environment, place = experiment.environment, experiment.place("environment", "options")
     options = dict(environment.options)
-    spec = gymnasium.spec(environment.id)
+    spec = environment.spec()
     envs: Any = None
     try:
         if environment.members > 1 and spec.vector_entry_point is not None:
