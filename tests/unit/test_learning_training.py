@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caviar_clients.learning import training
-from caviar_clients.learning.campaign import prepare_folder, reached, train_experiment
+from caviar_clients.learning.campaign import check_folder, reached, train_experiment
 from caviar_clients.learning.checkpoints import newest_checkpoint
 from caviar_clients.learning.events import EventFile, read_events
 from caviar_clients.learning.experiment import Experiment, parse_experiment
@@ -43,7 +43,10 @@ def short(tmp_path: Path) -> Path:
 
 
 def experiment(
-    scenario: Path, algorithm: str = 'name = "dqn"\nlearning_starts = 20', members: int = 1
+    scenario: Path | str,
+    algorithm: str = 'name = "dqn"\nlearning_starts = 20',
+    members: int = 1,
+    folder: Path | None = None,
 ) -> Experiment:
     return parse_experiment(
         f"""
@@ -67,6 +70,7 @@ def experiment(
         waves = 3
         """,
         "my.toml",
+        folder,
     )
 
 
@@ -86,6 +90,18 @@ def end_at(wanted: Experiment, folder: Path, steps: int) -> list[int]:
     with pytest.raises(KilledError):
         train_seed(wanted, 1, folder, report)
     return told
+
+
+def begin(wanted: Experiment, root: Path) -> Path:
+    """Begin to train an experiment, and end that after its first steps; returns its folder."""
+
+    def report(progress: Progress) -> None:
+        if progress.steps:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        train_experiment(wanted, root, report=report)
+    return root / wanted.experiment.name
 
 
 ALGORITHMS = [
@@ -196,14 +212,68 @@ def test_an_environment_without_beams_is_trained_without_a_policy_file(tmp_path:
 
 def test_a_folder_of_other_values_is_refused_with_the_values(short: Path, tmp_path: Path) -> None:
     wanted = experiment(short)
-    prepare_folder(wanted, tmp_path)
-    prepare_folder(wanted, tmp_path)
+    begin(wanted, tmp_path)
+    begin(wanted, tmp_path)
     changed = experiment(short, 'name = "dqn"\nlearning_starts = 30')
     with pytest.raises(RunError, match=r"algorithm\.learning_starts was 20 and is 30\. Give the experiment"):
-        prepare_folder(changed, tmp_path)
+        check_folder(changed, tmp_path)
     short.write_text(short.read_text().replace("components = 3", "components = 2"))
     with pytest.raises(RunError, match="the file of the scenario is another one"):
-        prepare_folder(wanted, tmp_path)
+        check_folder(wanted, tmp_path)
+
+
+def test_a_folder_that_has_moved_with_its_scenario_is_gone_on_with(
+    tmp_path: Path,
+) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    (before / "scenarios").mkdir(parents=True)
+    text = find_scenario("geometric").read_text().replace("frames = 500", f"frames = {FRAMES}")
+    (before / "scenarios" / "short.toml").write_text(text)
+    begin(experiment("file:scenarios/short.toml", folder=before), before / "training")
+    before.rename(after)
+    moved = experiment("file:scenarios/short.toml", folder=after)
+    assert str(after) in moved.environment.options["scenario"]
+    begin(moved, after / "training")
+    (after / "scenarios" / "short.toml").rename(after / "short.toml")
+    with pytest.raises(
+        RunError, match=r"scenario was 'file:scenarios/short\.toml' and is 'file:short\.toml'"
+    ):
+        check_folder(experiment("file:short.toml", folder=after), after / "training")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_experiment_that_is_refused_before_its_first_step_leaves_no_folder(
+    jobs: int, short: Path, tmp_path: Path
+) -> None:
+    refused = experiment(short, 'name = "ppo"\nn_steps = 1\nbatch_size = 1')  # one advantage has no spread
+    with pytest.raises(ScenarioError, match="algorithm: PPO of Stable-Baselines3 does not take this"):
+        train_experiment(refused, tmp_path / "deep" / "training", jobs)
+    assert not (tmp_path / "deep").exists()
+    # A folder that was there stays, with what is in it.
+    folder = begin(experiment(short, 'name = "ppo"\nn_steps = 16\nbatch_size = 16'), tmp_path)
+    kept = sorted(folder.rglob("*"))
+    with pytest.raises(RunError, match="was begun with other values"):
+        train_experiment(refused, tmp_path, jobs)
+    assert sorted(folder.rglob("*")) == kept
+
+
+def test_an_experiment_is_trained_by_one_command_at_a_time(short: Path, tmp_path: Path) -> None:
+    wanted = experiment(short)
+    seen = []
+
+    def report(_: Progress) -> None:
+        if not seen:
+            with pytest.raises(RunError) as refused:
+                train_experiment(wanted, tmp_path)
+            seen.append(str(refused.value))
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        train_experiment(wanted, tmp_path, report=report)
+    assert seen == [
+        f"'beams' in {tmp_path / 'beams'} is being trained by process {os.getpid()}; wait for it, or end it"
+    ]
+    begin(wanted, tmp_path)  # the lock ended with the command, and what it made is gone
 
 
 def test_a_seed_is_trained_by_one_process_at_a_time(
@@ -212,7 +282,7 @@ def test_a_seed_is_trained_by_one_process_at_a_time(
     monkeypatch.setattr(training, "PATIENCE_S", 0.0)
     (tmp_path / "seed-1").mkdir()
     with (
-        training._locked(tmp_path / "seed-1" / "lock", 1),
+        training.locked(tmp_path / "seed-1" / "lock", "seed 1"),
         pytest.raises(RunError, match=f"seed 1 is being trained by process {os.getpid()}"),
     ):
         train_seed(experiment(short), 1, tmp_path)
@@ -330,11 +400,10 @@ def test_a_training_without_enough_memory_says_what_to_make_smaller(
 
 def test_a_folder_whose_record_is_gone_is_not_gone_on_with(short: Path, tmp_path: Path) -> None:
     wanted = experiment(short)
-    folder = prepare_folder(wanted, tmp_path)
-    (folder / "seed-1").mkdir()
+    folder = begin(wanted, tmp_path)
     (folder / "experiment.json").unlink()
     with pytest.raises(RunError, match=r"has seed-1, and no experiment\.json that says of what; give"):
-        prepare_folder(wanted, tmp_path)
+        check_folder(wanted, tmp_path)
 
 
 def test_a_result_of_another_seed_is_refused(tmp_path: Path) -> None:

@@ -34,11 +34,11 @@ def train_command(
     ] = None,
 ) -> None:
     """Train the seeds of an experiment, or go on with what was interrupted: policies, curves, checkpoints."""
-    from caviar_clients.learning.campaign import prepare_folder, reached, train_experiment
+    from caviar_clients.learning.campaign import check_folder, reached, train_experiment
     from caviar_clients.learning.experiment import load_experiment
 
     console, loaded = Console(), load_experiment(experiment)
-    folder = prepare_folder(loaded, out)
+    folder = check_folder(loaded, out)
     if any(reached(loaded, out).values()):
         print_line(console, f"{folder} goes on: {_steps_of(loaded, out)}")
     try:

@@ -12,7 +12,8 @@ import os
 import shutil
 import signal
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,16 +28,17 @@ from caviar_clients.learning.training import (
     CHECKPOINTS,
     Progress,
     SeedResult,
+    locked,
     read_result,
     seed_folder,
     train_seed,
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
-from caviar_protocol.scenario.conversion import Source
 
 RECORD = "experiment.json"
 """What the folder was begun with."""
+_LOCK = "lock"
 _GOODBYE_S = 5.0
 
 Report = Callable[[Progress], None]
@@ -100,25 +102,33 @@ def train_experiments(
         SetupError: The extra ``learning`` is not installed.
     """
     left: list[_Training] = []
-    for experiment in experiments:
-        folder, subject = prepare_folder(experiment, root), experiment.experiment
-        for index, seed in enumerate(subject.seeds):
-            if read_result(folder, seed) is None:
-                left.append(_Training(experiment, seed, folder, index))
-            else:
-                report(subject.name, Progress(seed=seed, steps=subject.steps))
-    left.sort(key=lambda training: training.turn)
 
     def done(training: _Training) -> None:
         if not keep_checkpoints:
             shutil.rmtree(seed_folder(training.folder, training.seed) / CHECKPOINTS, ignore_errors=True)
 
-    if jobs == 1 or len(left) < 2:
-        for one in left:
-            train_seed(one.experiment, one.seed, one.folder, partial(report, one.name))
-            done(one)
-    else:
-        _train_in_processes(left, jobs, report, done)
+    stepped: set[str] = set()
+
+    def tell(name: str, progress: Progress) -> None:
+        if progress.steps:
+            stepped.add(name)
+        report(name, progress)
+
+    with ExitStack() as stack:
+        for experiment in experiments:
+            folder, subject = stack.enter_context(_held(experiment, root, stepped)), experiment.experiment
+            for index, seed in enumerate(subject.seeds):
+                if read_result(folder, seed) is None:
+                    left.append(_Training(experiment, seed, folder, index))
+                else:
+                    tell(subject.name, Progress(seed=seed, steps=subject.steps))
+        left.sort(key=lambda training: training.turn)
+        if jobs == 1 or len(left) < 2:
+            for one in left:
+                train_seed(one.experiment, one.seed, one.folder, partial(tell, one.name))
+                done(one)
+        else:
+            _train_in_processes(left, jobs, tell, done)
     found = []
     for experiment in experiments:
         folder = root / experiment.experiment.name
@@ -127,12 +137,43 @@ def train_experiments(
     return found
 
 
-def prepare_folder(experiment: Experiment, root: Path) -> Path:
-    """Make the folder of an experiment, or check that it was begun with the same values.
+@contextmanager
+def _held(experiment: Experiment, root: Path, stepped: Container[str]) -> Iterator[Path]:
+    """Keep the folder of an experiment from other commands while it is trained, and make it where it lacks.
+
+    Where the block fails before a seed has taken a step, what was made is removed.
+
+    Args:
+        experiment: What is trained.
+        root: What has the folder.
+        stepped: Names of experiments of which a seed has taken a step.
+    """
+    folder = check_folder(experiment, root)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]  # the deepest first
+    with locked(folder / _LOCK, f"{experiment.experiment.name!r} in {folder}"):
+        file = check_folder(experiment, root) / RECORD
+        is_new = folder in made and not file.exists()  # another command may have begun it meanwhile
+        try:
+            if not file.exists():
+                now = _Record(experiment.digest(), _values(experiment))
+                with writing(file):
+                    replace_file(file, msgspec.json.format(msgspec.json.encode(now), indent=1))
+            yield folder
+        except Exception:
+            if is_new and experiment.experiment.name not in stepped:
+                shutil.rmtree(folder, ignore_errors=True)
+                for path in made[1:]:
+                    with suppress(OSError):  # something else is in it by now
+                        path.rmdir()
+            raise
+
+
+def check_folder(experiment: Experiment, root: Path) -> Path:
+    """Find the folder of an experiment, and check that it was begun with the same values, or is not there.
 
     Args:
         experiment: What is trained; seeds may be added to it.
-        root: Where the folder is made.
+        root: What has the folder.
 
     Raises:
         RunError: The folder was begun with other values; the text names those that differ.
@@ -140,20 +181,19 @@ def prepare_folder(experiment: Experiment, root: Path) -> Path:
     folder = root / experiment.experiment.name
     file = folder / RECORD
     now = _Record(experiment.digest(), _values(experiment))
-    with writing(file):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            before = msgspec.json.decode(file.read_bytes(), type=_Record)
-        except FileNotFoundError:
-            if trained := sorted(path.name for path in folder.glob("seed-*")):
-                raise RunError(
-                    f"{folder} has {', '.join(trained[:4])}, and no {RECORD} that says of what; give the "
-                    "experiment another name, or remove the folder"
-                ) from None
-            replace_file(file, msgspec.json.format(msgspec.json.encode(now), indent=1))
-            return folder
-        except msgspec.DecodeError as error:
-            raise RunError(f"{file} cannot be read: {error}; remove {folder} to train anew") from error
+    try:
+        before = msgspec.json.decode(file.read_bytes(), type=_Record)
+    except FileNotFoundError:
+        if trained := sorted(path.name for path in folder.glob("seed-*")):
+            raise RunError(
+                f"{folder} has {', '.join(trained[:4])}, and no {RECORD} that says of what; give the "
+                "experiment another name, or remove the folder"
+            ) from None
+        return folder
+    except OSError as error:
+        raise RunError(f"cannot read {file}: {error.strerror}; choose another folder with --out") from error
+    except msgspec.DecodeError as error:
+        raise RunError(f"{file} cannot be read: {error}; remove {folder} to train anew") from error
     if before.digest != now.digest:
         changes = list(_differences(before.experiment, now.experiment))
         what = "; ".join(changes[:4]) or "the file of the scenario is another one"
@@ -181,8 +221,7 @@ def reached(experiment: Experiment, root: Path) -> dict[int, int]:
 def _values(experiment: Experiment) -> dict[str, Any]:
     """The values of an experiment without its seeds, as plain tables."""
     # Through JSON, as the file has them: tuples are lists there.
-    plain = msgspec.structs.replace(experiment, source=Source())
-    made: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain))
+    made: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(experiment.recorded()))
     del made["source"], made["experiment"]["seeds"]
     return made
 

@@ -216,7 +216,7 @@ class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is trained, how, and with which seeds."""
 
-    not_in_file: ClassVar[tuple[str, ...]] = ("source",)
+    not_in_file: ClassVar[tuple[str, ...]] = ("source", "written")
 
     experiment: Subject
     environment: EnvironmentSpec
@@ -225,6 +225,15 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     features: Mapping[str, Encoding] = {}
     """By part of the observation; what is not named goes into the network as it is."""
     source: Source = Source()
+    written: Mapping[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    """The environment's options as the file has them, where ``file:`` paths are relative."""
+
+    def recorded(self) -> Experiment:
+        """The experiment without its places and with the file's own paths: the same wherever it lies."""
+        environment = self.environment
+        if not isinstance(self.written, msgspec.UnsetType):
+            environment = msgspec.structs.replace(environment, options=self.written)
+        return msgspec.structs.replace(self, environment=environment, source=Source(), written=msgspec.UNSET)
 
     def digest(self) -> str:
         """SHA-256 of what decides how a seed is trained: all but the list of seeds, and the scenario's file.
@@ -233,7 +242,7 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             ScenarioError: The scenario cannot be read, or breaks a rule.
         """
         subject = msgspec.structs.replace(self.experiment, seeds=(0,))
-        made = msgspec.structs.replace(self, experiment=subject, source=Source())
+        made = msgspec.structs.replace(self.recorded(), experiment=subject)
         scenario = self.environment.options.get("scenario")
         content = b""
         if isinstance(scenario, str):
@@ -318,8 +327,11 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
     made = convert_table(Experiment, table, Place("", source))
     place = Place("environment", source).at("options")
     options = absolute_paths(dict(made.environment.options), folder or Path(), place)
-    environment = msgspec.structs.replace(made.environment, options=options)
-    made = msgspec.structs.replace(made, environment=environment, source=source)
+    environment, written = (
+        msgspec.structs.replace(made.environment, options=options),
+        made.environment.options,
+    )
+    made = msgspec.structs.replace(made, environment=environment, source=source, written=written)
     find_modules_in(folder or Path())  # processes that are started from here look there, too
     _check_options(made)
     _check_steps(made)

@@ -181,7 +181,7 @@ def train_seed(
     mine = seed_folder(folder, seed)
     with writing(mine / RESULT):
         mine.mkdir(parents=True, exist_ok=True)
-    with _locked(mine / "lock", seed):
+    with locked(mine / "lock", f"seed {seed}", PATIENCE_S):
         done = read_result(folder, seed)
         return _train(experiment, seed, mine, report) if done is None else done
 
@@ -449,29 +449,50 @@ def _reporting(report: Callable[[], None]) -> Any:
 
 
 @contextmanager
-def _locked(file: Path, seed: int) -> Iterator[None]:
-    """Keep other processes from training a seed; the lock ends with the process, however it ends."""
-    with writing(file):
-        stream = file.open("a+")
-    with stream:
-        _lock(stream, file, seed)
-        stream.truncate(0)
-        stream.write(str(os.getpid()))
-        stream.flush()
-        yield
+def locked(file: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
+    """Keep other processes from training the same; the lock ends with the process, however it ends.
+
+    Args:
+        file: Of the lock; it is made, with the folders to it.
+        what: Is trained, as the error's subject.
+        patience_s: How long the process before may take to its end.
+
+    Raises:
+        RunError: Another process trains it, or the disk refuses.
+    """
+    while True:
+        with writing(file):
+            stream = file.open("a+")
+        with stream:
+            _lock(stream, file, what, patience_s)
+            if not _is_still_at(file, stream):  # the process before has removed the folder that it had made
+                continue
+            stream.truncate(0)
+            stream.write(str(os.getpid()))
+            stream.flush()
+            yield
+            return
 
 
-def _lock(stream: IO[str], file: Path, seed: int) -> None:
-    until = time.monotonic() + PATIENCE_S
+def _is_still_at(file: Path, stream: IO[str]) -> bool:
+    try:
+        return os.path.samestat(file.stat(), os.fstat(stream.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def _lock(stream: IO[str], file: Path, what: str, patience_s: float) -> None:
+    until = time.monotonic() + patience_s
     while True:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             # A child whose parent was killed ends at its next report.
             if time.monotonic() > until:
-                holder = file.read_text() or "?"
+                stream.seek(0)
+                holder = stream.read() or "that has just begun"
                 raise RunError(
-                    f"seed {seed} is being trained by process {holder}; wait for it, or end it"
+                    f"{what} is being trained by process {holder}; wait for it, or end it"
                 ) from None
             time.sleep(0.05)
         else:
