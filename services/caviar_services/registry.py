@@ -142,6 +142,15 @@ def load(role: str, name: str) -> type[Service[Any]]:
     missing = ", ".join(name for name in cls.attributes_to_set if not hasattr(cls, name))
     if missing:
         raise DeclarationError(f"{role} {name!r} is {target}, which does not set: {missing}")
+    if cls.checkpoints:
+        missing = " and ".join(
+            method for method in ("checkpoint", "restore") if getattr(cls, method) is getattr(Service, method)
+        )
+        if missing:
+            raise DeclarationError(
+                f"{role} {name!r} is {target}, which sets checkpoints = True and does not define {missing}; "
+                "define checkpoint() and restore(), or leave out checkpoints if nothing outlives a frame"
+            )
     for base in cls.__mro__[1:]:
         # A base reads its own settings: without them it would fail in the middle of a run.
         inherited = vars(base).get("Settings", NoSettings)

@@ -79,11 +79,25 @@ class PlainSettings(NoRung):
 
 class Right(NoRung):
     rung = "right"
+
+class NoCheckpoint(Right):
+    checkpoints = True
+
+class NoRestore(NoCheckpoint):
+    def checkpoint(self): ...
+
+class Whole(NoRestore):
+    def restore(self, state): ...
 """
 
 
 BROKEN = {
     "no rung": ("unfinished:NoRung", "which does not set: rung"),
+    "no checkpoint": (
+        "unfinished:NoCheckpoint",
+        "sets checkpoints = True and does not define checkpoint and restore; define checkpoint() and",
+    ),
+    "no restore": ("unfinished:NoRestore", "sets checkpoints = True and does not define restore; define"),
     "settings of another kind": (
         "unfinished:PlainSettings",
         "whose Settings is Plain: it has to be a subclass of ChannelSettings, that of ChannelModel",
@@ -112,6 +126,7 @@ def test_what_is_wrong_with_an_implementation_is_said(
     module(tmp_path, monkeypatch, "broken_import", "1 / 0\n")
     module(tmp_path, monkeypatch, "unfinished", UNFINISHED)
     assert load("channel", "unfinished:Right").__name__ == "Right"
+    assert load("channel", "unfinished:Whole").checkpoints
     with pytest.raises(DeclarationError) as caught:
         load("channel", place)
     assert words in str(caught.value)
