@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from rich.console import Console
 from typer.testing import CliRunner
 
-from caviar_clients.cli.learning import evaluate_command
+from caviar_clients.cli.learning import _evaluation_tables, evaluate_command
 from caviar_clients.cli.main import app
 from caviar_clients.learning.contest import Contest, episodes_of, made_player
-from caviar_clients.learning.evaluate import evaluate
+from caviar_clients.learning.evaluate import KINDS, Evaluation, Interval, evaluate
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
@@ -159,3 +161,36 @@ def test_settings_of_what_is_always_compared_with_are_refused(tmp_path: Path) ->
 def test_figures_that_cannot_be_written_are_known_before_the_first_episode(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory"):
         evaluate_command(tmp_path / "none.onnx", "geometric", json=tmp_path)
+
+
+def test_the_tables_of_an_evaluation_are_whole_at_80_columns() -> None:
+    """Also of a traced channel, whose |y| has an exponent, and of what hardly receives anything."""
+    means = {
+        "policy": Interval(1.234e-5, 5.678e-7, 20),
+        "hierarchical-sweep": Interval(1.234567e-8, 1.9e-12, 20),
+        "my_module:AgentOfALongName": Interval(9.87e-13, 4.3e-14, 20),
+        "optimum": Interval(2.5e-5, float("nan"), 1),
+    }
+    made = Evaluation(
+        policy="policy.onnx",
+        scenario="street-canyon",
+        found={name: dict.fromkeys(KINDS, mean) for name, mean in means.items()},
+        frames={"all": 1_000_000, "LOS": 600_000, "NLOS": 400_000},
+        efficiency=dict.fromkeys(means, Interval(24.17, 0.0251, 20)),
+        pilots=dict.fromkeys(means, 6.4),
+    )
+    console = Console(width=80, record=True, file=io.StringIO())
+    for table in _evaluation_tables(made):
+        console.print(table)
+    text = console.export_text()
+    assert "mean |y| in 10⁻⁶" in text
+    for row in (
+        "│ policy                 │    12.34 ± 0.57 │",
+        "│ hierarchical-sweep     │ 0.01235 ± 2e-06 │",
+        "│ my_module:AgentOfALong │   1e-06 ± 4e-08 │",
+        "│ optimum                │              25 │",
+        "│ optimum                    │            6.4 │ 24.17 ± 0.025 │",
+    ):
+        assert row in text
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80

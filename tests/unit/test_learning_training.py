@@ -15,6 +15,7 @@ from caviar_clients.learning.campaign import check_folder, reached, train_experi
 from caviar_clients.learning.checkpoints import newest_checkpoint
 from caviar_clients.learning.events import EventFile, read_events
 from caviar_clients.learning.experiment import Experiment, parse_experiment
+from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import LinearRate, Progress, read_result, train_seed
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import find_scenario
@@ -282,7 +283,7 @@ def test_a_seed_is_trained_by_one_process_at_a_time(
     monkeypatch.setattr(training, "PATIENCE_S", 0.0)
     (tmp_path / "seed-1").mkdir()
     with (
-        training.locked(tmp_path / "seed-1" / "lock", "seed 1"),
+        locked(tmp_path / "seed-1" / "lock", "seed 1"),
         pytest.raises(RunError, match=f"seed 1 is being trained by process {os.getpid()}"),
     ):
         train_seed(experiment(short), 1, tmp_path)
@@ -330,6 +331,27 @@ def test_what_the_environment_does_not_take_is_named_with_its_place(
     with pytest.raises(ScenarioError) as refused:
         train_seed(parse_experiment(text.replace(old, new).strip(), "my.toml"), 1, tmp_path)
     assert expected in str(refused.value)
+
+
+def test_an_encoding_of_one_user_where_there_are_several_is_answered_with_the_option(tmp_path: Path) -> None:
+    text = """
+        experiment = { name = "two", seeds = [1], steps = 200 }
+        algorithm = { name = "dqn" }
+        features = { position = { scale = [50.0, 50.0, 20.0] } }
+        [environment]
+        id = "caviar/BeamSelection-v0"
+        options = { scenario = "smoke", observe = ["position"] }
+        """
+    with pytest.raises(ScenarioError) as refused:
+        train_experiment(parse_experiment(text), tmp_path)
+    expected = (
+        "'position' has 6; 3 for each of 2 users. Choose these by the option `users` below "
+        '[environment.options], as users = ["car/rx"] of car/rx, uav/rx-uav; or write one for all'
+    )
+    assert expected in str(refused.value)
+    chosen = text.replace('"position"] }', '"position"], users = ["car/rx"] }')
+    assert check_folder(parse_experiment(chosen), tmp_path)
+    training.make_envs(parse_experiment(chosen)).close()
 
 
 def test_an_algorithm_that_does_not_fit_the_actions_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +14,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from caviar_clients.cli.shared import print_line, progress_bar, require_writable, write_json
+from caviar_clients.cli.shared import counted, print_line, progress_bar, require_writable, write_json
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 
 if TYPE_CHECKING:
+    from caviar_clients.learning.evaluate import Evaluation, Interval
     from caviar_clients.learning.experiment import Experiment
     from caviar_clients.learning.training import Progress, SeedResult
 
@@ -204,16 +206,9 @@ def evaluate_command(
         made = evaluate(
             policy, on, chosen, episodes, lambda done: bar.update(task, completed=done), rivals, users
         )
-    table = Table(title=f"mean |y| of {made.policy} on {made.scenario}, {seeds * episodes} episodes")
-    table.add_column("", no_wrap=True)
-    for kind in KINDS:
-        table.add_column(f"{kind} ({made.frames[kind]:,})", justify="right")
-    table.add_column("pilots a frame", justify="right")
-    table.add_column("bit/s/Hz left", justify="right")
-    for method, means in made.found.items():
-        cost = f"{made.pilots[method]:.4g}", str(made.efficiency[method])
-        table.add_row(method, *(str(means[kind]) for kind in KINDS), *cost)
-    console.print(table)
+    print_line(console, f"{made.policy} on {made.scenario}, {counted(seeds * episodes, 'episode')}")
+    for table in _evaluation_tables(made):
+        console.print(table)
     if json is not None:
         write_json(
             json,
@@ -224,6 +219,47 @@ def evaluate_command(
                 "pilots": dict(made.pilots),
             },
         )
+
+
+def _evaluation_tables(made: Evaluation) -> tuple[Table, Table]:
+    """|y|, and what pilots cost: two tables, as 80 columns hold no more."""
+    from caviar_clients.learning.evaluate import KINDS
+
+    exponent = _common_exponent([means[kind].mean for means in made.found.values() for kind in KINDS])
+    unit = f" in 10{str(exponent).translate(_RAISED)}" if exponent else ""
+    gains = Table(title=f"mean |y|{unit}, by frames", title_justify="left")
+    gains.add_column("", overflow="fold")
+    for kind in KINDS:
+        gains.add_column(f"{kind} ({made.frames[kind]:,})", justify="right", no_wrap=True)
+    costs = Table(title="pilots, and the spectral efficiency that they leave", title_justify="left")
+    costs.add_column("", overflow="fold")
+    costs.add_column("pilots a frame", justify="right", no_wrap=True)
+    costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
+    for method, means in made.found.items():
+        gains.add_row(method, *(_short(means[kind], exponent) for kind in KINDS))
+        costs.add_row(method, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
+    return gains, costs
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _common_exponent(values: Sequence[float]) -> int:
+    """The power of ten, a multiple of 3, in which the largest value is from 1 to 1000; 0: none is needed."""
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    if largest == 0 or 0.01 <= largest < 10_000:
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3)
+
+
+def _short(found: Interval, exponent: int = 0) -> str:
+    """A mean and its interval in a power of ten; of what is far below that, one digit."""
+    factor = 10.0**exponent
+    mean, half_width = found.mean / factor, found.half_width / factor
+    digits = 4 if not abs(mean) < 1e-3 else 1
+    if found.episodes < 2:
+        return f"{mean:.{digits}g}"
+    return f"{mean:.{digits}g} ± {half_width:.{1 if abs(half_width) < 1e-3 else 2}g}"
 
 
 def _settings_of(texts: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -24,11 +24,11 @@ import msgspec
 from caviar_clients.files import writing
 from caviar_clients.learning.checkpoints import newest_checkpoint
 from caviar_clients.learning.experiment import Experiment
+from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import (
     CHECKPOINTS,
     Progress,
     SeedResult,
-    locked,
     read_result,
     seed_folder,
     train_seed,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
@@ -12,13 +12,19 @@ from caviar_protocol.errors import suggestion
 from caviar_protocol.scenario.conversion import Place
 
 
-def check_encodings(observation_space: Any, encodings: Mapping[str, Encoding], place: Place) -> None:
+def check_encodings(
+    observation_space: Any,
+    encodings: Mapping[str, Encoding],
+    place: Place,
+    remedy: Callable[[int, int], str] = lambda given, size: "write one for all, or one for each",
+) -> None:
     """Check that encodings fit what is observed.
 
     Args:
         observation_space: Parts by name, each a box.
         encodings: By part.
         place: Where they stand.
+        remedy: What is to be written where an encoding has another number of numbers than its part.
 
     Raises:
         ScenarioError: A part is not observed, or its encoding has another number of numbers.
@@ -40,10 +46,8 @@ def check_encodings(observation_space: Any, encodings: Mapping[str, Encoding], p
         for what in ("offset", "scale", "waves"):
             values = getattr(encoding, what)
             if isinstance(values, tuple) and len(values) != size:
-                text = (
-                    f"has {len(values)} numbers, and {name!r} has {size}; write one for all, or one for each"
-                )
-                raise place.at(name).at(what).error(text)
+                text = f"has {len(values)} numbers, and {name!r} has {size}"
+                raise place.at(name).at(what).error(f"{text}; {remedy(len(values), size)}")
 
 
 def encoded_parts(observation_space: Any, encodings: Mapping[str, Encoding]) -> Any:

@@ -7,16 +7,14 @@ same, step by step, as one that was never interrupted.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import inspect
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import gymnasium
 import msgspec
@@ -29,6 +27,7 @@ from caviar_clients.learning.events import EventFile
 from caviar_clients.learning.experiment import Dqn, Experiment
 from caviar_clients.learning.export import BeamEnv, export_policy
 from caviar_clients.learning.features import check_encodings
+from caviar_clients.learning.lock import locked
 from caviar_clients.learning.vec_env import stable_baselines3_env
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.files import replace_file
@@ -141,8 +140,25 @@ def make_envs(experiment: Experiment) -> Any:
         raise experiment.place_of_option(str(error)).error(str(error)) from error
     except TypeError as error:
         raise place.error(f"{environment.id} does not take them: {error}") from error
-    check_encodings(envs.observation_space, experiment.features, experiment.place("features"))
+    place = experiment.place("features")
+    check_encodings(envs.observation_space, experiment.features, place, partial(_other_users, experiment))
     return VecMonitor(envs)
+
+
+def _other_users(experiment: Experiment, given: int, size: int) -> str:
+    """What to write where the encoding of a part is of fewer users than the environment has."""
+    remedy = "write one for all, or one for each"
+    made = gymnasium.make(experiment.environment.id, **experiment.environment.options).unwrapped
+    count = len(made.users) if isinstance(made, BeamEnv) else 1
+    made.close()
+    if not isinstance(made, BeamEnv) or count == 1 or size % count or given == size:
+        return remedy
+    names = made.users.receivers
+    fewer = next((name for name in names if "*" not in name), names[0])
+    return (
+        f"{size // count} for each of {count} users. Choose these by the option `users` below "
+        f'[environment.options], as users = ["{fewer}"] of {", ".join(names)}; or {remedy}'
+    )
 
 
 def train_seed(
@@ -443,57 +459,3 @@ def _reporting(report: Callable[[], None]) -> Any:
             return True
 
     return Reporting()
-
-
-# --- one process a seed ---------------------------------------------------------------------------------
-
-
-@contextmanager
-def locked(file: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
-    """Keep other processes from training the same; the lock ends with the process, however it ends.
-
-    Args:
-        file: Of the lock; it is made, with the folders to it.
-        what: Is trained, as the error's subject.
-        patience_s: How long the process before may take to its end.
-
-    Raises:
-        RunError: Another process trains it, or the disk refuses.
-    """
-    while True:
-        with writing(file):
-            stream = file.open("a+")
-        with stream:
-            _lock(stream, file, what, patience_s)
-            if not _is_still_at(file, stream):  # the process before has removed the folder that it had made
-                continue
-            stream.truncate(0)
-            stream.write(str(os.getpid()))
-            stream.flush()
-            yield
-            return
-
-
-def _is_still_at(file: Path, stream: IO[str]) -> bool:
-    try:
-        return os.path.samestat(file.stat(), os.fstat(stream.fileno()))
-    except FileNotFoundError:
-        return False
-
-
-def _lock(stream: IO[str], file: Path, what: str, patience_s: float) -> None:
-    until = time.monotonic() + patience_s
-    while True:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            # A child whose parent was killed ends at its next report.
-            if time.monotonic() > until:
-                stream.seek(0)
-                holder = stream.read() or "that has just begun"
-                raise RunError(
-                    f"{what} is being trained by process {holder}; wait for it, or end it"
-                ) from None
-            time.sleep(0.05)
-        else:
-            return

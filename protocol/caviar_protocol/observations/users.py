@@ -95,6 +95,11 @@ class Users:
     def __len__(self) -> int:
         return len(self.places)
 
+    @property
+    def receivers(self) -> tuple[str, ...]:
+        """Names of the receivers that are served, with ``*`` where the scene has those of objects."""
+        return tuple(dict.fromkeys(_full_name(rx) for _, rx in self._groups))
+
     def present(self, scene: Scene) -> tuple[tuple[int, Pair], ...]:
         """Find the pairs of a scene that are served.
 
