@@ -1,15 +1,21 @@
 """Train against a run on another machine: this program takes the agent's place over the network.
 
-On the machine of the world, with the keys of both (docs/topics/threat-model.md)::
+Here, make the keys of this program; ``keys/agent.key`` stays on this machine (docs/topics/threat-model.md)::
 
+    caviar keys new agent
+
+On the machine of the world, with a copy of ``keys/agent.pub``::
+
+    caviar keys new broker
+    caviar keys authorize agent.pub --name agent --role agent
     caviar new crossing
     sed -i 's/use = "los-beam"/use = "remote"/' crossing.toml
     caviar run crossing.toml --bind tcp://0.0.0.0:5570 --keys keys
 
-and here, with a copy of the scenario::
+and here, with copies of ``crossing.toml`` and of ``keys/broker.pub``, within half a minute::
 
     python examples/remote_trainer.py crossing.toml tcp://HOST:5570 \\
-        --key keys/agent.key --broker-key keys/broker.pub
+        --key keys/agent.key --broker-key broker.pub
 
 Needs the base install. It learns in a table, by UCB1 (Auer et al. 2002), which beam pair serves a user best
 that is seen in some direction. The run ends with its last episode; ``run.episodes`` says how many there are.

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
+import shlex
+import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -71,6 +75,49 @@ def test_the_remote_trainer_plays_all_episodes(tmp_path: Path) -> None:
     assert process.returncode == 0
     assert "episode 2: mean |y| 0." in printed
     assert "the run is over" in printed
+
+
+def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
+    """As they stand in its file, one after the other; but for the port, and the length of the run."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    there.mkdir()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    description = ast.get_docstring(ast.parse((EXAMPLES / "remote_trainer.py").read_text()))
+    assert description is not None
+    text = description.replace("\\\n", " ").replace("5570", port).replace("HOST", "127.0.0.1")
+    text = text.replace("examples/", f"{EXAMPLES}/")
+    new_key, *prepare, begin, train = (line for line in text.splitlines() if line.startswith("    "))
+    bin_folder = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+    def ended(command: str, folder: Path) -> str:
+        done = subprocess.run(
+            shlex.split(command), cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+            env={**os.environ, "PATH": bin_folder},
+        )  # fmt: skip
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+    ended(new_key, here)
+    shutil.copy(here / "keys" / "agent.pub", there)
+    for command in prepare:
+        ended(command, there)
+    scenario = there / "crossing.toml"
+    scenario.write_text(re.sub(r"(?m)^frames = \d+", "frames = 30", scenario.read_text()))
+    shutil.copy(scenario, here)
+    shutil.copy(there / "keys" / "broker.pub", here)
+    run = subprocess.Popen(
+        begin.split(), cwd=there, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "PATH": bin_folder},
+    )  # fmt: skip
+    try:
+        assert "the run is over" in ended(train, here)
+        assert run.wait(timeout=30) == 0
+    finally:
+        run.kill()
+        run.communicate()
 
 
 def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None:
