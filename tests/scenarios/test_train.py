@@ -108,6 +108,30 @@ def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch
     assert policies.items() < results(tmp_path / "training").items()
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "real", "why"),
+    [
+        ('name = "ppo", n_steps = 64, batch_size = 64', 256, "PPO learns from n_steps × members = 64 × 2"),
+        ('name = "dqn", learning_starts = 20, train_freq = 7', 210, "train_freq × members = 7 × 2 steps"),
+        ('name = "a2c"', 200, None),
+    ],
+)
+def test_bar_and_table_have_the_steps_that_are_trained_and_say_why(
+    algorithm: str, real: int, why: str | None, tmp_path: Path
+) -> None:
+    file = written(tmp_path, steps=200)
+    text = file.read_text().replace('name = "dqn", learning_starts = 20, gamma = 0.0', algorithm)
+    file.write_text(text.replace("seeds = [1, 2]", "seeds = [1]"))
+    command = ["train", str(file), "--out", str(tmp_path)]
+    first, again = (CliRunner().invoke(app, command, env={"COLUMNS": "200"}).output for _ in range(2))
+    for output in (first, again):
+        assert f"{real}/{real} steps" in output
+        assert f"│ {real} │" in output.replace("   ", " ").replace("  ", " ")
+        assert ("and the 200 of the file are no multiple of these" in output) == bool(why)
+    assert why is None or f"{real} steps a seed: " in first
+    assert why is None or why in first
+
+
 OWN = """
 import gymnasium, numpy
 

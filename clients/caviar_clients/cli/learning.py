@@ -52,6 +52,8 @@ def train_command(
         )
         raise
     console.print(_results_table(loaded, folder, results))
+    if any(result.steps != loaded.experiment.steps for result in results):
+        print_line(console, _rollouts(loaded))
 
 
 def cores() -> int:
@@ -76,14 +78,16 @@ def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable
     columns = (MofNCompleteColumn(), "steps", TimeRemainingColumn(), "{task.fields[reward]}")
     with progress_bar(console, *columns) as bar:
         together: list[Any] = []
-        done, total = dict.fromkeys(subject.seeds, 0), subject.steps * len(subject.seeds)
+        done = dict.fromkeys(subject.seeds, 0)
 
         def report(progress: Progress) -> None:
-            seed, steps = progress.seed, min(progress.steps, subject.steps)
+            seed, steps, total = progress.seed, progress.steps, progress.total
             if not together:
-                together.append(bar.add_task(subject.name, total=total, reward=""))
+                together.append(bar.add_task(subject.name, total=total * len(subject.seeds), reward=""))
+                if progress.rollout and total != subject.steps:
+                    print_line(console, f"{total:,} steps a seed: {_rollouts(experiment, progress.rollout)}")
             if seed not in tasks:
-                tasks[seed] = bar.add_task(f"seed {seed}", total=subject.steps, completed=steps, reward="")
+                tasks[seed] = bar.add_task(f"seed {seed}", total=total, completed=steps, reward="")
                 # What an earlier call has trained says nothing about the time left.
                 bar.reset(together[0], completed=sum(done.values()) + steps)
             reward = "" if progress.mean_reward is None else f"reward {progress.mean_reward:.4g}"
@@ -92,6 +96,17 @@ def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable
             bar.update(together[0], completed=sum(done.values()))
 
         yield report
+
+
+def _rollouts(experiment: Experiment, rollout: int = 0) -> str:
+    """Why more steps are trained than the file asks for."""
+    algorithm, members = experiment.algorithm, experiment.environment.members
+    what = "n_steps" if hasattr(algorithm, "n_steps") else "train_freq"
+    numbers = f" = {rollout // members:,} × {members:,}" if rollout else ""
+    return (
+        f"{algorithm.called} learns from {what} × members{numbers} steps at once, and the "
+        f"{experiment.experiment.steps:,} of the file are no multiple of these"
+    )
 
 
 def _steps_of(experiment: Experiment, root: Path) -> str:

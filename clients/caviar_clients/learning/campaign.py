@@ -118,10 +118,11 @@ def train_experiments(
         for experiment in experiments:
             folder, subject = stack.enter_context(_held(experiment, root, stepped)), experiment.experiment
             for index, seed in enumerate(subject.seeds):
-                if read_result(folder, seed) is None:
+                if (done_before := read_result(folder, seed)) is None:
                     left.append(_Training(experiment, seed, folder, index))
                 else:
-                    tell(subject.name, Progress(seed=seed, steps=subject.steps))
+                    steps = done_before.steps
+                    tell(subject.name, Progress(seed=seed, steps=steps, total=steps))
         left.sort(key=lambda training: training.turn)
         if jobs == 1 or len(left) < 2:
             for one in left:

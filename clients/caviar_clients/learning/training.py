@@ -69,6 +69,10 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int
     steps: int
+    total: int
+    """Steps that it is trained, whole rollouts: at least those of the experiment."""
+    rollout: int = 0
+    """Steps of all members together from which an algorithm learns at once; 0: not known, as all is done."""
     mean_reward: float | None = None
 
 
@@ -215,15 +219,15 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
             model = _new_model(experiment, envs, _chunk_seed(seed, 0))
         else:
             model = load_checkpoint(newest, _resumable(experiment.algorithm.called), envs)
-        report(_progress(model, seed))
+        report(_progress(model, seed, total))
         with EventFile(mine / CURVES, purge_step=model.num_timesteps or None) as events:
             model.set_logger(_logger(events))
-            callback = _reporting(lambda: report(_progress(model, seed)))
+            callback = _reporting(lambda: report(_progress(model, seed, total)))
             while model.num_timesteps < total:
                 with _explained(model, seed):
                     _train_chunk(model, total, seed, callback)
                 save_checkpoint(mine / CHECKPOINTS, model)
-        report(_progress(model, seed))
+        report(_progress(model, seed, total))
         with writing(mine / MODEL):
             model.save(mine / MODEL)
         policy = _export(experiment, model, mine / POLICY, seed)
@@ -400,8 +404,16 @@ def _export(experiment: Experiment, model: Any, file: Path, seed: int) -> str | 
 # --- reports while it trains ------------------------------------------------------------------------------
 
 
-def _progress(model: Any, seed: int) -> Progress:
-    return Progress(seed=seed, steps=int(model.num_timesteps), mean_reward=_mean_reward(model))
+def _progress(model: Any, seed: int, asked: int) -> Progress:
+    frequency = model.train_freq.frequency if hasattr(model, "train_freq") else model.n_steps
+    rollout = frequency * model.n_envs
+    return Progress(
+        seed=seed,
+        steps=int(model.num_timesteps),
+        total=-(-asked // rollout) * rollout,
+        rollout=rollout,
+        mean_reward=_mean_reward(model),
+    )
 
 
 def _mean_reward(model: Any) -> float | None:

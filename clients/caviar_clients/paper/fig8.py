@@ -224,10 +224,8 @@ def _record_flights(folder: Path) -> None:
 
 
 def _train(experiments: Sequence[Experiment], settings: Settings, meter: _Meter) -> None:
-    totals = {one.experiment.name: one.experiment.steps for one in experiments}
-
     def report(name: str, progress: Progress) -> None:
-        share = min(1.0, progress.steps / totals[name])
+        share = min(1.0, progress.steps / progress.total)
         meter.report(f"{name}, seed {progress.seed}", share, f"{name}, seed {progress.seed}")
 
     # The longest first: at the end no core waits for another one.
