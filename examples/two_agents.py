@@ -2,9 +2,9 @@
 
     python examples/two_agents.py [--seeds 3]
 
-Needs the extra ``learning`` (PettingZoo) and ``channel`` (the street comes with Sionna RT). Neither agent
-learns here: the pilot flies over the roofs to the next address, and the beams point along the straight line,
-or at random, so that what each of them makes of the other's doing can be seen.
+Needs the extra ``learning`` (PettingZoo), and ``world`` or ``channel``: the street is a scene of Sionna RT,
+which both bring. Neither agent learns here: the pilot flies over the roofs to the next address, and the beams
+point along the straight line, or at random, so that what each of them makes of the other's doing can be seen.
 """
 
 import argparse

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import signal
 import subprocess
@@ -61,6 +62,38 @@ def run_as_printed(command: Sequence[str | Path], folder: Path) -> str:
     )  # fmt: skip
     assert done.returncode == 0, f"{command}\n{done.stdout}"
     return done.stdout
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Language and content of the fenced blocks of a page."""
+    return re.findall(r"^```(\w+)\n(.*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def follow(page: Path, folder: Path) -> None:
+    """Follow the blocks of a page from top to bottom in a folder.
+
+    A block whose first line is a comment with a file name is written to that file; other blocks of ``sh`` and
+    ``python`` are run. What a block of ``text`` shows has to be in the output of the command before it, with
+    anything for ``…``.
+    """
+    output = ""
+    for language, content in blocks(page):
+        name = re.match(r"# ([\w.-]+\.\w+)\n", content)
+        if name:
+            (folder / name[1]).write_text(content, "utf-8")
+        elif language == "sh":
+            output = run_as_printed(["bash", "-e", "-o", "pipefail", "-c", content], folder)
+        elif language == "python":
+            output = run_as_printed([sys.executable, "-c", content], folder)
+        elif language == "text":
+            for line in content.splitlines():
+                assert _shown(line).search(output), f"{page} shows {line!r}; the command printed\n{output}"
+
+
+def _shown(line: str) -> re.Pattern[str]:
+    """A line of output, whatever its spaces, with anything for ``…``."""
+    words = [re.escape(word).replace("…", ".*") for word in line.split()]
+    return re.compile(r"\s+".join(words))
 
 
 def run(scenario: Path, out: Path, *arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:

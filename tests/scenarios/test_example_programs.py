@@ -77,6 +77,15 @@ def test_the_remote_trainer_plays_all_episodes(tmp_path: Path) -> None:
     assert "the run is over" in printed
 
 
+def test_the_guide_makes_keys_as_the_remote_trainer_does() -> None:
+    """By the commands that the test below runs."""
+    page = (EXAMPLES.parent / "docs" / "howto" / "train-an-agent.md").read_text(encoding="utf-8")
+    described = (EXAMPLES / "remote_trainer.py").read_text(encoding="utf-8")
+    commands = re.findall(r"^(caviar (?:keys|run crossing).*?)(?: +#.*)?$", page, re.MULTILINE)
+    assert len(commands) == 4
+    assert not [command for command in commands if f"    {command}\n" not in described]
+
+
 def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
     """As they stand in its file, one after the other; but for the port, and the length of the run."""
     here, there = tmp_path / "here", tmp_path / "there"

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from scenarios_support import ROOT, blocks
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
@@ -84,6 +85,22 @@ def test_a_killed_command_goes_on_to_the_policy_of_one_that_was_not(tmp_path: Pa
     assert whole.exit_code == 0, whole.output
     assert results(tmp_path / "killed") == results(tmp_path / "whole")
     assert len(results(tmp_path / "whole")) == 1
+
+
+def test_an_environment_beside_the_experiment_is_trained_in_every_process(tmp_path: Path) -> None:
+    """That of the page, and its reward alone: a policy is exported where agents can observe the same."""
+    (block,) = (text for _, text in blocks(ROOT / "docs/howto/train-an-agent.md") if "# my_env.py" in text)
+    (tmp_path / "my_env.py").write_text(
+        f'{block}\ngymnasium.register("Steady-v0", lambda **options: Steady(BeamSelectionEnv(**options)))\n'
+    )
+    file = written(tmp_path, steps=200)
+    text = file.read_text()
+    for name, is_exported in (("Mine-v0", False), ("Steady-v0", True)):
+        file.write_text(text.replace("caviar/BeamSelection-v0", f"my_env:{name}"))
+        status, output = finish(train(file, name))
+        assert status == 0, output
+        found = results(tmp_path / name)
+        assert [policy is not None for _, policy in sorted(found.items())] == [is_exported] * 2
 
 
 def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -75,6 +75,16 @@ def test_what_a_scenario_needs_follows_from_its_services(name: str, needed: tupl
     assert scenarios.extras_of(load_scenario(name)) == needed
 
 
+def test_scenes_of_sionna_come_with_either_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = load_scenario("uav-pair")
+    for module in (scenarios, shared):
+        monkeypatch.setattr(module, "has_extra", lambda extra: extra == "channel")
+    assert scenarios.extras_of(pair) == ("channel",)
+    scenarios.require_extras(pair)
+    monkeypatch.setattr(scenarios, "has_extra", lambda extra: False)
+    assert scenarios.extras_of(pair) == ("world",)
+
+
 def test_the_rate_model_of_a_link_may_need_an_extra() -> None:
     text = shipped_scenarios()["cell"].read_text().replace('rate_model = "capped"', 'rate_model = "nr"')
     assert scenarios.extras_of(parse_scenario(text)) == ("system",)

@@ -30,6 +30,7 @@ ELSEWHERE = {
         "tests/scenarios/test_tutorials.py",
     ),
     "README.md": "tests/scenarios/test_readme.py",
+    "docs/howto/beam-agents.md": "tests/scenarios/test_learning_agents.py",
     "protocol/SPEC.md": "tests/unit/test_protocol_spec.py",
 }
 """Pages whose examples need processes of their own, and the test that runs them."""
@@ -79,8 +80,8 @@ def _wideband() -> dict[str, Any]:
 
 
 def _packets() -> dict[str, Any]:
-    """Thirty frames of `cell`."""
-    text = re.sub(r"(?m)^frames = .*", "frames = 30", find_scenario("cell").read_text())
+    """240 frames of `cell`: up to the first handovers."""
+    text = re.sub(r"(?m)^frames = .*", "frames = 240", find_scenario("cell").read_text())
     record_run(Path("runs/cell"), parse_scenario(text, folder=find_scenario("cell").parent))
     return {}
 

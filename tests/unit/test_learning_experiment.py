@@ -115,6 +115,12 @@ def test_what_is_wrong_is_named_with_its_place(old: str, new: str, expected: str
     assert expected in str(refused.value)
 
 
+def test_a_module_that_is_nowhere_is_named_with_the_places_looked_in() -> None:
+    text = TEXT.replace("caviar/BeamSelection-v0", "no_such_module:Mine-v0")
+    with pytest.raises(ScenarioError, match="beside the experiment, in the current folder"):
+        parse_experiment(text, "my.toml")
+
+
 def test_a_module_that_breaks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "breaks_at_import.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -60,6 +60,9 @@ def test_products_are_found_by_frame_and_by_topic(run):
     recording = Recording(run)
     assert recording.product(0, 3, "scene", "world") == scene(3)
     assert [p.payload for _, p in recording.products("link")] == [link(k) for k in range(6)]
+    assert [frame.number for frame in recording] == [frame.number for frame in recording.frames()]
+    with pytest.raises(RecordingError, match=r"recording\[3\] is no topic.*recording\.frame\(episode=0"):
+        recording[3]
     assert isinstance(recording.product(0, 0, "scene", "world"), Scene)
     with pytest.raises(RecordingError, match=r"frame 1 has no lidar of 'top'"):
         recording.product(0, 1, "lidar", "top")

@@ -165,6 +165,12 @@ def test_missing_scenery_and_nonsense_are_refused(tmp_path: Path) -> None:
         scenery_assets("munich")
 
 
+def test_without_sionna_the_extras_that_bring_its_scenes_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SetupError, match=r"`world` and `channel` bring.*pip install 'caviar-sim\[world\]'"):
+        scenery_assets("sionna:simple_street_canyon")
+
+
 @with_sionna
 def test_scenes_of_sionna_are_found_without_importing_it() -> None:
     assets = scenery_assets("sionna:simple_street_canyon")

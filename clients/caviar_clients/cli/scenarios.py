@@ -35,10 +35,10 @@ def _extras(spec: ServiceSpec) -> set[str]:
     if spec.remote:
         return set()
     found = {load(spec.role, spec.use).extra}
-    # Scenes of Sionna are part of the package that the extra `world` brings.
+    # Scenes of Sionna are part of a package that both `world` and `channel` bring.
     scenery = spec.settings.get("scenery", "")
     if isinstance(scenery, str) and scenery.startswith("sionna:"):
-        found.add("world")
+        found.add("channel" if has_extra("channel") and not has_extra("world") else "world")
     if spec.settings.get("rate_model") == "nr":  # of the link `cell`
         found.add("system")
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")

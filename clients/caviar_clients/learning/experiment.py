@@ -311,7 +311,8 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
     Args:
         text: TOML.
         file: What errors call it.
-        folder: What its ``file:`` paths are relative to; by default the working directory.
+        folder: What its ``file:`` paths are relative to, and where the module of an environment is looked for
+            after all other places; by default the working directory.
 
     Raises:
         ScenarioError: As of `load_experiment`.
@@ -332,7 +333,8 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
         made.environment.options,
     )
     made = msgspec.structs.replace(made, environment=environment, source=source, written=written)
-    find_modules_in(folder or Path())  # processes that are started from here look there, too
+    for place_of_modules in (folder or Path(), Path()):  # processes started from here look there, too
+        find_modules_in(place_of_modules)
     _check_options(made)
     _check_steps(made)
     _check_encodings(made)
@@ -410,8 +412,8 @@ def _import(module: str) -> None:
         importlib.import_module(module)
     except ImportError as error:
         raise ImportError(
-            f"module {module!r} cannot be imported: {error}; is it beside the experiment's file, installed, "
-            "or in PYTHONPATH?"
+            f"module {module!r} cannot be imported: {error}; modules are looked for beside the "
+            "experiment, in the current folder, among what is installed and in PYTHONPATH"
         ) from error
     except Exception as error:  # whatever the module of a user raises, or a name that is none
         raise ImportError(

@@ -61,7 +61,8 @@ class SeedResult(msgspec.Struct, frozen=True, kw_only=True):
     mean_reward: float | None = None
     """Sum of rewards of an episode, the mean over the last hundred; None: no episode came to its end."""
     policy: str | None = None
-    """SHA-256 of `POLICY`; None: the environment's actions are no beams, and there is none."""
+    """SHA-256 of `POLICY`; None: the environment's actions are no beams, or it observes what no agent of a
+    run can, and there is none."""
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
@@ -384,9 +385,12 @@ def _new_model(experiment: Experiment, envs: Any, seed: int) -> Any:
 
 
 def _export(experiment: Experiment, model: Any, file: Path, seed: int) -> str | None:
-    """Export the policy where its actions are beams; returns the SHA-256 of the file."""
+    """Export the policy where its actions are beams, and all it observes are parts that the agent ``policy``
+    can observe; returns the SHA-256 of the file."""
     made = gymnasium.make(experiment.environment.id, **experiment.environment.options).unwrapped
-    if not isinstance(made, BeamEnv):
+    # An environment of the user's own may be a wrapper, which observes or decides something else.
+    learnt = model.observation_space, model.action_space
+    if not isinstance(made, BeamEnv) or learnt != (made.observation_space, made.action_space):
         return None
     mean_reward = _mean_reward(model)
     export_policy(

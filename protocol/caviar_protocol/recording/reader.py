@@ -104,6 +104,9 @@ class Recording:
     def __len__(self) -> int:
         return self._starts[-1]
 
+    def __iter__(self) -> Iterator[RecordedFrame]:
+        return self.frames()
+
     def __repr__(self) -> str:
         episodes = len({episode for episode, _ in self._index})
         of = f"{len(self)} frames in {episodes} episode{'s' * (episodes != 1)}"
@@ -167,6 +170,11 @@ class Recording:
             RecordingError: There is no such topic, none of its products is in the recording, or the source
                 is not one of it.
         """
+        if not isinstance(key, str | tuple):
+            raise RecordingError(
+                f"recording[{key!r}] is no topic, which is a text, as in recording['link']; frames are "
+                "recording.frame(episode=0, frame=7) and recording.frames()"
+            )
         topic, source = (key, "") if isinstance(key, str) else key
         return TOPIC_ARRAYS[check_topic(topic)](
             self, topic, self._sources(topic, source), np.arange(len(self), dtype=np.int64)

@@ -185,10 +185,22 @@ BORESIGHT: Vector = (1.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Pair:
-    """A transmitter and a receiver."""
+    """A transmitter and a receiver.
+
+    Example:
+        >>> from caviar_protocol.recording import Recording
+        >>> scene = Recording("runs/smoke-20261122-101500")["scene"][0]
+        >>> pair = pairs_of(scene)[1]
+        >>> pair.rx.position  # on its mount, the UAV
+        (0.0, 0.0, -0.175)
+        >>> device_pose(scene, pair.rx).position  # in the world
+        (20.0, -15.0, 0.125)
+    """
 
     tx: AntennaDevice
+    """Its ``position`` is that on its mount; `device_pose` gives the one in the world."""
     rx: AntennaDevice
+    """The same."""
 
 
 def pairs_of(scene: Scene) -> list[Pair]:

@@ -132,8 +132,8 @@ def _bundled(name: str) -> Path:
     folder = next((place for place in folders if place.is_dir()), None)
     if folder is None:
         raise SetupError(
-            f'scenery "{_BUNDLED}{name}" comes with sionna-rt, which is not installed; run: '
-            + install_command("world")
+            f'scenery "{_BUNDLED}{name}" comes with sionna-rt, which the extras `world` and `channel` bring, '
+            f"and which is not installed; run: {install_command('world')}"
         )
     xml = folder / name / f"{name}.xml"
     if "/" in name or not xml.is_file():
