@@ -202,7 +202,7 @@ def print_line(console: Console, text: object, style: str = "") -> None:
 
 
 def progress_bar(console: Console, *columns: str | ProgressColumn, transient: bool = False) -> Progress:
-    """Make a bar after the description of its task.
+    """Make a bar after the description of its task; where there is no terminal, a line every half minute.
 
     Args:
         console: Where it is drawn.
@@ -213,7 +213,11 @@ def progress_bar(console: Console, *columns: str | ProgressColumn, transient: bo
 
     # A task may be named after what a user wrote, in which brackets are no markup.
     first = (TextColumn("{task.description}", markup=False), BarColumn())
-    return Progress(*first, *columns, console=console, transient=transient)
+    if console.is_interactive or console.is_jupyter:
+        return Progress(*first, *columns, console=console, transient=transient)
+    from caviar_clients.cli.plain_progress import PlainProgress
+
+    return PlainProgress(*first, *columns, console=console, transient=transient)
 
 
 def write_json(file: Path | None, found: Any) -> None:

@@ -1,0 +1,45 @@
+"""Progress without a terminal: lines in a log."""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+import time
+
+import pytest
+from rich.console import Console
+
+from caviar_clients.cli import plain_progress
+from caviar_clients.cli.paper import _time_left
+from caviar_clients.cli.shared import progress_bar
+
+
+def test_lines_are_printed_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also by ``caviar paper``, whose bar vanishes, and while nothing is reported."""
+    monkeypatch.setattr(plain_progress, "EVERY_S", 0.05)
+    output = io.StringIO()
+    with _time_left(Console(file=output)) as show:
+        for share in (0.0, 0.1, 0.2):
+            show("training [1]", share)
+            time.sleep(0.01)
+        until = time.monotonic() + 10
+        while output.getvalue().count("\n") < 3 and time.monotonic() < until:
+            time.sleep(0.01)
+    lines = output.getvalue().splitlines()
+    assert len(lines) >= 3
+    assert re.fullmatch(r"training \[1\]: 20 %, 0:00:0\d left", lines[0])
+    assert not any(thread.name == "progress" for thread in threading.enumerate())
+
+
+def test_nothing_is_printed_beside_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plain_progress, "EVERY_S", 0.01)
+    console = Console(file=io.StringIO(), force_terminal=True)
+    assert not isinstance(progress_bar(console), plain_progress.PlainProgress)
+
+
+def test_what_has_no_end_is_counted() -> None:
+    bar = plain_progress.PlainProgress(console=Console(file=io.StringIO()))
+    task = bar.add_task("frames", total=None)
+    bar.update(task, completed=12)
+    assert plain_progress.line_of(bar.tasks[0]) == "frames: 12"
