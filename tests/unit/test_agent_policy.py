@@ -167,7 +167,9 @@ def test_what_does_not_fit_is_refused_with_both_sides(tmp_path: Path) -> None:
     content = file.read_bytes()
     (tmp_path / "cut.onnx").write_bytes(content[: len(content) // 2])
     cut = refused(with_policy(tmp_path, "cut.onnx"), tmp_path / "a")
-    assert "policy cut.onnx is no ONNX model" in cut
+    line = with_policy(tmp_path).read_text().splitlines().index('settings.file = "file:policy.onnx"') + 1
+    assert f"scenario.toml:{line}: services.agent.settings.file: policy cut.onnx is no ONNX model" in cut
+    assert "export the policy again" in cut
     other = refused(with_policy(tmp_path, base="smoke"), tmp_path / "b")
     assert "was trained for 1 user(s) with beams 64 × 1, and the scenario has 2 user(s)" in other
     assert "services.agent.settings.file" in other or "scenario.toml" in other
@@ -175,10 +177,47 @@ def test_what_does_not_fit_is_refused_with_both_sides(tmp_path: Path) -> None:
     assert "none.onnx" in missing
     made(tmp_path, Constant(BEAMS), "beyond.onnx")
     text = refused(with_policy(tmp_path, "beyond.onnx"), tmp_path / "d")
+    assert "scenario.toml:" in text
+    assert "settings.file: policy" in text
     assert "policy beyond.onnx chooses pair 64 of 64 for place 0" in text
     made(tmp_path, BeyondLater(), "later.onnx")
     text = refused(with_policy(tmp_path, "later.onnx"), tmp_path / "e")
     assert "the policy chose pair 64 of 64 for uav/rx" in text
+
+
+class Unstable(torch.nn.Module):  # type: ignore[misc]
+    """A network that fails where nothing is observed."""
+
+    def forward(self, aod: Any) -> Any:
+        return torch.gather(torch.zeros(1, 4), 1, 99 * (1 - aod.to(torch.int64)))[:, 0].to(torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("module", "dtype", "words"),
+    [
+        (
+            Straight(),
+            torch.float64,
+            "takes 'aod' as tensor(double), and it is observed as float32; export the policy with inputs",
+        ),
+        (Unstable(), torch.float32, "cannot be run ("),
+    ],
+)
+def test_a_model_that_cannot_be_run_is_refused_at_its_key(
+    module: Any, dtype: Any, words: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "bare.onnx"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter by tracing
+        example = (torch.ones(1, 1, dtype=dtype),)
+        torch.onnx.export(
+            module, example, str(file), input_names=["aod"], output_names=["action"], dynamo=False
+        )
+    scenario = with_policy(tmp_path, "bare.onnx", more='settings.observe = ["aod"]')
+    text = refused(scenario, tmp_path / "a")
+    line = scenario.read_text().splitlines().index('settings.file = "file:bare.onnx"') + 1
+    assert f"scenario.toml:{line}: services.agent.settings.file: policy bare.onnx {words}" in text
+    assert "Traceback" not in text
 
 
 def test_a_file_without_a_card_says_what_to_write(tmp_path: Path) -> None:

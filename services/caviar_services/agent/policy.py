@@ -123,6 +123,8 @@ class PolicyModel:
             raise ScenarioError(f"{called} is no ONNX model ({reason}); export the policy again") from error
         self.inputs: dict[str, tuple[Any, ...]] = {i.name: tuple(i.shape) for i in self._session.get_inputs()}
         """Shape of each input, by name; what is not a number may have any size."""
+        self.types: dict[str, str] = {i.name: i.type for i in self._session.get_inputs()}
+        """Type of each input as ONNX Runtime calls it, ``tensor(float)``, by name."""
         self.outputs = tuple(output.name for output in self._session.get_outputs())
         text = self._session.get_modelmeta().custom_metadata_map.get(CARD_KEY)
         try:
@@ -221,10 +223,13 @@ class PolicyAgent(Agent[PolicySettings]):
 
     def _load(self, path: Path, called: str, digest: str = "") -> Served:
         """Load a policy, hold it against the scenario, and run it once."""
-        model = PolicyModel(path, called)
+        key = self.run.settings_place.at("file").key
+        try:
+            model = PolicyModel(path, called)
+        except ScenarioError as error:
+            raise ScenarioError(error.message, key=key) from error
         if digest and model.digest != digest:
             raise AssetError(f"{called} is damaged in {path}; remove that file, and give the policy again")
-        key = self.run.settings_place.at("file").key
         card = model.card
         observe = self.settings.observe or (card.observe if card else ())
         if not observe:
@@ -250,7 +255,11 @@ class PolicyAgent(Agent[PolicySettings]):
             )
         _check_shapes(model, observer, called, key)
         # Buffers are made at the first run, which would else be late.
-        action = model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
+        try:
+            action = model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
+        except Exception as error:  # of ONNX Runtime, whose exceptions have no common base
+            reason = str(error).partition("\n")[0]
+            raise ScenarioError(f"{called} cannot be run ({reason}); export it again", key=key) from error
         self._check_action(action, called, key)
         return Served(model, observer)
 
@@ -355,6 +364,9 @@ def _codebooks(sizes: Sequence[tuple[int, int]]) -> str:
     return f"{len(sizes)} user(s) with beams {shown}"
 
 
+_ONNX_TYPES = {"float32": "float", "float64": "double"}
+
+
 def _check_shapes(model: PolicyModel, observer: Observer, called: str, key: str) -> None:
     """Refuse a model that takes other inputs than are observed, or gives no action."""
     bounds = observer.bounds
@@ -372,6 +384,13 @@ def _check_shapes(model: PolicyModel, observer: Observer, called: str, key: str)
             raise ScenarioError(
                 f"{called} takes {part!r} of shape {list(given)}, and the scenario's is "
                 f"{list(needed)}: it was trained for other users",
+                key=key,
+            )
+        dtype = np.dtype(bounds[part].dtype).name
+        if model.types[part] != f"tensor({_ONNX_TYPES.get(dtype, dtype)})":
+            raise ScenarioError(
+                f"{called} takes {part!r} as {model.types[part]}, and it is observed as {dtype}; export the "
+                f"policy with inputs of {dtype}",
                 key=key,
             )
     if ACTION not in model.outputs:
