@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING
 import caviar_clients.envs as _registered  # noqa: F401
 
 if TYPE_CHECKING:
+    from caviar_clients.datasets.reader import Dataset
     from caviar_protocol.recording import Recording
     from caviar_protocol.scenario import Scenario
 
-__all__ = ["load_scenario", "open", "run"]
+__all__ = ["dataset", "load_scenario", "open", "run"]
 
 
 def load_scenario(scenario: str | Path) -> Scenario:
@@ -116,3 +117,21 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
     from caviar_protocol.recording import Recording, newest_run
 
     return Recording(newest_run() if run is None else run)
+
+
+def dataset(path: str | Path) -> Dataset:
+    """Open a dataset that ``caviar generate`` wrote.
+
+    Args:
+        path: Folder of the dataset.
+
+    Returns:
+        The dataset: tables as columns (``data.users(los=True)["gain_db"]``), recorded arrays a row for each
+        user (``data.users()["channel.h"]``), splits by episode, and the recording of each episode.
+
+    Raises:
+        RecordingError: There is no dataset; the text has the place and the remedy.
+    """
+    from caviar_clients.datasets.reader import Dataset
+
+    return Dataset(path)

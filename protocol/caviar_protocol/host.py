@@ -112,6 +112,7 @@ _MODULES = {
     "channel": "sionna",
     "sensors": "mitsuba",
     "world": "libsumo",
+    "datasets": "distributed",
     "learning": "stable_baselines3",
     "plot": "matplotlib",
     "system": "sionna.sys",
@@ -122,7 +123,8 @@ def has_extra(extra: str) -> bool:
     """Whether the libraries of an extra can be imported; they are not imported for that.
 
     Args:
-        extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``learning``, ``plot`` or ``system``.
+        extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``datasets``, ``learning``, ``plot`` or
+            ``system``.
     """
     package, _, inner = _MODULES[extra].partition(".")
     spec = importlib.util.find_spec(package)

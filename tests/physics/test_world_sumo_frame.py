@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caviar_protocol.space.coordinates import rotation_matrix
-from caviar_services.world.sumo import Placement, body_pose, heading, object_class
+from caviar_services.world.sumo_conventions import Placement, body_pose, heading, object_class
 
 compass = st.floats(0.0, 360.0, exclude_max=True)
 slopes = st.floats(-30.0, 30.0)

@@ -534,3 +534,52 @@ def test_other_traffic_than_that_which_was_saved_is_an_error(make: Make) -> None
     world.reset(0, 8, 0)
     with pytest.raises(RunError, match="has other traffic 29 steps after frame 0 than it had before"):
         world.restore(state)
+
+
+# --- one traffic for all episodes ----------------------------------------------------------------------
+
+
+def test_episodes_of_one_traffic_begin_in_saved_states_and_are_the_same_in_any_order(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def scenes(cache: Path, episodes: list[int]) -> dict[int, list[tuple[bytes, ...]]]:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+        world = make(begin_s=20.0, between_episodes_s=7.0)
+        found = {}
+        for episode in episodes:
+            world.reset(episode, 3, 0)
+            found[episode] = [wire_bytes(scene_at(world, number)) for number in range(15)]
+        world.close()
+        return found
+
+    forwards = scenes(tmp_path / "one", [0, 1, 2])
+    backwards = scenes(tmp_path / "two", [2, 1, 0])  # the first one passes through the traffic up to it
+    assert forwards == backwards
+    assert len({episode[0] for episode in forwards.values()}) == 3
+    saved = sorted((tmp_path / "one" / "caviar" / "traffic").glob("*/*"))
+    assert [file.name for file in saved] == [f"00000{number}.xml.gz" for number in range(3)]
+
+
+def test_an_episode_of_one_traffic_begins_where_a_run_comes_that_long_after_the_first(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    spec = DeviceSpec(name="rx", kind="antenna", on="traffic.*", count=4, mount="roof", role="rx")
+    shared = make(begin_s=20.0, between_episodes_s=30.0, devices=(spec,))
+    shared.reset(1, 3, 0)
+    first = scene_at(shared, 0)
+    passed = make(begin_s=50.0, devices=(spec,))
+    passed.reset(0, 3, 0)
+    then = scene_at(passed, 0)
+    assert len(first.devices) == 4
+    assert (first.names, first.position.tolist()) == (then.names, then.position.tolist())
+    # Who came first carries the receivers: the order of departure is that of the run.
+    assert [device.name for device in first.devices] == [device.name for device in then.devices]
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, 0.25, math.inf])
+def test_a_spacing_that_is_no_number_of_steps_is_refused(make: Make, spacing: float) -> None:
+    with pytest.raises(
+        ScenarioError, match=r"between_episodes_s.*not a whole number of SUMO's steps of 100 ms"
+    ):
+        make(between_episodes_s=spacing)

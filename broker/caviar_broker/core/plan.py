@@ -130,6 +130,9 @@ class RunPlan:
     instants_ns: tuple[int, ...] = ()
     """Simulated time of each frame, where these are not evenly spaced."""
     episodes: int = 1
+    """Number of the last episode, plus one."""
+    first_episode: int = 0
+    """Where the run begins: with the seeds that this episode has in a run from episode 0 on."""
     seed: int = 0
     realtime: bool = False
     """Whether frames wait until real time has come to them (clause 8)."""

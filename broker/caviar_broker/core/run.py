@@ -220,10 +220,10 @@ class Run:
         self.members = {service.name: Member(service, since=now) for service in plan.services}
         self.graph: Graph | None = None
         """Known once all services have joined."""
-        self.episode = 0
+        self.episode = plan.first_episode
         self.seed = plan.seed
         """Of the present episode."""
-        self.seed_episode = 0
+        self.seed_episode = plan.first_episode
         """Episodes since the first one with this seed."""
         # Seed of the next episode, and the agent that chose it.
         self._wished: tuple[int, Member] | None = None
@@ -269,7 +269,7 @@ class Run:
         """An episode begins: with the seed that was chosen, or the one before."""
         if self._wished is not None:
             self.seed, self.seed_episode, self._wished = self._wished[0], 0, None
-        elif self.episode:
+        elif self.episode > self.plan.first_episode:
             self.seed_episode += 1
 
     # --- transitions of the run --------------------------------------------------------------------

@@ -123,6 +123,8 @@ class EmbeddedRun:
             them.
         imposed: Decisions that services take over in place of their own, as
             `caviar_protocol.recording.reader.recorded_decisions` finds them.
+        episode: The one episode that is played, with the seeds that it has in a run of many; None: all.
+        with_journal: Whether the decisions of the clock are written beside the recording.
 
     Example:
         >>> from caviar_clients.session.checks import checked_scenario
@@ -140,6 +142,8 @@ class EmbeddedRun:
         on_wait: Callable[[str], None] = _log.warning,
         seats: Mapping[str, type[Service[Any]]] | None = None,
         imposed: Imposed | None = None,
+        episode: int | None = None,
+        with_journal: bool = True,
     ) -> None:
         if directory is None:
             scenario = _without_recorders(scenario)
@@ -153,6 +157,8 @@ class EmbeddedRun:
         plan = with_replay(plan, scenario.replay)
         imposed = plan.imposed if imposed is None else imposed
         store = AssetStore()
+        if episode is not None:
+            plan = replace(plan, first_episode=episode, episodes=episode + 1)
         plan = replace(
             plan,
             # A service that runs ahead gains nothing in one process, and computes in vain where an agent ends
@@ -169,7 +175,9 @@ class EmbeddedRun:
         self._now = 0
         self._plan, self._clock = plan, FrameClock(plan, self._now)
         self._journal = (
-            JournalFile(RunDirectory(folder).journal, NO_BROKER, run=plan.run) if directory else None
+            JournalFile(RunDirectory(folder).journal, NO_BROKER, run=plan.run)
+            if directory and with_journal
+            else None
         )
         self._on_notice, self._on_frame = on_notice, on_frame
         self.outcome: ev.Finished | None = None
@@ -283,7 +291,7 @@ class EmbeddedRun:
                 phase, episode, frame = "step", order.message.episode, order.message.frame
             session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
         self._at_work = None
-        if self._journal is not None and type(order.message) is m.Grant:
+        if self._encodes and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
 
     def _close(self, session: ServiceSession) -> None:
@@ -360,14 +368,15 @@ class EmbeddedRun:
                 elif kind is not ev.Latency:
                     self._tell(action)
             # One write for all entries of a turn, and one event for the clock: the last number covers all.
-            if entries and self._journal is not None:
-                self._journal.write(entries)
+            if entries:
+                if self._journal is not None:
+                    self._journal.write(entries)
                 self._clock.receive(ev.Journaled(entries[-1].number), self._now)
 
     def _tell(self, action: ev.Action) -> None:
         match action:
             case ev.FrameFinished():
-                if self._journal is not None:
+                if self._encodes:
                     self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
                 self._on_frame(action)
             case ev.Notice():

@@ -14,6 +14,7 @@ import platform
 import re
 import shutil
 from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Generic, TypeVar
@@ -190,6 +191,7 @@ read: choose another directory with --out
     )
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of Python, of this distribution, and of its dependencies that are installed.
 

@@ -36,13 +36,14 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
+from msgspec.structs import replace as replace_field
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.files import Durability, sync_file
-from caviar_protocol.messages import GrantInput
+from caviar_protocol.messages import GrantInput, Report
 from caviar_protocol.recording import (
     FrameEntry,
     Manifest,
@@ -53,6 +54,7 @@ from caviar_protocol.recording import (
 from caviar_protocol.recording.integrity import RecordedSegments, follows
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.scenario.conversion import FILE
 from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import (
     Recorder,
@@ -81,6 +83,9 @@ class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Of the chunks, a frame each."""
     copy_assets: bool = True
     """Copy the scenery into the run directory."""
+    reproducible: bool = False
+    """Leave out what differs between equal runs: start, machine, wall times, folders of files. Then the
+    recordings of equal runs have equal bytes."""
     notes: tuple[str, ...] = ()
     """Free text, kept in the metadata."""
 
@@ -142,15 +147,16 @@ class McapRecorder(Recorder[McapSettings]):
             copied = copy_assets(assets, RunDirectory(folder).assets, sync=self._durability != "none")
         except OSError as error:
             raise failure(Path(error.filename or folder), error) from error
+        reproducible = self.settings.reproducible
         self._metadata = RecordingMetadata(
             run=self.run.run,
             seed=self.run.seed,
             sampling_period_ns=self.run.sampling_period_ns,
             frames=self.run.frames,
-            scenario=dict(self.run.scenario),
+            scenario=_without_folders(self.run.scenario) if reproducible else dict(self.run.scenario),
             versions=versions(),
-            machine=machine(),
-            started=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine={} if reproducible else machine(),
+            started="" if reproducible else datetime.now(UTC).isoformat(timespec="seconds"),
             assets=copied,
             notes=self.settings.notes,
         )
@@ -185,7 +191,7 @@ class McapRecorder(Recorder[McapSettings]):
             t_ns=frame.t_ns,
             seed=frame.seed,
             inputs=tuple(_with_digest(item) for item in inputs),
-            reports=frame.reports,
+            reports=_without_times(frame.reports) if self.settings.reproducible else frame.reports,
         )
         # Before the first byte of the frame: a product that is wrong leaves no half of a frame behind.
         new = [item for item in inputs if self._stored.is_new(item.provenance)]
@@ -432,6 +438,20 @@ def durability_of(scenario: Mapping[str, object]) -> Durability:
     run = scenario.get("run")
     durability: Durability = run.get("durability", "periodic") if isinstance(run, Mapping) else "periodic"
     return durability
+
+
+def _without_times(reports: tuple[Report, ...]) -> tuple[Report, ...]:
+    """Reports without wall times, in the order of their services."""
+    return tuple(replace_field(report, measured={}) for report in sorted(reports, key=lambda r: r.source))
+
+
+def _without_folders(value: Any) -> Any:
+    """What a scenario says, with ``file:NAME`` in place of the absolute path of a file or folder."""
+    if isinstance(value, str) and value.startswith("/"):
+        return f"{FILE}{Path(value).name}"
+    if isinstance(value, Mapping):
+        return {key: _without_folders(item) for key, item in value.items()}
+    return [_without_folders(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _as_text(metadata: RecordingMetadata) -> dict[str, str]:

@@ -1,15 +1,10 @@
-"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process.
-
-SUMO gives the centre of the front bumper on the ground, a heading in degrees clockwise from north, and a
-slope in degrees, positive uphill; a scene has the centre of the bounding box and angles counter-clockwise
-from +x.
-"""
+"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
@@ -17,12 +12,14 @@ import msgspec
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import derive_seed
-from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler
+from caviar_protocol.space.coordinates import Vector
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Preparation, Prepared, RunInfo
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
+from caviar_services.world.sumo_conventions import Placement, body_pose, heading, object_class
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
+from caviar_services.world.sumo_states import TrafficStates
 
 _NS_PER_MS = 1_000_000
 # SUMO's car-following models are made for steps up to one second.
@@ -52,6 +49,10 @@ class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     begin_s: Annotated[
         float, quantity("s", "SUMO's time at frame 0; it runs up to there first, to fill the roads")
     ] = 0.0
+    between_episodes_s: Annotated[
+        float | None,
+        quantity("s", "episodes share one traffic and begin so far apart in it; unset: each has its own"),
+    ] = None
     offset_m: Annotated[Vector3, quantity("m", "where the network's origin lies; z: the ground")] = (
         0.0,
         0.0,
@@ -123,6 +124,8 @@ class SumoWorld(World[SumoSettings]):
         self._angles: dict[str, float] = {}
         self._vehicles: dict[str, _Kind] = {}
         self._persons: dict[str, _Kind] = {}
+        if settings.between_episodes_s is not None:
+            check_spacing(settings.between_episodes_s, self._step_ms)
         if not settings.net and not settings.config:
             raise ScenarioError('needs net = "file:….net.xml" or config = "file:….sumocfg"', key="settings")
         for name in settings.meshes:
@@ -157,10 +160,18 @@ class SumoWorld(World[SumoSettings]):
         )
 
     def begin(self, episode: int, seed: int) -> None:
-        """Start SUMO with the episode's seed, and run it up to ``begin_s``."""
+        """Start SUMO with the episode's seed, and run it up to ``begin_s``; where episodes share one traffic,
+        from its saved state."""
         self._steps, self._vehicles, self._persons = 0, {}, {}
         simulation = self._started()
         self.run.progress("start SUMO", 0.0)
+        if (states := self.traffic_states(seed)) is not None:
+            if not states.file(episode).exists():
+                states.make(simulation, episode, self._passed)
+            simulation.start(states.arguments(episode))
+            self._angles = {}
+            self._take_over(simulation)
+            return
         simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
         # Compared in milliseconds, to half a step: SUMO adds its steps up in floating point.
         target_ms = self.settings.begin_s * 1e3
@@ -170,6 +181,37 @@ class SumoWorld(World[SumoSettings]):
                 self.run.progress(f"fill the roads: {simulation.api.simulation.getTime():.0f} s", 0.0)
         self._steps = 0
         self._angles = {}
+
+    def traffic_states(self, seed: int) -> TrafficStates | None:
+        """The saved states of the traffic that all episodes share; None where each has its own.
+
+        Args:
+            seed: Of the run.
+
+        Raises:
+            SetupError: libsumo is not installed.
+        """
+        spacing = self.settings.between_episodes_s
+        if spacing is None:
+            return None
+        version = self._started().api.getVersion()[1]
+        options = self._options(derive_seed(seed, 0, self.run.name))
+        return TrafficStates(self._files(), options, version, self.settings.begin_s, spacing)
+
+    def _passed(self, now_s: float, end_s: float) -> None:
+        self.run.progress(f"one traffic for all episodes: {now_s:.0f} of {end_s:.0f} s", 0.0)
+
+    def _take_over(self, simulation: Simulation) -> None:
+        """Note the vehicles and persons of a saved state, in the order of their departure."""
+        for domain, known in (
+            (simulation.api.vehicle, self._vehicles),
+            (simulation.api.person, self._persons),
+        ):
+            names = domain.getIDList()
+            if domain is simulation.api.vehicle:
+                names = sorted(names, key=lambda name: (simulation.api.vehicle.getDeparture(name), name))
+            for name in names:
+                known[name] = self._kind(domain, name)
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """Vehicles, then persons, each in the order of their departure."""
@@ -236,18 +278,24 @@ class SumoWorld(World[SumoSettings]):
         return self._simulation
 
     def _arguments(self, seed: int) -> list[str]:
+        files = (word for option, names in self._files().items() for word in (option, ",".join(names)))
+        return [*files, *self._options(seed)]
+
+    def _files(self) -> dict[str, Sequence[str]]:
         s = self.settings
-        arguments = ["--configuration-file", s.config] if s.config else []
-        for option, files in (
-            ("--net-file", _tuple(s.net)),
-            ("--route-files", _tuple(s.routes)),
-            ("--additional-files", _tuple(s.additional)),
-        ):
-            arguments += [option, ",".join(files)] if files else []
+        found = {
+            "--configuration-file": _tuple(s.config),
+            "--net-file": _tuple(s.net),
+            "--route-files": _tuple(s.routes),
+            "--additional-files": _tuple(s.additional),
+        }
+        return {option: names for option, names in found.items() if names}
+
+    def _options(self, seed: int) -> list[str]:
         # Warnings too, which are many; what SUMO would leave out is found before (`sumo_process.check_file`).
         quiet = ["--no-step-log", "--duration-log.disable", "--no-warnings"]
         step = ["--step-length", f"{self._step_ms / 1000:.3f}", "--seed", str(seed)]
-        return [*arguments, *quiet, *step, *s.options]
+        return [*quiet, *step, *self.settings.options]
 
     def _step(self, simulation: Simulation) -> None:
         api = simulation.api
@@ -335,137 +383,28 @@ def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:
     return step
 
 
+def check_spacing(between_episodes_s: float, step_ms: int) -> None:
+    """Check that episodes can begin so far apart in one traffic.
+
+    Args:
+        between_episodes_s: From the beginning of an episode to that of the next [s].
+        step_ms: SUMO's step [ms].
+
+    Raises:
+        ScenarioError: It is not a whole number of steps, or none at all.
+
+    Example:
+        >>> check_spacing(30.0, 100)
+    """
+    ms = between_episodes_s * 1000.0
+    if not 0 < ms < math.inf or abs(ms / step_ms - round(ms / step_ms)) > 1e-6:
+        raise ScenarioError(
+            f"{between_episodes_s} s is not a whole number of SUMO's steps of {step_ms} ms, at least one",
+            key="settings.between_episodes_s",
+        )
+
+
 def _tuple(files: Files) -> tuple[str, ...]:
     if isinstance(files, str):
         return (files,) if files else ()
     return files
-
-
-class Placement(NamedTuple):
-    """How the road network lies in the scene: turned about its origin, then shifted.
-
-    Example:
-        >>> Placement((100.0, 0.0, 0.0)).yaw
-        0.0
-    """
-
-    offset: Vector = (0.0, 0.0, 0.0)
-    """[m]"""
-    yaw: float = 0.0
-    """[rad], counter-clockwise."""
-
-
-class Heading(NamedTuple):
-    """Where a body on the road points [rad].
-
-    Example:
-        >>> Heading(0.0, 0.0).forward
-        (1.0, 0.0, 0.0)
-    """
-
-    yaw: float
-    slope: float
-
-    @property
-    def forward(self) -> Vector:
-        """Unit vector out of the nose."""
-        horizontal = math.cos(self.slope)
-        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.sin(self.slope))
-
-    @property
-    def up(self) -> Vector:
-        """Unit vector out of the roof."""
-        horizontal = -math.sin(self.slope)
-        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.cos(self.slope))
-
-
-def heading(angle_deg: float, slope_deg: float, placement: Placement) -> Heading:
-    """Convert a direction of SUMO: yaw = 90° − angle, turned with the network.
-
-    Args:
-        angle_deg: SUMO's angle, clockwise from north [°].
-        slope_deg: SUMO's slope, positive uphill [°].
-        placement: How the network lies in the scene.
-
-    Example:
-        >>> heading(90.0, 0.0, Placement())  # eastwards is +x
-        Heading(yaw=0.0, slope=0.0)
-    """
-    return Heading(math.radians(90.0 - angle_deg) + placement.yaw, math.radians(slope_deg))
-
-
-def body_pose(bumper: Vector, towards: Heading, length: float, height: float, placement: Placement) -> Pose:
-    """Pose of the bounding box of a body, which SUMO places by its front bumper.
-
-    Args:
-        bumper: Centre of the front bumper on the ground, in SUMO's coordinates [m].
-        towards: Where the body points in the scene.
-        length: Of the body [m].
-        height: Of the body [m].
-        placement: How the network lies in the scene.
-
-    Example:
-        >>> body_pose((10.0, 0.0, 0.0), Heading(0.0, 0.0), 4.0, 1.5, Placement()).position
-        (8.0, 0.0, 0.75)
-    """
-    c, s = math.cos(placement.yaw), math.sin(placement.yaw)
-    x, y, z = bumper
-    dx, dy, dz = placement.offset
-    front = (c * x - s * y + dx, s * x + c * y + dy, z + dz)
-    fx, fy, fz = towards.forward
-    ux, uy, uz = towards.up
-    back, rise = length / 2, height / 2
-    position = (
-        front[0] - back * fx + rise * ux,
-        front[1] - back * fy + rise * uy,
-        front[2] - back * fz + rise * uz,
-    )
-    # Positive pitch lowers the nose, a positive slope lifts it.
-    return Pose(position, quaternion_from_euler(towards.yaw, -towards.slope))
-
-
-_CLASS_OF: dict[str, str] = {
-    "aircraft": "uav",
-    "bicycle": "bicycle",
-    "bus": "bus",
-    "cable_car": "train",
-    "coach": "bus",
-    "container": "container",
-    "delivery": "truck",
-    "drone": "uav",
-    "moped": "motorcycle",
-    "motorcycle": "motorcycle",
-    "pedestrian": "pedestrian",
-    "rail": "train",
-    "rail_electric": "train",
-    "rail_fast": "train",
-    "rail_urban": "train",
-    "scooter": "bicycle",
-    "ship": "ship",
-    "subway": "train",
-    "trailer": "truck",
-    "tram": "train",
-    "truck": "truck",
-    "wheelchair": "pedestrian",
-}
-
-
-def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> str:
-    """Find the class of an object: as chosen for its vehicle type or its vClass, else by its vClass.
-
-    A vClass that is not in the table drives on roads and is a ``car``.
-
-    Args:
-        type_id: SUMO's vehicle type.
-        vehicle_class: SUMO's vClass.
-        chosen: Class by vehicle type or vClass, which goes before the table.
-
-    Example:
-        >>> object_class("Lorry@17", "passenger", {"Lorry": "truck"}), object_class("t", "coach", {})
-        ('truck', 'bus')
-    """
-    base_type = type_id.partition("@")[0]  # SUMO appends @VEHICLE to a type changed for one vehicle
-    for key in (base_type, vehicle_class):
-        if key in chosen:
-            return chosen[key]
-    return _CLASS_OF.get(vehicle_class, "car")

@@ -1,0 +1,208 @@
+"""``caviar generate``: datasets of episodes."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from caviar_clients.cli.shared import (
+    complete_scenario,
+    counted,
+    print_line,
+    progress_bar,
+    require_installed,
+)
+from caviar_clients.files import printable
+from caviar_protocol.errors import RunError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from caviar_clients.datasets.episode import EpisodeResult
+    from caviar_clients.datasets.estimate import Estimate
+
+LINE_S = 30.0
+"""[s] between two lines of progress where no bar can be drawn."""
+SHOWN_FAILURES = 10
+
+
+def generate_command(
+    scenario: Annotated[
+        Path,
+        typer.Argument(
+            help="scenario that ships, by name (caviar scenarios), or a file (TOML)",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the dataset; one that is begun is continued")],
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="episodes of the dataset, instead of the scenario's")
+    ] = None,
+    scenes: Annotated[
+        int | None, typer.Option(min=1, help="scenes of an episode, instead of the scenario's frames")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=0, help="processes that play; 0: one for each core")] = 0,
+    scheduler: Annotated[
+        str, typer.Option(help="address of a Dask scheduler, tcp://HOST:8786, instead of own processes")
+    ] = "",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="remove the dataset that is in the folder first")
+    ] = False,
+) -> None:
+    """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
+    require_installed("caviar generate", ["datasets"])
+    from caviar_clients.cli.scenarios import require_extras
+    from caviar_clients.datasets.generate import generate
+    from caviar_clients.datasets.plan import plan_dataset
+    from caviar_clients.session.checks import checked_scenario
+    from caviar_protocol.scenario import find_scenario
+
+    loaded = checked_scenario(find_scenario(scenario))
+    require_extras(loaded)
+    plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
+    if overwrite:
+        _remove(out)
+    console = Console()
+    shape = f"{counted(plan.episodes, 'episode')} of {counted(plan.scenes, 'scene')}"
+    print_line(console, f"{loaded.run.name}: {shape} into {out}")
+    with _Screen(console) as screen:
+        try:
+            outcome = generate(plan, out, screen, workers=workers, scheduler=scheduler)
+        except KeyboardInterrupt:
+            print_line(console, "stopped; the same command goes on with what is left")
+            raise
+    rate = outcome.scenes / outcome.wall_s if outcome.wall_s else 0.0
+    if outcome.before:
+        print_line(console, f"{counted(outcome.before, 'episode')} were there")
+    print_line(
+        console,
+        f"{counted(outcome.episodes, 'episode')}, {counted(outcome.scenes, 'scene')}, "
+        f"{outcome.bytes / 1e6:.1f} MB in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
+    )
+    if outcome.failed:
+        for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
+            print_line(console, f"episode {number} failed: {printable(error)}", "red")
+        raise RunError(
+            f"{counted(len(outcome.failed), 'episode')} of {plan.episodes} failed, all are listed in "
+            f"table failures of {out / 'catalogue.sqlite'}; the same command tries them again"
+        )
+
+
+def tables_command(
+    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    form: Annotated[
+        str, typer.Option("--format", help="csv, or parquet, which DuckDB and pandas read")
+    ] = "parquet",
+    out: Annotated[
+        Path | None, typer.Option(help="folder of the files; by default tables in that of the dataset")
+    ] = None,
+) -> None:
+    """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
+    from caviar_clients.cli.shared import require_known
+    from caviar_clients.datasets.catalogue import Catalogue
+    from caviar_clients.datasets.directory import DatasetDirectory
+    from caviar_clients.datasets.export import export_tables
+
+    require_known("--format", form, ("csv", "parquet"))
+    if form == "parquet":
+        require_installed("caviar tables --format parquet", ["datasets"])
+    directory = DatasetDirectory(dataset)
+    catalogue, console = Catalogue(directory.catalogue), Console()
+    for file in export_tables(catalogue, out or directory.tables, form):  # type: ignore[arg-type]
+        print_line(console, file)
+
+
+def duration_text(seconds: float) -> str:
+    """Say how long something takes.
+
+    Example:
+        >>> duration_text(8.25), duration_text(75.0), duration_text(7300.0)
+        ('8.2 s', '1 min 15 s', '2 h 1 min')
+    """
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _remove(out: Path) -> None:
+    """Remove a dataset; what else is in the folder stays."""
+    from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+
+    directory = DatasetDirectory(out)
+    if not directory.catalogue.exists():
+        return
+    with writing_dataset(directory):
+        for folder in (directory.episodes, directory.assets, directory.tables):
+            shutil.rmtree(folder, ignore_errors=True)
+        for file in out.glob(f"{directory.catalogue.name}*"):
+            file.unlink()
+
+
+class _Screen:
+    """Shows how a generation goes on: as a bar, or as lines where no bar can be drawn."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+
+        self._console = console
+        self._bar: Progress = progress_bar(
+            console, MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn(), transient=True
+        )
+        self._traffic: Any = None
+        self._task: Any = None
+        self._total, self._done, self._scenes, self._began, self._line_at = 0, 0, 0, 0.0, 0.0
+
+    def __enter__(self) -> _Screen:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def note(self, text: str) -> None:
+        """See `generate.Observer`."""
+        print_line(self._bar.console, text, "yellow")
+
+    def traffic(self, now_s: float, end_s: float) -> None:
+        """See `generate.Observer`."""
+        if self._traffic is None:
+            print_line(
+                self._bar.console,
+                f"one pass through {duration_text(end_s)} of traffic, kept for all episodes",
+            )
+            self._traffic = self._bar.add_task("traffic", total=end_s, rate="s")
+        self._bar.update(self._traffic, completed=round(now_s), visible=now_s < end_s)
+
+    def estimated(self, found: Estimate, free: int, episodes: int, workers: int) -> None:
+        """See `generate.Observer`."""
+        print_line(
+            self._bar.console,
+            f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, "
+            f"{found.bytes / 1e6:.1f} MB of {free / 1e9:.1f} GB that are free",
+        )
+        self._total, self._began = episodes, time.monotonic()
+        self._line_at = self._began + LINE_S
+        self._task = self._bar.add_task("episodes", total=episodes, rate="")
+
+    def ended(self, result: EpisodeResult) -> None:
+        """See `generate.Observer`."""
+        now = time.monotonic()
+        self._done += 1
+        self._scenes += len(result.rows.scenes) if result.rows else 0
+        rate = self._scenes / max(now - self._began, 1e-9)
+        self._bar.update(self._task, completed=self._done, rate=f"{rate:.2f} scenes/s")
+        if not self._console.is_terminal and now >= self._line_at:
+            self._line_at = now + LINE_S
+            left = (now - self._began) / self._done * (self._total - self._done)
+            text = f"{self._done} of {self._total} episodes, {rate:.2f} scenes/s, {duration_text(left)} left"
+            print_line(self._console, text)

@@ -1,0 +1,150 @@
+"""One episode of a dataset: one embedded run in this process, and its recording renamed into place.
+
+It imports services, and runs in the processes of a cluster.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from caviar_clients.datasets.directory import DatasetDirectory, unwritable
+from caviar_clients.datasets.rows import EpisodeRows, rows_of
+from caviar_clients.files import printable
+from caviar_clients.session.checks import check_implementations
+from caviar_clients.session.embedded import EmbeddedRun
+from caviar_protocol.assets import default_folder
+from caviar_protocol.errors import CaviarError
+from caviar_protocol.files import replace_file, sync_file
+from caviar_protocol.recording import Recording
+from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.scenario import Scenario
+
+MEASURED = "measured.json"
+"""Beside the recording of an episode: times, host and start, which differ from run to run."""
+
+
+@dataclass(frozen=True)
+class EpisodeTask:
+    """What a process needs to know to play an episode."""
+
+    scenario: Scenario
+    """With the settings of a dataset (`plan.dataset_scenario`)."""
+    episode: int
+    out: str
+    """Folder of the dataset, as the process sees it."""
+    trial: bool = False
+    """Whether the recording is removed once its time and size are known."""
+    kept: str = ""
+    """Where the recording of a trial is moved to; empty: it is removed."""
+    cached: Mapping[str, bytes] = field(default_factory=dict)
+    """Files that the cache of the process's user needs, by their names in it (`traffic.saved_states`)."""
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What came of an episode."""
+
+    episode: int
+    error: str = ""
+    """Why it failed; empty: it is there."""
+    rows: EpisodeRows | None = None
+    """Of the catalogue; None where it failed."""
+    measured: dict[str, Any] = field(default_factory=dict)
+    """Times, host and start."""
+
+
+def play_episode(task: EpisodeTask) -> EpisodeResult:
+    """Play an episode, and put its recording into place.
+
+    Whatever fails is told in the result: an episode that fails is no reason to lose others.
+
+    Args:
+        task: The episode.
+
+    Returns:
+        Rows of the catalogue and times, or the error.
+    """
+    began, cpu = time.monotonic(), time.process_time()
+    measured: dict[str, Any] = {
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+    }
+    directory = DatasetDirectory(Path(task.out))
+    target = directory.episode(task.episode)
+    try:
+        if target.exists() and not task.trial:  # by a twin of this task, on a worker that was given up
+            return EpisodeResult(task.episode, rows=rows_of(Recording(target)), measured=measured)
+        directory.work.mkdir(exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f"{task.episode}-", dir=directory.work))
+    except OSError as error:
+        return EpisodeResult(task.episode, str(unwritable(error.filename or task.out, error)))
+    except CaviarError as error:
+        return EpisodeResult(task.episode, str(error))
+    try:
+        # The last part is the id of the run, which the recording has in it.
+        folder = work / target.name
+        folder.mkdir()
+        times = _play(task, folder)
+        rows = rows_of(Recording(folder))
+        measured |= {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu, **times}
+        if not task.trial:
+            _put_into_place(folder, target, measured)
+        else:
+            measured["disk_b"] = _on_disk(folder)
+            if task.kept:
+                folder.rename(task.kept)
+        return EpisodeResult(task.episode, rows=rows, measured=measured)
+    except CaviarError as error:
+        return EpisodeResult(task.episode, printable(str(error)), measured=measured)
+    except OSError as error:
+        return EpisodeResult(task.episode, str(unwritable(error.filename or work, error)), measured=measured)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
+    """Play; the wall time of each service, summed over the scenes [s]."""
+    for name, content in task.cached.items():
+        file = default_folder() / name
+        if not file.exists():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(file, content, durable=False, concurrent=True)
+    scenario = check_implementations(task.scenario)
+    run = EmbeddedRun(scenario, folder, episode=task.episode, with_journal=False)
+    outcome = run.run()
+    if outcome.error:
+        raise CaviarError(outcome.error)
+    services = run.statistics.recent_services()
+    return {"services_s": {name: service.total_ms / 1e3 for name, service in services.items()}}
+
+
+def _on_disk(folder: Path) -> int:
+    """What a recording takes of the disk, with its folder and a block for what is measured [B]."""
+    about = [path.stat() for path in (folder, *folder.iterdir())]
+    return sum(stat.st_blocks * 512 for stat in about) + about[0].st_blksize
+
+
+def _put_into_place(folder: Path, target: Path, measured: dict[str, Any]) -> None:
+    """Have the disk hold a recording, and rename it in one step."""
+    replace_file(folder / MEASURED, msgspec.json.encode(measured) + b"\n", durable=False)
+    for file in (*RunDirectory(folder).segments(), RunDirectory(folder).manifest, folder):
+        sync_file(file)
+    try:
+        folder.rename(target)
+    except OSError:
+        # A twin was quicker; a recording depends on the episode alone, so that its is as good.
+        if not target.exists():
+            raise
+    sync_file(target.parent)

@@ -1,0 +1,156 @@
+"""What a dataset is made of: the scenario of its episodes, and the digest that tells it from others."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from caviar_clients.session.checks import check_implementations
+from caviar_protocol.digest import file_digest
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario.rules import with_overrides
+from caviar_services.drjit_setup import choose_variant
+from caviar_services.recorder.base import versions
+
+FORMAT = 1
+"""Version of the layout of a dataset."""
+
+
+@dataclass(frozen=True)
+class DatasetPlan:
+    """A dataset: episodes of one scenario.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> plan = plan_dataset(load_scenario("smoke"), episodes=3, scenes=2)
+        >>> plan.episodes, plan.scenes, plan.scenario.run.frames
+        (3, 2, 2)
+    """
+
+    scenario: Scenario
+    """Of an episode: its frames are the scenes, and its recorder leaves out what differs from run to run."""
+    episodes: int
+
+    @property
+    def scenes(self) -> int:
+        """Of an episode."""
+        return self.scenario.run.frames
+
+    def settings(self) -> dict[str, Any]:
+        """All that the bytes of a recording follow from, beside the number of its episode, as plain values.
+
+        Raises:
+            ScenarioError: A file that the scenario names cannot be read.
+        """
+        content = msgspec.to_builtins(self.scenario)
+        content.pop("source", None)
+        return {
+            "format": FORMAT,
+            "scenario": _without_folders(content),
+            "files": dict(sorted(_files(content))),
+            "versions": versions(),
+            "device": choose_variant(),
+        }
+
+
+def plan_dataset(
+    scenario: Scenario, *, episodes: int, scenes: int | None = None, seed: int | None = None
+) -> DatasetPlan:
+    """Make the plan of a dataset.
+
+    Args:
+        scenario: Whose episodes are played.
+        episodes: How many.
+        scenes: Of an episode; None: the frames of the scenario.
+        seed: Of all random numbers; None: that of the scenario.
+
+    Raises:
+        ScenarioError: The scenario has no recorder ``mcap``, or a service elsewhere.
+    """
+    scenario = with_overrides(scenario, scenes, seed, "free")
+    recorders = [name for name, spec in scenario.services.items() if spec.role == "recorder"]
+    if len(recorders) != 1 or scenario.services[recorders[0]].use != "mcap":
+        raise ScenarioError(
+            'a dataset needs one recorder; add [services.recorder] with role = "recorder", use = "mcap"',
+            scenario.source.file,
+            "services",
+        )
+    for name, spec in scenario.services.items():
+        if spec.remote:
+            raise ScenarioError(
+                f"{name!r} is a service elsewhere; the episodes of a dataset run in one process each: give "
+                "it an implementation with use",
+                scenario.source.file,
+                f"services.{name}.use",
+            )
+    recorder = scenario.services[recorders[0]]
+    settings = {"compression": "zstd", **recorder.settings, "reproducible": True, "copy_assets": False}
+    services = {**scenario.services, recorders[0]: replace(recorder, settings=settings)}
+    # A kill costs the episodes in progress, whatever the disk holds of them: each is synced as a whole.
+    # Nor does a recording say how many episodes there are: a dataset may grow.
+    run = replace(scenario.run, episodes=1, durability="none", checkpoint_frames=0)
+    return DatasetPlan(check_implementations(replace(scenario, run=run, services=services)), episodes)
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Digest of the settings of a dataset; the number of its episodes is none of them.
+
+    Args:
+        settings: Of `DatasetPlan.settings`.
+
+    Example:
+        >>> fingerprint({"device": "llvm"})[:8]
+        '72f6d3f2'
+    """
+    return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """Keys of the settings in which two datasets differ, each with both values.
+
+    Args:
+        before: Settings of one.
+        now: Settings of the other.
+
+    Example:
+        >>> list(differences({"device": "llvm"}, {"device": "cuda"}))
+        ["device was 'llvm', is 'cuda'"]
+    """
+    yield from _differences("", before, now)
+
+
+def _differences(key: str, before: Any, now: Any) -> Iterator[str]:
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in dict.fromkeys((*before, *now)):
+            yield from _differences(f"{key}.{name}" if key else name, before.get(name), now.get(name))
+    elif before != now:
+        yield f"{key} was {before!r}, is {now!r}"
+
+
+def _without_folders(value: Any) -> Any:
+    if isinstance(value, str) and value.startswith("/"):
+        return f"file:{Path(value).name}"
+    if isinstance(value, Mapping):
+        return {key: _without_folders(item) for key, item in value.items()}
+    return [_without_folders(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _files(value: Any) -> Iterator[tuple[str, str]]:
+    """Name and digest of each file that the settings name."""
+    if isinstance(value, str) and value.startswith("/"):
+        path = Path(value)
+        if path.is_file():
+            yield path.name, file_digest(path)
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _files(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _files(item)

@@ -1,0 +1,242 @@
+"""Users of a dataset as rows: columns of the catalogue, and what was recorded of each user."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from types import UnionType
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.recording.arrays import TopicArrays
+from caviar_protocol.recording.topics import TOPIC_ARRAYS
+
+if TYPE_CHECKING:
+    from caviar_clients.datasets.reader import Dataset
+
+_DTYPES: dict[type, Any] = {int: np.int64, float: np.float64, bool: np.bool_, str: np.str_}
+_NONE: dict[type, Any] = {int: -1, float: np.nan}
+SENSORS = ("lidar", "camera", "depth", "segmentation")
+"""Topics with a row for each sensor: a user has the one on its own object, or that of all."""
+
+
+class Columns(Mapping[str, NDArray[Any]]):
+    """Columns of a table, by name, all of the same length.
+
+    Args:
+        columns: Arrays of the same length.
+
+    Example:
+        >>> table = Columns({"episode": np.array([0, 1]), "scenes": np.array([3, 4])})
+        >>> table["scenes"].sum(), len(table), list(table)
+        (np.int64(7), 2, ['episode', 'scenes'])
+    """
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        self._columns = dict(columns)
+
+    @classmethod
+    def of(cls, row: type[Any], names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Columns:
+        """Make columns of the rows of a database.
+
+        Args:
+            row: Class whose fields are the columns.
+            names: Of the columns, in the order of the values.
+            rows: Values.
+        """
+        hints = get_type_hints(row)
+        values = list(zip(*rows, strict=True)) if rows else [()] * len(names)
+        found = {}
+        for name, column in zip(names, values, strict=True):
+            optional = isinstance(hints[name], UnionType)
+            kind = get_args(hints[name])[0] if optional else hints[name]
+            given = [_NONE[kind] if value is None else value for value in column] if optional else column
+            found[name] = np.array(given, dtype=_DTYPES[kind])
+        return cls(found)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._columns:
+            raise RecordingError(f"there is no column {name!r}; {suggestion(name, self._columns)}")
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self._columns.values()))) if self._columns else 0
+
+    def where(self, rows: NDArray[Any]) -> Columns:
+        """These rows only.
+
+        Args:
+            rows: A mask, or positions.
+        """
+        return Columns({name: column[rows] for name, column in self._columns.items()})
+
+
+class Users:
+    """Users of a dataset, a row each: a receiver in a scene, on a carrier, for a transmitter.
+
+    A name without a dot is a column of the catalogue: ``users["gain_db"]``. A name with one is a recorded
+    array, of which each user has a row: ``users["channel.h"]``, ``users["lidar.grid"]``. Recorded arrays are
+    read when they are asked for, and not kept.
+
+    Args:
+        dataset: Of which they are.
+        table: Their rows of the catalogue.
+    """
+
+    def __init__(self, dataset: Dataset, table: Columns) -> None:
+        self._dataset, self._table = dataset, table
+
+    def __len__(self) -> int:
+        """Number of users."""
+        return len(self._table)
+
+    def __repr__(self) -> str:
+        lines = [f"{len(self)} users of {self._dataset.path}", f"  columns: {', '.join(self._table)}"]
+        lines += [f"  {name}: {doc}" for name, doc in self.recorded().items()]
+        return "\n".join(lines)
+
+    def recorded(self) -> dict[str, str]:
+        """Names of the recorded arrays, each with what it is, its unit and the shape of a row."""
+        if not self._dataset.episodes:
+            return {}
+        topics = self._dataset.episode(self._dataset.episodes[0]).topics
+        return {
+            f"{topic}.{name}": f"{column.doc} [{column.unit}], {column.dtype.name}, {list(column.shape)}"
+            for topic in topics
+            if topic in SENSORS or topic in ("channel", "link")
+            for name, column in TOPIC_ARRAYS[topic].columns.items()
+        }
+
+    def __getitem__(self, name: str | slice | NDArray[Any]) -> Any:
+        """A column, a recorded array, or with a slice, a mask or positions these users only."""
+        if not isinstance(name, str):
+            rows = np.arange(len(self))[name]
+            return Users(self._dataset, self._table.where(rows))
+        return self.read([name])[name]
+
+    def read(self, names: Sequence[str]) -> Columns:
+        """Read several columns and recorded arrays at once, each scene once.
+
+        Args:
+            names: As of ``users[name]``.
+
+        Returns:
+            An array for each name; axis 0 counts the users, in their order. Rows of different lengths are
+            padded with NaN, −1 for integers, 0 for unsigned ones and false for booleans.
+
+        Raises:
+            RecordingError: There is no such name, or it was not recorded; a user's object has no such sensor.
+        """
+        columns = {name: self._table[name] for name in names if "." not in name}
+        recorded = [name for name in names if "." in name]
+        rows = self._recorded(recorded) if recorded else {}
+        return Columns({name: columns[name] if name in columns else _stacked(rows[name]) for name in names})
+
+    def batches(self, size: int, names: Sequence[str], *, shuffle: int | None = None) -> Iterator[Columns]:
+        """Read the users in parts, so that a dataset of any size is read in the memory of one.
+
+        Args:
+            size: Users of a part at most.
+            names: Columns and recorded arrays.
+            shuffle: Seed of the order; None: as they are. Episodes are shuffled, and users within 16 of
+                them, so that what is read together lies together.
+
+        Raises:
+            ValueError: A part would have no user.
+        """
+        if size < 1:
+            raise ValueError(f"a batch has at least 1 user, got {size}")
+        order = np.arange(len(self)) if shuffle is None else self._shuffled(shuffle)
+        for start in range(0, len(order), size):
+            yield self[order[start : start + size]].read(names)
+
+    def _shuffled(self, seed: int) -> NDArray[np.int64]:
+        draw = random.Random(seed)  # noqa: S311 - no secret
+        episode = self._table["episode"]
+        numbers = np.unique(episode).tolist()
+        draw.shuffle(numbers)
+        places = {number: np.flatnonzero(episode == number).tolist() for number in numbers}
+        order = list[int]()
+        for start in range(0, len(numbers), _TOGETHER):
+            part = [place for number in numbers[start : start + _TOGETHER] for place in places[number]]
+            draw.shuffle(part)
+            order += part
+        return np.array(order, dtype=np.int64)
+
+    def _recorded(self, names: Sequence[str]) -> dict[str, list[Any]]:
+        """Rows of recorded arrays, in the order of the users."""
+        found: dict[str, list[Any]] = {name: [None] * len(self) for name in names}
+        table = self._table
+        scenes = np.stack([table["episode"], table["scene"]], axis=1)
+        # Each scene once, in the order in which they lie on the disk.
+        order = np.lexsort((scenes[:, 1], scenes[:, 0]))
+        starts = np.flatnonzero(np.any(np.diff(scenes[order], axis=0, prepend=-1), axis=1))
+        for at, start in enumerate(starts):
+            stop = starts[at + 1] if at + 1 < len(starts) else len(order)
+            users = order[start:stop]
+            episode, scene = (int(value) for value in scenes[users[0]])
+            for name in names:
+                for user, row in zip(users, self._rows(name, episode, scene, users), strict=True):
+                    found[name][user] = row
+        return found
+
+    def _rows(self, name: str, episode: int, scene: int, users: NDArray[Any]) -> list[Any]:
+        """Rows of a recorded array, of users of one scene."""
+        topic, _, field = name.partition(".")
+        recording = self._dataset.episode(episode)
+        arrays: TopicArrays[Any, Any] = recording[topic]
+        if field not in arrays.columns:
+            raise RecordingError(f"{topic} has no array {field!r}; {suggestion(field, arrays.columns)}")
+        payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
+        place = f"{recording.path}, scene {scene}"
+        if payload is None:
+            raise RecordingError(f"{place}: {topic} is absent")
+        rows = arrays.columns[field].rows(arrays, payload)
+        at = {key: number for number, key in enumerate(arrays.keys_of(payload))}
+        return [rows[self._key(topic, at, user, place)] for user in users]
+
+    def _key(self, topic: str, at: Mapping[Any, int], user: int, place: str) -> int:
+        """The row of a product that a user has."""
+        table = self._table
+        if topic not in SENSORS:
+            key = str(table["tx"][user]), str(table["rx"][user]), str(table["carrier"][user])
+            if key not in at:
+                raise RecordingError(f"{place}: {topic} has no user {key}")
+            return at[key]
+        carrier = str(table["object"][user])
+        own = [row for sensor, row in at.items() if carrier and str(sensor).startswith(f"{carrier}/")]
+        fixed = [row for sensor, row in at.items() if "/" not in str(sensor)]
+        for rows in (own, fixed):
+            if len(rows) == 1:
+                return rows[0]
+        raise RecordingError(
+            f"{place}: {table['rx'][user]} has {len(own)} sensors of {topic} on its object, and {len(fixed)} "
+            f"stand fixed: it takes one of either; read dataset.episode({table['episode'][user]})[{topic!r}]"
+        )
+
+
+_TOGETHER = 16
+
+# What stands where there is no value, by kind of element.
+_MISSING: dict[str, Any] = {"f": np.nan, "c": complex(np.nan, np.nan), "i": -1, "u": 0, "b": False}
+
+
+def _stacked(rows: Sequence[Any]) -> NDArray[Any]:
+    """Rows as one array, padded where their lengths differ."""
+    if not rows:
+        return np.zeros(0)
+    arrays = [np.asarray(row) for row in rows]
+    shape = tuple(np.max([array.shape for array in arrays], axis=0).astype(int)) if arrays[0].ndim else ()
+    if all(array.shape == shape for array in arrays):
+        return np.stack(arrays)
+    out = np.full((len(arrays), *shape), _MISSING[arrays[0].dtype.kind], dtype=arrays[0].dtype)
+    for at, array in enumerate(arrays):
+        out[at][tuple(slice(size) for size in array.shape)] = array
+    return out

@@ -1,0 +1,143 @@
+"""Places, headings and classes of SUMO as those of a scene.
+
+SUMO gives the centre of the front bumper on the ground, a heading in degrees clockwise from north, and a
+slope in degrees, positive uphill; a scene has the centre of the bounding box and angles counter-clockwise
+from +x.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler
+
+
+class Placement(NamedTuple):
+    """How the road network lies in the scene: turned about its origin, then shifted.
+
+    Example:
+        >>> Placement((100.0, 0.0, 0.0)).yaw
+        0.0
+    """
+
+    offset: Vector = (0.0, 0.0, 0.0)
+    """[m]"""
+    yaw: float = 0.0
+    """[rad], counter-clockwise."""
+
+
+class Heading(NamedTuple):
+    """Where a body on the road points [rad].
+
+    Example:
+        >>> Heading(0.0, 0.0).forward
+        (1.0, 0.0, 0.0)
+    """
+
+    yaw: float
+    slope: float
+
+    @property
+    def forward(self) -> Vector:
+        """Unit vector out of the nose."""
+        horizontal = math.cos(self.slope)
+        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.sin(self.slope))
+
+    @property
+    def up(self) -> Vector:
+        """Unit vector out of the roof."""
+        horizontal = -math.sin(self.slope)
+        return (math.cos(self.yaw) * horizontal, math.sin(self.yaw) * horizontal, math.cos(self.slope))
+
+
+def heading(angle_deg: float, slope_deg: float, placement: Placement) -> Heading:
+    """Convert a direction of SUMO: yaw = 90° − angle, turned with the network.
+
+    Args:
+        angle_deg: SUMO's angle, clockwise from north [°].
+        slope_deg: SUMO's slope, positive uphill [°].
+        placement: How the network lies in the scene.
+
+    Example:
+        >>> heading(90.0, 0.0, Placement())  # eastwards is +x
+        Heading(yaw=0.0, slope=0.0)
+    """
+    return Heading(math.radians(90.0 - angle_deg) + placement.yaw, math.radians(slope_deg))
+
+
+def body_pose(bumper: Vector, towards: Heading, length: float, height: float, placement: Placement) -> Pose:
+    """Pose of the bounding box of a body, which SUMO places by its front bumper.
+
+    Args:
+        bumper: Centre of the front bumper on the ground, in SUMO's coordinates [m].
+        towards: Where the body points in the scene.
+        length: Of the body [m].
+        height: Of the body [m].
+        placement: How the network lies in the scene.
+
+    Example:
+        >>> body_pose((10.0, 0.0, 0.0), Heading(0.0, 0.0), 4.0, 1.5, Placement()).position
+        (8.0, 0.0, 0.75)
+    """
+    c, s = math.cos(placement.yaw), math.sin(placement.yaw)
+    x, y, z = bumper
+    dx, dy, dz = placement.offset
+    front = (c * x - s * y + dx, s * x + c * y + dy, z + dz)
+    fx, fy, fz = towards.forward
+    ux, uy, uz = towards.up
+    back, rise = length / 2, height / 2
+    position = (
+        front[0] - back * fx + rise * ux,
+        front[1] - back * fy + rise * uy,
+        front[2] - back * fz + rise * uz,
+    )
+    # Positive pitch lowers the nose, a positive slope lifts it.
+    return Pose(position, quaternion_from_euler(towards.yaw, -towards.slope))
+
+
+_CLASS_OF: dict[str, str] = {
+    "aircraft": "uav",
+    "bicycle": "bicycle",
+    "bus": "bus",
+    "cable_car": "train",
+    "coach": "bus",
+    "container": "container",
+    "delivery": "truck",
+    "drone": "uav",
+    "moped": "motorcycle",
+    "motorcycle": "motorcycle",
+    "pedestrian": "pedestrian",
+    "rail": "train",
+    "rail_electric": "train",
+    "rail_fast": "train",
+    "rail_urban": "train",
+    "scooter": "bicycle",
+    "ship": "ship",
+    "subway": "train",
+    "trailer": "truck",
+    "tram": "train",
+    "truck": "truck",
+    "wheelchair": "pedestrian",
+}
+
+
+def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> str:
+    """Find the class of an object: as chosen for its vehicle type or its vClass, else by its vClass.
+
+    A vClass that is not in the table drives on roads and is a ``car``.
+
+    Args:
+        type_id: SUMO's vehicle type.
+        vehicle_class: SUMO's vClass.
+        chosen: Class by vehicle type or vClass, which goes before the table.
+
+    Example:
+        >>> object_class("Lorry@17", "passenger", {"Lorry": "truck"}), object_class("t", "coach", {})
+        ('truck', 'bus')
+    """
+    base_type = type_id.partition("@")[0]  # SUMO appends @VEHICLE to a type changed for one vehicle
+    for key in (base_type, vehicle_class):
+        if key in chosen:
+            return chosen[key]
+    return _CLASS_OF.get(vehicle_class, "car")

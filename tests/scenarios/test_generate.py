@@ -1,0 +1,254 @@
+"""``caviar generate`` with real processes: kills, other numbers of workers, a scheduler that comes back."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
+COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
+EPISODES = 24
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episodes of a quarter of a second, so that a kill finds some begun."""
+    folder = tmp_path_factory.mktemp("scenario")
+    (folder / "slow_agent.py").write_text(
+        "import time\n"
+        "from caviar_services.agent.baselines import RandomAgent\n"
+        "class SlowAgent(RandomAgent):\n"
+        "    def step(self, frame):\n"
+        "        time.sleep(0.05)\n"
+        "        return super().step(frame)\n"
+    )
+    file = folder / "slow.toml"
+    file.write_text(SMOKE.read_text().replace('use = "los-beam"', 'use = "slow_agent:SlowAgent"', 1))
+    return file
+
+
+def generate(
+    scenario: Path, out: Path, *options: str, seconds: float = 120.0
+) -> subprocess.CompletedProcess[str]:
+    command = [
+        *COMMAND,
+        str(scenario),
+        "--out",
+        str(out),
+        "--episodes",
+        str(EPISODES),
+        "--scenes",
+        "5",
+        *options,
+    ]
+    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+
+
+@pytest.fixture(scope="module")
+def reference(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("reference") / "d"
+    done = generate(scenario, out, "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    assert f"slow: {EPISODES} episodes of 5 scenes" in done.stdout.replace("smoke:", "slow:")
+    assert "estimate: " in done.stdout
+    return out
+
+
+def content(out: Path) -> dict[str, object]:
+    """Bytes of the recordings, and the tables that depend on the dataset alone."""
+    found: dict[str, object] = {
+        file.relative_to(out).as_posix(): file.read_bytes()
+        for file in sorted(out.glob("episodes/*/recording*"))
+    }
+    with sqlite3.connect(f"file:{out / 'catalogue.sqlite'}?mode=ro", uri=True) as connection:
+        for table in ("episodes", "scenes", "users", "products", "dataset"):
+            found[table] = connection.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608
+    return found
+
+
+def children(process: psutil.Process) -> list[psutil.Process]:
+    """The processes that play episodes."""
+    found = []
+    for child in process.children(recursive=True):
+        try:
+            if "spawn_main" in " ".join(child.cmdline()):
+                found.append(child)
+        except psutil.Error:
+            continue
+    return found
+
+
+@pytest.mark.slow
+def test_two_workers_write_the_bytes_of_one(scenario: Path, reference: Path, tmp_path: Path) -> None:
+    done = generate(scenario, tmp_path / "d", "--workers", "2")
+    assert done.returncode == 0, done.stderr
+    assert len(content(reference)) == 2 * EPISODES + 5
+    assert content(tmp_path / "d") == content(reference)
+
+
+@pytest.mark.slow
+def test_killed_workers_and_commands_change_no_byte(scenario: Path, reference: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    kills, rounds = 0, 0
+    while len(list(out.glob("episodes/episode-*"))) < EPISODES and rounds < 12:
+        rounds += 1
+        command = [*COMMAND, str(scenario), "--out", str(out), "--workers", "2"]
+        process = subprocess.Popen(
+            [*command, "--episodes", str(EPISODES), "--scenes", "5"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        before = len(list(out.glob("episodes/episode-*")))
+        watched = psutil.Process(process.pid)
+        deadline = time.monotonic() + 60.0
+        while process.poll() is None and time.monotonic() < deadline:
+            there = len(list(out.glob("episodes/episode-*")))
+            if there >= before + 2 and kills % 3 != 2:
+                for worker in children(watched)[:1]:
+                    worker.kill()
+                    kills += 1
+                before = there
+            elif there >= before + 2:
+                process.kill()
+                kills += 1
+                break
+            time.sleep(0.05)
+        process.wait(60.0)
+    assert kills >= 4
+    done = generate(scenario, out)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert content(out) == content(reference)
+    assert list((out / ".work").iterdir()) == []
+
+
+@contextmanager
+def dask(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.slow
+def test_a_cluster_survives_a_worker_and_its_scheduler(
+    scenario: Path, reference: Path, tmp_path: Path
+) -> None:
+    out, port = tmp_path / "d", str(free_port())
+    address = f"tcp://127.0.0.1:{port}"
+    start = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    worker = ("worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny", "--host", "127.0.0.1")
+    with dask(*worker) as doomed, dask(*worker), dask(*worker):
+        with dask(*start):
+            command = [*COMMAND, str(scenario), "--out", str(out), "--scheduler", address]
+            process = subprocess.Popen(
+                [*command, "--episodes", str(EPISODES), "--scenes", "5"],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+            wait_for(out, 4, process)
+            doomed.kill()
+            wait_for(out, 10, process)
+        with dask(*start), dask(*worker), dask(*worker):
+            said, _ = process.communicate(timeout=120.0)
+    assert process.returncode == 0, said
+    assert content(out) == content(reference)
+
+
+def wait_for(out: Path, episodes: int, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 90.0
+    while len(list(out.glob("episodes/episode-*"))) < episodes:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "too few episodes in 90 s"
+        time.sleep(0.05)
+
+
+def test_what_goes_wrong_is_named_and_leaves_nothing_half_written(scenario: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = generate(scenario, tmp_path / "file" / "d")
+    assert done.returncode == 1
+    assert "the dataset cannot be written" in done.stderr
+    done = generate(scenario, tmp_path / "d", "--scheduler", "tcp://127.0.0.1:9", seconds=90.0)
+    assert done.returncode == 1
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list((tmp_path / "d" / "episodes").iterdir()) == []
+
+
+def test_another_dataset_is_not_continued(scenario: Path, reference: Path) -> None:
+    before = content(reference)
+    done = generate(scenario, reference, "--seed", "5")
+    assert done.returncode == 1
+    assert "holds another dataset: scenario.run.seed was 1, is 5" in done.stderr
+    assert content(reference) == before
+    again = generate(scenario, reference)
+    assert again.returncode == 0
+    assert f"{EPISODES} episodes were there" in again.stdout
+
+
+def test_an_episode_that_fails_is_listed_and_the_others_are_there(tmp_path: Path) -> None:
+    (tmp_path / "picky.py").write_text(
+        "from caviar_services.agent.baselines import RandomAgent\n"
+        "class Picky(RandomAgent):\n"
+        "    def step(self, frame):\n"
+        "        if frame.episode in (5, 7):\n"
+        "            raise ValueError('I will not')\n"
+        "        return super().step(frame)\n"
+    )
+    file = tmp_path / "picky.toml"
+    file.write_text(SMOKE.read_text().replace('use = "los-beam"', 'use = "picky:Picky"', 1))
+    done = generate(file, tmp_path / "d", "--workers", "1")
+    assert done.returncode == 1
+    assert "episode 5 failed: agent 'agent' failed" in done.stdout
+    assert "2 episodes of 24 failed" in done.stderr
+    there = {int(path.name[-6:]) for path in (tmp_path / "d" / "episodes").iterdir()}
+    assert there == set(range(EPISODES)) - {5, 7}
+
+
+def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    command = [
+        *COMMAND,
+        str(scenario),
+        "--out",
+        str(out),
+        "--episodes",
+        "400",
+        "--scenes",
+        "5",
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(out, 3, process)
+    workers = children(psutil.Process(process.pid))
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 130, errors
+    assert "the same command goes on" in said
+    assert "Traceback" not in errors
+    gone, alive = psutil.wait_procs(workers, timeout=10.0)
+    assert (len(gone) >= 2, alive) == (True, [])
+    assert list((out / ".work").iterdir()) == []

@@ -1,0 +1,156 @@
+"""An episode of a dataset: its recording depends on scenario, seed and number alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
+from caviar_clients.datasets.plan import differences, fingerprint, plan_dataset
+from caviar_clients.session.checks import check_implementations
+from caviar_clients.session.embedded import EmbeddedRun
+from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.recording import Recording
+from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
+from caviar_services.agent.baselines import RandomAgent
+from caviar_services.service import Frame, StepResult
+
+SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
+
+
+class Fails(RandomAgent):
+    """Fails in a frame."""
+
+    def step(self, frame: Frame) -> StepResult:
+        if frame.number == 2:
+            raise ValueError("the agent has no answer")
+        return super().step(frame)
+
+
+def dataset(
+    tmp_path: Path, scenario: Scenario | None = None, episodes: int = 4, scenes: int = 3
+) -> list[bytes]:
+    """Play the episodes into a folder; the bytes of their recordings."""
+    directory = DatasetDirectory(tmp_path)
+    plan = plan_dataset(scenario or load_scenario(SMOKE), episodes=episodes, scenes=scenes)
+    with writing_dataset(directory):
+        for number in reversed(range(episodes)):
+            assert play_episode(EpisodeTask(plan.scenario, number, str(tmp_path))).error == ""
+    return [
+        directory.episode(number).joinpath("recording-0000.mcap").read_bytes() for number in range(episodes)
+    ]
+
+
+def test_the_bytes_of_an_episode_do_not_depend_on_folder_order_or_number_of_episodes(tmp_path: Path) -> None:
+    first = dataset(tmp_path / "one" / "deeper")
+    copied = tmp_path / "moved"
+    copied.mkdir()
+    (copied / "again.toml").write_text(SMOKE.read_text())
+    second = dataset(tmp_path / "two", load_scenario(copied / "again.toml"), episodes=6)
+    assert first == second[:4]
+    assert len({bytes(content) for content in first}) == 4
+
+
+def test_an_episode_is_that_of_a_run_of_many(tmp_path: Path) -> None:
+    """Product for product: only what differs from run to run is left out."""
+    dataset(tmp_path / "d")
+    text = SMOKE.read_text().replace("frames = 100\n", "frames = 3\nepisodes = 4\n", 1)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    assert EmbeddedRun(check_implementations(parse_scenario(text)), folder).run().error == ""
+    whole = Recording(folder)
+    for number in range(4):
+        episode = Recording(DatasetDirectory(tmp_path / "d").episode(number))
+        assert [frame.episode for frame in episode.frames()] == [number] * 3
+        for frame in episode.frames():
+            of_run = whole.frame(number, frame.number)
+            assert frame.entry.seed == of_run.entry.seed
+            assert [p.digest for p in frame.products] == [p.digest for p in of_run.products]
+
+
+def test_what_differs_from_run_to_run_stands_in_no_recording(tmp_path: Path) -> None:
+    dataset(tmp_path, episodes=1)
+    recording = Recording(DatasetDirectory(tmp_path).episode(0))
+    assert (recording.metadata.started, recording.metadata.machine) == ("", {})
+    assert [
+        report.measured for frame in recording.frames() for report in frame.reports if report.measured
+    ] == []
+    assert str(tmp_path) not in str(recording.metadata)
+    assert "/" not in str(recording.metadata.scenario["services"])
+
+
+def test_a_twin_leaves_the_recording_that_is_there(tmp_path: Path) -> None:
+    dataset(tmp_path, episodes=1)
+    plan = plan_dataset(load_scenario(SMOKE), episodes=1, scenes=3)
+    before = DatasetDirectory(tmp_path).episode(0).stat().st_ino
+    result = play_episode(EpisodeTask(plan.scenario, 0, str(tmp_path)))
+    assert result.rows is not None
+    assert result.rows.episode[:2] == (0, 3)
+    assert DatasetDirectory(tmp_path).episode(0).stat().st_ino == before
+    assert list(DatasetDirectory(tmp_path).work.iterdir()) == []
+
+
+def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> None:
+    text = SMOKE.read_text().replace('use = "los-beam"', f'use = "{__name__}:Fails"', 1)
+    plan = plan_dataset(parse_scenario(text), episodes=1, scenes=3)
+    with writing_dataset(DatasetDirectory(tmp_path)):
+        result = play_episode(EpisodeTask(plan.scenario, 0, str(tmp_path)))
+    assert result.rows is None
+    assert "the agent has no answer" in result.error
+    assert "frame 2" in result.error
+    assert DatasetDirectory(tmp_path).finished() == []
+    assert list(DatasetDirectory(tmp_path).work.iterdir()) == []
+
+
+def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:
+    directory = DatasetDirectory(tmp_path)
+    with (
+        writing_dataset(directory),
+        pytest.raises(RunError, match="another process writes the dataset"),
+        writing_dataset(directory),
+    ):
+        pass
+
+
+def test_what_a_killed_command_left_half_written_is_removed(tmp_path: Path) -> None:
+    directory = DatasetDirectory(tmp_path)
+    with writing_dataset(directory):
+        pass
+    (directory.work / "3-abc" / "episode-000003").mkdir(parents=True)
+    with writing_dataset(directory):
+        assert list(directory.work.iterdir()) == []
+
+
+def test_a_scenario_that_makes_no_dataset_is_refused() -> None:
+    text = SMOKE.read_text()
+    elsewhere = parse_scenario(text.replace('use = "free-space"', 'use = "remote"', 1))
+    with pytest.raises(ScenarioError, match="'channel' is a service elsewhere"):
+        plan_dataset(elsewhere, episodes=1)
+    text = text.replace('record = ["scene", "channel", "action", "link"]\n', "", 1)
+    without = parse_scenario(text[: text.index("[services.recorder]")] + text[text.index("[[devices]]") :])
+    with pytest.raises(ScenarioError, match=r"needs one recorder; add \[services.recorder\]"):
+        plan_dataset(without, episodes=1)
+
+
+def test_a_dataset_is_told_from_another_by_what_its_bytes_follow_from() -> None:
+    scenario = load_scenario(SMOKE)
+    same = plan_dataset(scenario, episodes=2, scenes=3).settings()
+    more = plan_dataset(scenario, episodes=9, scenes=3).settings()
+    other = plan_dataset(scenario, episodes=2, scenes=3, seed=7).settings()
+    assert fingerprint(same) == fingerprint(more) != fingerprint(other)
+    assert list(differences(same, other)) == ["scenario.run.seed was 1, is 7"]
+
+
+def test_an_estimate_has_a_part_for_the_episode_and_one_for_each_scene() -> None:
+    trials = [Trial(9.0, scenes=(1, 3), wall_s=(1.0, 2.0), bytes=(1000, 3000))] * 2
+    assert estimate(trials, episodes=10, scenes=5) == Estimate(wall_s=15.0, bytes=50_000)
+    single = Trial(9.0, scenes=(1, 1, 1), wall_s=(1.0, 2.0, 3.0), bytes=(1000, 1000, 4000))
+    assert estimate([single], episodes=10, scenes=1) == Estimate(wall_s=20.0, bytes=20_000)
+
+
+def test_a_disk_that_is_too_small_is_refused_with_both_figures(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"too small: 1050000000\.00 GB are needed, \d+\.\d+ GB are free"):
+        check_disk(tmp_path, 10**18)
