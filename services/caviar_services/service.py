@@ -22,7 +22,7 @@ from typing import ClassVar, Generic, TypeVar
 import msgspec
 
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Carrier
 from caviar_services.frame import Frame, FrameInput, StepResult
@@ -202,6 +202,19 @@ class Service(ABC, Generic[S]):
 
         Raises:
             ScenarioError: A value is wrong; the error names file, key and line.
+        """
+
+    @classmethod
+    def check_scenario(cls, settings: S, scenario: Scenario, place: Place) -> None:  # optional hook
+        """Check settings against the rest of the scenario, after `check_settings`.
+
+        Args:
+            settings: The settings.
+            scenario: Which the service is part of.
+            place: Where the settings stand in it.
+
+        Raises:
+            ScenarioError: A value does not fit the scenario; the error names file, key and line.
         """
 
     def __init__(self, settings: S, run: RunInfo) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
 
+from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Status
-from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import directions, pairs_of
@@ -168,6 +171,30 @@ def test_a_part_that_does_not_exist_is_refused_with_its_key() -> None:
         ScenarioError, match=r"settings\.observe: no observation is called 'aodd'; did you mean"
     ):
         LearnerAgent(LearnerSettings(observe=("aodd",)), RUN).prepare(Preparation(demand={}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (
+            'observe = ["aod", "buffered"]',
+            "observe: observation 'buffered' is of packets, and link",
+        ),
+        ('observe = ["aodd"]', "observe: no observation is called 'aodd'; did you mean 'aod'?"),
+        ('users = ["cra/*"]', "users: no receiver of the scenario is cra/*; there are: car/rx, uav/rx-uav"),
+    ],
+)
+def test_what_the_scenario_does_not_have_is_refused_when_it_is_read(
+    settings: str, words: str, tmp_path: Path
+) -> None:
+    text = find_scenario("smoke").read_text()
+    assert 'use = "los-beam"' in text
+    path = tmp_path / "my.toml"
+    path.write_text(text.replace('use = "los-beam"', f'use = "learner"\nsettings.{settings}'))
+    line = path.read_text().splitlines().index(f"settings.{settings}") + 1
+    with pytest.raises(ScenarioError) as refused:
+        checked_scenario(path)
+    assert f"my.toml:{line}: services.agent.settings.{words}" in str(refused.value)
 
 
 def test_a_perceptron_that_could_not_serve_in_time_is_refused() -> None:

@@ -322,6 +322,7 @@ def _prepared(scenario: Scenario, name: str, spec: ServiceSpec) -> Service[Any]:
     place = Place(spec.use) if spec.role == "agent" else settings_place(scenario, name)
     settings = convert_settings(cls.Settings, spec.settings, place)
     cls.check_settings(settings, place)
+    cls.check_scenario(settings, scenario, place)
     run = RunInfo(
         name=name,
         seed=scenario.run.seed,

@@ -131,7 +131,9 @@ def check_implementations(scenario: Scenario) -> Scenario:
             raise scenario_error(scenario, f"services.{name}.use", str(error)) from error
         place = settings_place(scenario, name)
         _check_keys(spec, implementation, place)
-        implementation.check_settings(convert_settings(implementation.Settings, spec.settings, place), place)
+        settings = convert_settings(implementation.Settings, spec.settings, place)
+        implementation.check_settings(settings, place)
+        implementation.check_scenario(settings, scenario, place)
         produced.update(implementation.outputs)
     for index, entry in enumerate(scenario.run.record):
         topic = entry.partition(".")[0]  # of a part, as channel.taps

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.observations import FAR, KnownDevices, Moment, Observer, Users
+from caviar_protocol.observations import FAR, KnownDevices, KnownScenario, Moment, Observer, Users
+from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
 from caviar_protocol.space.scene import Pair
@@ -181,28 +182,15 @@ class LearnerAgent(Agent[LearnerSettings]):
                 f"{MOST_WEIGHTS:,} at most"
             )
 
+    @classmethod
+    def check_scenario(cls, settings: LearnerSettings, scenario: Scenario, place: Place) -> None:
+        """Refuse an observation that the scenario does not have, as of packets where its link sends none."""
+        _observed(settings, scenario, place)
+
     def prepare(self, preparation: Preparation) -> Prepared:
         """Look the parts of the observation up."""
-        place = self.run.settings_place
         known = KnownDevices(self.run.devices)
-        self._places = Users(known, self.settings.users, self.settings.except_users)
-        if not self.settings.observe:
-            raise ScenarioError('is empty; write observe = ["aod"]', key=place.at("observe").key)
-        try:
-            self._observer = Observer(known, self._places, self.settings.observe)
-        except ScenarioError as error:
-            raise ScenarioError(str(error), key=place.at("observe").key) from error
-        if self._observer.inputs:
-            topics = ", ".join(sorted(i.topic for i in self._observer.inputs))
-            raise ScenarioError(
-                f"needs {topics}, and this agent takes the scene and the link alone; write an agent of your "
-                "own with these inputs",
-                key=place.at("observe").key,
-            )
-        for name in self.settings.scale:
-            if name not in self.settings.observe:
-                text = f"{name!r} is not observed; {suggestion(name, self.settings.observe)}"
-                raise ScenarioError(text, key=place.at("scale").key)
+        self._places, self._observer = _observed(self.settings, known, self.run.settings_place)
         return super().prepare(preparation)
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
@@ -278,3 +266,33 @@ class LearnerAgent(Agent[LearnerSettings]):
         scaled = np.concatenate(found)
         phases = np.outer(np.arange(1, self.settings.waves + 1), math.pi * scaled).reshape(-1)
         return np.concatenate([scaled, np.sin(phases), np.cos(phases)])
+
+
+def _observed(settings: LearnerSettings, known: KnownScenario, place: Place) -> tuple[Users, Observer]:
+    """The users, and what is observed of them.
+
+    Raises:
+        ScenarioError: Settings do not fit what is known of the scenario; names the key.
+    """
+    try:
+        users = Users(known, settings.users, settings.except_users)
+    except ScenarioError as error:
+        raise place.at("users").error(error.message) from error
+    here = place.at("observe")
+    if not settings.observe:
+        raise here.error('is empty; write observe = ["aod"]')
+    try:
+        observer = Observer(known, users, settings.observe)
+    except ScenarioError as error:
+        raise here.error(error.message) from error
+    if observer.inputs:
+        topics = ", ".join(sorted(i.topic for i in observer.inputs))
+        raise here.error(
+            f"needs {topics}, and this agent takes the scene and the link alone; write an agent of your "
+            "own with these inputs"
+        )
+    for name in settings.scale:
+        if name not in settings.observe:
+            text = f"{name!r} is not observed; {suggestion(name, settings.observe)}"
+            raise place.at("scale").error(text)
+    return users, observer
