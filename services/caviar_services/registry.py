@@ -151,6 +151,14 @@ def load(role: str, name: str) -> type[Service[Any]]:
                 f"{role} {name!r} is {target}, which sets checkpoints = True and does not define {missing}; "
                 "define checkpoint() and restore(), or leave out checkpoints if nothing outlives a frame"
             )
+    # What is saved by nobody would be found out with the first service that is killed.
+    own = [base for base in cls.__mro__ if base is not Service and issubclass(base, Service)]
+    unsaid = not any("checkpoints" in vars(base) for base in own)
+    if unsaid and any({"checkpoint", "restore"} & {*vars(base)} for base in own):
+        raise DeclarationError(
+            f"{role} {name!r} is {target}, which defines checkpoint() or restore() and does not say whether "
+            "they are used; write checkpoints = True in the class"
+        )
     for base in cls.__mro__[1:]:
         # A base reads its own settings: without them it would fail in the middle of a run.
         inherited = vars(base).get("Settings", NoSettings)

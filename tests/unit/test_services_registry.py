@@ -88,6 +88,13 @@ class NoRestore(NoCheckpoint):
 
 class Whole(NoRestore):
     def restore(self, state): ...
+
+class Undeclared(Right):
+    def checkpoint(self): ...
+    def restore(self, state): ...
+
+class SwitchedOff(Undeclared):
+    checkpoints = False
 """
 
 
@@ -98,6 +105,10 @@ BROKEN = {
         "sets checkpoints = True and does not define checkpoint and restore; define checkpoint() and",
     ),
     "no restore": ("unfinished:NoRestore", "sets checkpoints = True and does not define restore; define"),
+    "checkpoints that are not declared": (
+        "unfinished:Undeclared",
+        "defines checkpoint() or restore() and does not say whether they are used; write checkpoints = True",
+    ),
     "settings of another kind": (
         "unfinished:PlainSettings",
         "whose Settings is Plain: it has to be a subclass of ChannelSettings, that of ChannelModel",
@@ -127,6 +138,7 @@ def test_what_is_wrong_with_an_implementation_is_said(
     module(tmp_path, monkeypatch, "unfinished", UNFINISHED)
     assert load("channel", "unfinished:Right").__name__ == "Right"
     assert load("channel", "unfinished:Whole").checkpoints
+    assert not load("channel", "unfinished:SwitchedOff").checkpoints
     with pytest.raises(DeclarationError) as caught:
         load("channel", place)
     assert words in str(caught.value)
