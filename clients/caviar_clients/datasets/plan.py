@@ -106,8 +106,8 @@ def fingerprint(settings: Mapping[str, Any]) -> str:
         settings: Of `DatasetPlan.settings`.
 
     Example:
-        >>> fingerprint({"device": "llvm"})[:8]
-        '72f6d3f2'
+        >>> fingerprint({"device": "llvm"}) == fingerprint({"device": "cuda"})
+        False
     """
     return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
 
 from caviar_protocol.assets import default_folder
-from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_services.registry import load
 from caviar_services.service import RunInfo
 from caviar_services.world.sumo import SumoWorld
-from caviar_services.world.sumo_process import Simulation, load_libsumo
 from caviar_services.world.sumo_states import TrafficStates
 
 Progress = Callable[[float, float], None]
@@ -28,7 +24,6 @@ class SharedTraffic:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
         self._states = list(_shared(scenario))
 
     def save(self, episodes: int, progress: Progress) -> None:
@@ -41,32 +36,9 @@ class SharedTraffic:
         Raises:
             RunError: They cannot be saved.
         """
-        if not any(states.missing(episodes) for states in self._states):
-            return
-        # A process of its own: libsumo has one simulation in a process, and may end it on a broken file.
-        context = multiprocessing.get_context("spawn")
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_save, args=(self._scenario, episodes, sender), daemon=True)
-        process.start()
-        sender.close()
-        error = ""
-        try:
-            while True:
-                try:
-                    found = receiver.recv()
-                except EOFError:
-                    break
-                if isinstance(found, str):
-                    error = found
-                else:
-                    progress(*found)
-            process.join()
-        finally:
-            if process.is_alive():
-                process.kill()
-                process.join()
-        if error or process.exitcode:
-            raise RunError(error or f"SUMO ended its process with status {process.exitcode}")
+        for states in self._states:
+            if states.missing(episodes):
+                states.make(episodes, progress)
 
     def states_of(self, episode: int) -> dict[str, bytes]:
         """Read the saved states from which an episode begins.
@@ -89,14 +61,3 @@ def _shared(scenario: Scenario) -> Iterator[TrafficStates]:
         run = RunInfo(name=name, sampling_period_ns=scenario.run.sampling_period_ns)
         if (states := cls(settings, run).traffic_states(scenario.run.seed)) is not None:
             yield states
-
-
-def _save(scenario: Scenario, episodes: int, sender: Connection) -> None:
-    try:
-        for states in _shared(scenario):
-            simulation = Simulation(load_libsumo())
-            states.make(simulation, episodes - 1, lambda now, end: sender.send((now, end)))
-    except CaviarError as error:
-        sender.send(str(error))
-    finally:
-        sender.close()

@@ -167,7 +167,7 @@ class SumoWorld(World[SumoSettings]):
         self.run.progress("start SUMO", 0.0)
         if (states := self.traffic_states(seed)) is not None:
             if not states.file(episode).exists():
-                states.make(simulation, episode, self._passed)
+                states.make(episode + 1, self._passed)
             simulation.start(states.arguments(episode))
             self._angles = {}
             self._take_over(simulation)

@@ -10,16 +10,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from caviar_protocol.assets import default_folder
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RunError
-from caviar_services.world.sumo_process import Simulation
+from caviar_protocol.errors import CaviarError, RunError
+from caviar_services.world.sumo_process import Simulation, load_libsumo
+
+_REPORT_EVERY = 1000
+"""Steps between two reports of progress."""
 
 SAVING = ("--save-state.rng", "--save-state.precision", "20")
 """Options of SUMO with which a saved state has the random numbers and every digit."""
@@ -76,7 +79,7 @@ class TrafficStates:
         Args:
             episode: Its number.
         """
-        return self._folder / f"{episode:06d}.xml.gz"
+        return self._folder / _name(episode)
 
     def missing(self, episodes: int) -> bool:
         """Whether the state of one of the first episodes has to be made.
@@ -95,44 +98,48 @@ class TrafficStates:
         begin = ["--begin", f"{self.begin_s(episode):.3f}"]
         return [*self._command(), *begin, "--load-state", str(self.file(episode))]
 
-    def make(
-        self, simulation: Simulation, episode: int, progress: Callable[[float, float], None] = lambda *_: None
-    ) -> None:
-        """Save the states of all episodes up to one.
+    def make(self, episodes: int, progress: Callable[[float, float], None] = lambda *_: None) -> None:
+        """Save the states of the first episodes by one pass, in a process of its own.
+
+        SUMO writes into a state how many numbers its generators have drawn, and counts those of simulations
+        that the process ran before (SUMO 1.28): only the first one in a process is saved as it was.
 
         Args:
-            simulation: In which the pass runs; it is closed after it.
-            episode: The last one.
+            episodes: Their number.
             progress: Called now and then with SUMO's time [s], and with that at which the pass ends.
 
         Raises:
-            RunError: The states cannot be written.
+            RunError: SUMO stops, or the states cannot be written.
         """
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            folder = Path(tempfile.mkdtemp(prefix="part-", dir=self._folder))
-        except OSError as error:
-            raise self._failed(error) from error
-        try:
-            simulation.start([*self._command(), *SAVING])
-            end = self.begin_s(episode)
-            for number in range(episode + 1):
-                steps = 0
-                while simulation.api.simulation.getTime() < self.begin_s(number) - 5e-4:
-                    simulation.step()
-                    steps += 1
-                    if steps % 1000 == 0:
-                        progress(simulation.api.simulation.getTime(), end)
-                if not self.file(number).exists():
-                    part = folder / self.file(number).name
-                    simulation.api.simulation.saveState(str(part))
-                    os.replace(part, self.file(number))  # noqa: PTH105 - as elsewhere, in one step
-                progress(self.begin_s(number), end)
-        except OSError as error:
-            raise self._failed(error) from error
-        finally:
-            simulation.close()
-            shutil.rmtree(folder, ignore_errors=True)
+        command = [sys.executable, "-m", __name__]
+        with subprocess.Popen(  # noqa: S603 - our own module
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                self._watch(process, episodes, progress)
+            except BaseException:
+                process.kill()
+                raise
+
+    def _watch(
+        self, process: subprocess.Popen[str], episodes: int, progress: Callable[[float, float], None]
+    ) -> None:
+        if process.stdin is None or process.stdout is None or process.stderr is None:
+            raise RunError("the process of SUMO has no pipes")
+        order = {
+            "command": self._command(),
+            "folder": str(self._folder),
+            "begins_s": [self.begin_s(number) for number in range(episodes)],
+        }
+        process.stdin.write(json.dumps(order))
+        process.stdin.close()
+        for line in process.stdout:
+            now, end = map(float, line.split())
+            progress(now, end)
+        said = process.stderr.read().strip()
+        if process.wait():
+            last = said.splitlines()[-1] if said else f"it ended with status {process.returncode}"
+            raise RunError(f"the traffic of the episodes cannot be saved: {last}")
 
     def _command(self) -> list[str]:
         return [
@@ -140,8 +147,50 @@ class TrafficStates:
             *self._options,
         ]
 
-    def _failed(self, error: OSError) -> RunError:
-        return RunError(
-            f"the states of the traffic cannot be saved in {self._folder}: {error.strerror or error}; free "
-            "space there, or name another cache: export XDG_CACHE_HOME=/path"
-        )
+
+def _save(command: list[str], folder: Path, begins_s: list[float]) -> None:
+    """Pass through the traffic, and save its state at these times [s]; report on standard output."""
+    simulation = Simulation(load_libsumo())
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="part-", dir=folder) as part:
+        simulation.start([*command, *SAVING])
+        for number, begin_s in enumerate(begins_s):
+            steps = 0
+            while simulation.api.simulation.getTime() < begin_s - 5e-4:
+                simulation.step()
+                steps += 1
+                if steps % _REPORT_EVERY == 0:
+                    _report(simulation.api.simulation.getTime(), begins_s[-1])
+            file = Path(part, _name(number))
+            simulation.api.simulation.saveState(str(file))
+            file.replace(folder / file.name)  # in one step: others may make the same states
+            _report(begin_s, begins_s[-1])
+        simulation.close()
+
+
+def _report(now_s: float, end_s: float) -> None:
+    sys.stdout.write(f"{now_s} {end_s}\n")
+    sys.stdout.flush()
+
+
+def _name(episode: int) -> str:
+    return f"{episode:06d}.xml.gz"
+
+
+def main() -> int:
+    """Make the states that standard input asks for, as JSON."""
+    order = json.load(sys.stdin)
+    try:
+        _save(order["command"], Path(order["folder"]), order["begins_s"])
+    except OSError as error:
+        remedy = "free space there, or name another cache: export XDG_CACHE_HOME=/path"
+        sys.stderr.write(f"{order['folder']}: {error.strerror or error}; {remedy}\n")
+        return 1
+    except CaviarError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
