@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device
+from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device, turned_back
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics.scene import Device, Scene
 
@@ -328,7 +328,10 @@ def _as_published(
         device = published.get(f"{name}/{spec.name}")
         if device is not None and carries(spec, name):
             x, y, z = scene.dimensions[index].tolist()
-            yield mounted_device(spec, name, (x, y, z)), device
+            right = mounted_device(spec, name, (x, y, z))
+            if spec.keeps_heading:
+                right = turned_back(right, scene.orientation[index].tolist())
+            yield right, device
 
 
 def _difference(right: Device, device: Device) -> str:

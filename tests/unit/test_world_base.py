@@ -12,7 +12,7 @@ from world_builders import T_SAM_NS, ScriptedWorld, scene_at, state, wire_bytes
 
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import euler_from_quaternion, quaternion_from_euler
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaDevice, CameraDevice, LidarDevice
 from caviar_protocol.topics.scene import AntennaArray
@@ -243,3 +243,21 @@ def test_specifications_become_devices_in_radians() -> None:
 def test_an_antenna_without_a_role_is_refused_with_what_to_write() -> None:
     with pytest.raises(ScenarioError, match=r"'rx' lacks its role; write role = \"tx\""):
         ScriptedWorld([[]], [DeviceSpec(name="rx", kind="antenna")])
+
+
+def test_a_device_that_keeps_its_heading_does_not_turn_with_its_object() -> None:
+    turned = state("car.a", orientation=quaternion_from_euler(math.radians(130.0)))
+    specs = (
+        antenna("turns", yaw_deg=10.0),
+        antenna("keeps", yaw_deg=10.0, keeps_heading=True, position_m=(1.0, 0.0, 0.0)),
+    )
+    world = ScriptedWorld([[turned]], devices=specs)
+    world.reset(0, 1, 0)
+    scene = scene_at(world, 0)
+    yaw = {
+        device.name: math.degrees(euler_from_quaternion(device_pose(scene, device).orientation)[0])
+        for device in scene.devices
+    }
+    assert yaw == pytest.approx({"car.a/turns": 140.0, "car.a/keeps": 10.0})
+    at = next(device_pose(scene, d).position for d in scene.devices if d.name == "car.a/keeps")
+    assert at[:2] == pytest.approx((math.cos(math.radians(130.0)), math.sin(math.radians(130.0))))

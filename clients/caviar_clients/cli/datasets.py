@@ -16,6 +16,7 @@ from caviar_clients.cli.shared import (
     print_line,
     progress_bar,
     require_installed,
+    require_known,
 )
 from caviar_clients.files import printable
 from caviar_protocol.errors import RunError
@@ -35,7 +36,8 @@ def generate_command(
     scenario: Annotated[
         Path,
         typer.Argument(
-            help="scenario that ships, by name (caviar scenarios), or a file (TOML)",
+            help="preset (s001, s005, s006, s008, s011, s012), or scenario, by name or file",
+            metavar="SCENARIO|PRESET",
             show_default=False,
             autocompletion=complete_scenario,
         ),
@@ -47,6 +49,15 @@ def generate_command(
     scenes: Annotated[
         int | None, typer.Option(min=1, help="scenes of an episode, instead of the scenario's frames")
     ] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            help="scenario, by name or file, that a preset is applied to, instead of a street canyon"
+        ),
+    ] = None,
+    traffic: Annotated[
+        str, typer.Option(help="shared: all episodes are of one traffic, as the scenario says; independent")
+    ] = "shared",
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")
     ] = None,
@@ -62,11 +73,21 @@ def generate_command(
     require_installed("caviar generate", ["datasets"])
     from caviar_clients.cli.scenarios import require_extras
     from caviar_clients.datasets.generate import generate
-    from caviar_clients.datasets.plan import plan_dataset
+    from caviar_clients.datasets.plan import plan_dataset, with_own_traffic
+    from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
     from caviar_clients.session.checks import checked_scenario
     from caviar_protocol.scenario import find_scenario
 
-    loaded = checked_scenario(find_scenario(scenario))
+    require_known("--traffic", traffic, ("shared", "independent"))
+    preset = None if scenario.is_file() else find_preset(str(scenario))
+    if preset is not None:
+        loaded = apply_preset(preset, checked_scenario(find_scenario(scene or preset.scenario)))
+    elif scene is not None:
+        raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
+    else:
+        loaded = checked_scenario(find_scenario(scenario))
+    if traffic == "independent":
+        loaded = with_own_traffic(loaded)
     require_extras(loaded)
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
     if overwrite:
@@ -107,7 +128,6 @@ def tables_command(
     ] = None,
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
-    from caviar_clients.cli.shared import require_known
     from caviar_clients.datasets.catalogue import Catalogue
     from caviar_clients.datasets.directory import DatasetDirectory
     from caviar_clients.datasets.export import export_tables

@@ -60,7 +60,7 @@ class Catalogue:
     """
 
     def __init__(self, path: Path, *, writable: bool = False) -> None:
-        self.path = path
+        self.path, self._is_writable = path, writable
         if not writable and not path.is_file():
             raise RecordingError(
                 f"{path.parent} is no dataset, it has no {path.name}; make one with: "
@@ -79,6 +79,8 @@ class Catalogue:
     def close(self) -> None:
         """Close the database; what was added stays."""
         with self._errors():
+            if self._is_writable:  # one file, which can be read where nothing can be written
+                self._connection.execute("PRAGMA journal_mode = DELETE")
             self._connection.close()
 
     @property

@@ -5,6 +5,7 @@ It imports services, and runs in the processes of a cluster.
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import socket
@@ -75,6 +76,8 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
     Returns:
         Rows of the catalogue and times, or the error.
     """
+    # What fails is told in the result, with episode and cause.
+    logging.getLogger("caviar.service").setLevel(logging.CRITICAL)
     began, cpu = time.monotonic(), time.process_time()
     measured: dict[str, Any] = {
         "host": socket.gethostname(),

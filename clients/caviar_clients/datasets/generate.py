@@ -150,7 +150,7 @@ def _estimate(
 def _agree(plan: DatasetPlan, directory: DatasetDirectory, catalogue: Catalogue) -> None:
     """Raise `RunError` where the folder holds another dataset; note the plan where it does not."""
     settings, before = plan.settings(), catalogue.settings
-    if before and fingerprint(before) != fingerprint(settings):
+    if (catalogue.episodes() or directory.finished()) and fingerprint(before) != fingerprint(settings):
         found = list(differences(before, settings))
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
         raise RunError(

@@ -99,6 +99,19 @@ def plan_dataset(
     return DatasetPlan(check_implementations(replace(scenario, run=run, services=services)), episodes)
 
 
+def with_own_traffic(scenario: Scenario) -> Scenario:
+    """The scenario in which each episode has a traffic of its own, by its own seed.
+
+    Args:
+        scenario: Whose episodes may share one.
+    """
+    services = {
+        name: replace(spec, settings={k: v for k, v in spec.settings.items() if k != "between_episodes_s"})
+        for name, spec in scenario.services.items()
+    }
+    return replace(scenario, services=services)
+
+
 def fingerprint(settings: Mapping[str, Any]) -> str:
     """Digest of the settings of a dataset; the number of its episodes is none of them.
 

@@ -409,6 +409,10 @@ def _check_device(device: DeviceSpec, place: Place) -> None:
         )
     if device.mount != "centre" and not device.on:
         raise place.at("mount").error("only a device with `on` has a parent to be mounted at; remove the key")
+    if device.keeps_heading and not device.on:
+        raise place.at("keeps_heading").error(
+            "only a device with `on` has an object that turns; remove the key"
+        )
     _check_ascending(device.elevation_deg, place.at("elevation_deg"), -90.0, 90.0)
     _check_ascending(device.range_m, place.at("range_m"), 0.0)
     for index, size in enumerate(device.size_px):

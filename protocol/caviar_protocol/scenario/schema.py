@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.files import Durability
 from caviar_protocol.messages import Policy, Role
 from caviar_protocol.scenario.conversion import Source
-from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
+from caviar_protocol.space.coordinates import Vector, multiply, quaternion_from_euler
 from caviar_protocol.topics.channel import Carrier
 from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, Device, LidarDevice
 
@@ -154,6 +155,8 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
     pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0
     roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
+    keeps_heading: bool = False
+    """Whether a device with ``on`` keeps its angles in the world's axes while its object turns."""
     # antenna
     role: Literal["tx", "rx", "both", ""] = ""
     """Antennas: transmits, receives, or both. Antennas need it."""
@@ -294,6 +297,23 @@ def mounted_device(spec: DeviceSpec, parent: str, dimensions: Vector) -> Device:
         ScenarioError: An antenna has no role.
     """
     return _device(spec, f"{parent}/{spec.name}", parent, dimensions[2])
+
+
+def turned_back(device: Device, parent: Sequence[float]) -> Device:
+    """A mounted device that keeps its heading: its orientation is turned against its object's.
+
+    Args:
+        device: As of `mounted_device`.
+        parent: Orientation of the object, (w, x, y, z).
+
+    Example:
+        >>> spec = DeviceSpec(name="rx", kind="antenna", role="rx", on="car", keeps_heading=True)
+        >>> device = mounted_device(spec, "car", (4.5, 1.8, 1.5))
+        >>> turned_back(device, (0.0, 0.0, 0.0, 1.0)).orientation  # on a car that drives towards −x
+        (0.0, 0.0, 0.0, -1.0)
+    """
+    w, x, y, z = parent
+    return replace(device, orientation=multiply((w, -x, -y, -z), device.orientation))
 
 
 def pattern_asset(path: str) -> str:

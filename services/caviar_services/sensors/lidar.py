@@ -34,7 +34,9 @@ class LidarSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fi
 
     grid: GridSettings | None = None
     """The quantised grid that each scan carries where a service asks for it (``lidar.grid``)."""
-    points_every: Annotated[int, quantity("frame", "from one whose scans have points to the next", ge=1)] = 1
+    points_every: Annotated[
+        int, quantity("frame", "from one whose scans have points to the next; 0: none", ge=0)
+    ] = 1
     """The scans between have the grid alone: of 64 × 1,800 rays the points take 2.4 to 3.6 MB a frame."""
     points_world: bool = True
     """Whether scans have their points in world axes too. Without them a scan is a third smaller, and
@@ -112,7 +114,8 @@ class LidarSensors(Sensors[LidarSettings]):
     def step(self, frame: Frame) -> StepResult:
         """See `Sensors.step`."""
         # By the number of the frame, not counted: a service that was started again goes on in step.
-        self._with_points = frame.number % self.settings.points_every == 0
+        every = self.settings.points_every
+        self._with_points = every > 0 and frame.number % every == 0
         return super().step(frame)
 
     def example_devices(self) -> tuple[Device, ...]:

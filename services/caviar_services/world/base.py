@@ -23,7 +23,7 @@ from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, Setu
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.scenario.schema import carries, fixed_device, mounted_device
+from caviar_protocol.scenario.schema import carries, fixed_device, mounted_device, turned_back
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
@@ -245,6 +245,7 @@ class World(Service[W]):
     def _scene(self, states: list[ObjectState]) -> Scene:
         # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
+        devices = self._mounts.turned_back(devices, {state.name: state for state in states})
         states = sorted(states)
         listed = [(state.name, state.kind) for state in states]
         # Objects hardly ever come and go: what follows from names and classes alone is kept.
@@ -329,6 +330,7 @@ class Mounts:
 
     def __init__(self, specs: Sequence[DeviceSpec]) -> None:
         self._fixed = tuple(fixed_device(spec) for spec in specs if not spec.on)
+        self._keeping = frozenset(spec.name for spec in specs if spec.keeps_heading)
         self._mounted = tuple(spec for spec in specs if spec.on)
         self._arrived: list[str] = []
         self._objects: Sequence[tuple[str, Vector]] | None = None
@@ -382,6 +384,27 @@ class Mounts:
         self.without_object = tuple(without)
         self._objects, self._devices = objects, tuple(sorted(found, key=lambda device: device.name))
         return self._devices
+
+    def turned_back(
+        self, devices: tuple[Device, ...], states: Mapping[str, ObjectState]
+    ) -> tuple[Device, ...]:
+        """Turn devices that keep their headings against the objects that carry them.
+
+        Args:
+            devices: Of the frame, as of `devices`.
+            states: Objects of the frame, by name.
+
+        Returns:
+            The same devices, in the same order.
+        """
+        if not self._keeping:
+            return devices
+        return tuple(
+            turned_back(device, states[device.parent].orientation)
+            if device.parent and device.name.removeprefix(f"{device.parent}/") in self._keeping
+            else device
+            for device in devices
+        )
 
 
 # [rad/s]; slower is the rounding of a straight line.
