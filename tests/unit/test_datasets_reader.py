@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import caviar
-from caviar_clients.datasets.catalogue import TABLES, Catalogue
+from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.export import export_tables
@@ -170,3 +170,56 @@ def test_an_episode_that_is_added_again_replaces_itself(folder: Path, tmp_path: 
     assert catalogue.failures() == []
     catalogue.forget([3])
     assert (catalogue.episodes(), catalogue.table("products")[1]) == ([], [])
+
+
+def test_a_data_loader_delivers_one_order_with_any_number_of_processes(folder: Path) -> None:
+    from torch.utils.data import DataLoader
+
+    users = caviar.dataset(folder).users()
+    names = ["episode", "scene", "rx", "channel.h"]
+
+    def delivered(processes: int, epoch: int = 0) -> list[tuple[int, int, str, complex]]:
+        batches = users.torch_batches(5, names, shuffle=7)
+        batches.epoch = epoch
+        found = []
+        loader = DataLoader(
+            batches, batch_size=None, num_workers=processes, multiprocessing_context=_CONTEXT[processes]
+        )
+        for batch in loader:
+            assert batch["channel.h"].shape[1:] == (4, 32)
+            first = batch["channel.h"][:, 0, 0].tolist()
+            found += list(
+                zip(batch["episode"].tolist(), batch["scene"].tolist(), batch["rx"], first, strict=True)
+            )
+        return found
+
+    alone = delivered(0)
+    assert len(alone) == len(users)
+    assert delivered(2) == alone
+    assert delivered(0, epoch=1) != alone
+
+
+_CONTEXT = {0: None, 2: "spawn"}
+
+
+def test_samples_are_read_by_position(folder: Path) -> None:
+    users = caviar.dataset(folder).users()
+    samples = users.torch(["gain_db", "channel.tau", "rx"])
+    assert len(samples) == len(users)
+    assert samples[3]["gain_db"].item() == users["gain_db"][3]
+    assert samples[-1]["rx"] == users["rx"][-1]
+    with pytest.raises(IndexError, match="user 36 of 36"):
+        samples[36]
+
+
+def test_the_reference_names_every_table_and_column(repository: Path) -> None:
+    page = (repository / "docs" / "reference" / "datasets.md").read_text()
+    for table in (*TABLES, *MEASURED_TABLES):
+        assert f"## {table}" in page or f" {table}\n" in page
+        heading = (
+            page.split("## timings and failures")[1]
+            if table in MEASURED_TABLES
+            else page.split(f"## {table}\n")[1]
+        )
+        for column in columns_of(table):
+            assert f"`{column}`" in heading.split("\n## ")[0], (table, column)

@@ -86,8 +86,30 @@ def _packets() -> dict[str, Any]:
     return {}
 
 
+def _dataset() -> dict[str, Any]:
+    """A dataset of `smoke`."""
+    import caviar
+    from caviar_clients.datasets.catalogue import Catalogue
+    from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+    from caviar_clients.datasets.episode import EpisodeTask, play_episode
+    from caviar_clients.datasets.plan import plan_dataset
+    from caviar_protocol.scenario import load_scenario
+
+    directory = DatasetDirectory(Path("data/s008"))
+    plan = plan_dataset(load_scenario("smoke"), episodes=2, scenes=2)
+    with writing_dataset(directory):
+        catalogue = Catalogue(directory.catalogue, writable=True)
+        for number in range(plan.episodes):
+            rows = play_episode(EpisodeTask(plan.scenario, number, str(directory.path))).rows
+            assert rows is not None
+            catalogue.add(rows, {})
+        catalogue.close()
+    return {"caviar": caviar}
+
+
 GIVEN: dict[str, Callable[[], dict[str, Any]]] = {
     "CONTRIBUTING.md": _channel_model,
+    "docs/howto/datasets.md": _dataset,
     "docs/howto/packets.md": _packets,
     "docs/howto/wideband.md": _wideband,
     "docs/topics/channel.md": _keyframes,

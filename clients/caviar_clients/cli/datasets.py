@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from caviar_clients.datasets.episode import EpisodeResult
     from caviar_clients.datasets.estimate import Estimate
 
-LINE_S = 30.0
-"""[s] between two lines of progress where no bar can be drawn."""
 SHOWN_FAILURES = 10
 
 
@@ -180,7 +178,7 @@ class _Screen:
         )
         self._traffic: Any = None
         self._task: Any = None
-        self._total, self._done, self._scenes, self._began, self._line_at = 0, 0, 0, 0.0, 0.0
+        self._done, self._scenes, self._began = 0, 0, 0.0
 
     def __enter__(self) -> _Screen:
         self._bar.start()
@@ -201,7 +199,10 @@ class _Screen:
                 f"one pass through {duration_text(end_s)} of traffic, kept for all episodes",
             )
             self._traffic = self._bar.add_task("traffic", total=end_s, rate="s")
-        self._bar.update(self._traffic, completed=round(now_s), visible=now_s < end_s)
+        self._bar.update(self._traffic, completed=round(now_s))
+        if now_s >= end_s:
+            self._bar.remove_task(self._traffic)
+            self._traffic = None
 
     def estimated(self, found: Estimate, free: int, episodes: int, workers: int) -> None:
         """See `generate.Observer`."""
@@ -210,8 +211,7 @@ class _Screen:
             f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, "
             f"{found.bytes / 1e6:.1f} MB of {free / 1e9:.1f} GB that are free",
         )
-        self._total, self._began = episodes, time.monotonic()
-        self._line_at = self._began + LINE_S
+        self._began = time.monotonic()
         self._task = self._bar.add_task("episodes", total=episodes, rate="")
 
     def ended(self, result: EpisodeResult) -> None:
@@ -221,8 +221,3 @@ class _Screen:
         self._scenes += len(result.rows.scenes) if result.rows else 0
         rate = self._scenes / max(now - self._began, 1e-9)
         self._bar.update(self._task, completed=self._done, rate=f"{rate:.2f} scenes/s")
-        if not self._console.is_terminal and now >= self._line_at:
-            self._line_at = now + LINE_S
-            left = (now - self._began) / self._done * (self._total - self._done)
-            text = f"{self._done} of {self._total} episodes, {rate:.2f} scenes/s, {duration_text(left)} left"
-            print_line(self._console, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
@@ -10,12 +11,14 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.errors import RecordingError, SetupError, suggestion
+from caviar_protocol.host import install_command
 from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.recording.topics import TOPIC_ARRAYS
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.reader import Dataset
+    from caviar_clients.datasets.torch_data import UserBatches, UserSamples
 
 _DTYPES: dict[type, Any] = {int: np.int64, float: np.float64, bool: np.bool_, str: np.str_}
 _NONE: dict[type, Any] = {int: -1, float: np.nan}
@@ -151,11 +154,53 @@ class Users:
         Raises:
             ValueError: A part would have no user.
         """
+        for part in self.parts(size, shuffle=shuffle):
+            yield part.read(names)
+
+    def parts(self, size: int, *, shuffle: int | None = None) -> list[Users]:
+        """The parts that `batches` reads, in the same order; nothing is read.
+
+        Args:
+            size: Users of a part at most.
+            shuffle: As of `batches`.
+
+        Raises:
+            ValueError: A part would have no user.
+        """
         if size < 1:
             raise ValueError(f"a batch has at least 1 user, got {size}")
         order = np.arange(len(self)) if shuffle is None else self._shuffled(shuffle)
-        for start in range(0, len(order), size):
-            yield self[order[start : start + size]].read(names)
+        return [self[order[start : start + size]] for start in range(0, len(order), size)]
+
+    def torch(self, names: Sequence[str]) -> UserSamples:
+        """A PyTorch ``Dataset`` of these users, by position (`torch_data.UserSamples`).
+
+        Args:
+            names: Columns and recorded arrays of a sample.
+
+        Raises:
+            SetupError: PyTorch is not installed; the text has the command.
+        """
+        _require_torch()
+        from caviar_clients.datasets.torch_data import UserSamples
+
+        return UserSamples(self, names)
+
+    def torch_batches(self, size: int, names: Sequence[str], *, shuffle: int | None = None) -> UserBatches:
+        """A PyTorch ``IterableDataset`` of batches, in one order for any number of loading processes.
+
+        Args:
+            size: Users of a batch at most.
+            names: Columns and recorded arrays.
+            shuffle: Seed of the order; None: as they are.
+
+        Raises:
+            SetupError: PyTorch is not installed; the text has the command.
+        """
+        _require_torch()
+        from caviar_clients.datasets.torch_data import UserBatches
+
+        return UserBatches(self, names, size, shuffle)
 
     def _shuffled(self, seed: int) -> NDArray[np.int64]:
         draw = random.Random(seed)  # noqa: S311 - no secret
@@ -220,6 +265,11 @@ class Users:
             f"{place}: {table['rx'][user]} has {len(own)} sensors of {topic} on its object, and {len(fixed)} "
             f"stand fixed: it takes one of either; read dataset.episode({table['episode'][user]})[{topic!r}]"
         )
+
+
+def _require_torch() -> None:
+    if importlib.util.find_spec("torch") is None:
+        raise SetupError(f"PyTorch is not installed; run: {install_command('learning')}")
 
 
 _TOGETHER = 16
