@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
-    "scipy", "pytest", "hypothesis",
+    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb",
 )  # fmt: skip
 
 IMPORT_EVERYTHING = f"""

@@ -12,15 +12,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
-from typing import Any
-
-import dask
-from distributed import Client, Future, LocalCluster, wait
-from distributed.client import FuturesCancelledError
+from typing import TYPE_CHECKING, Any
 
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
 from caviar_protocol.errors import RunError
 from caviar_services.drjit_setup import THREADS_VARIABLE
+
+# Part of the extra `datasets`: imported where it is used.
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 ATTEMPTS = 5
 """Times that an episode is begun, where the processes that play it die."""
@@ -76,6 +76,8 @@ class Episodes:
         self._stack = ExitStack()
 
     def __enter__(self) -> Episodes:
+        import dask
+
         dask.config.set(_CONFIG)
         for name in (
             "distributed",
@@ -154,6 +156,9 @@ class Episodes:
         return future
 
     def _ended(self, playing: _Playing) -> list[Future]:
+        from distributed import wait
+        from distributed.client import FuturesCancelledError
+
         try:
             with suppress(TimeoutError), self._connected.as_current():
                 wait(list(playing.tasks), timeout=1.0, return_when="FIRST_COMPLETED")
@@ -192,6 +197,8 @@ class Episodes:
         return self._client
 
     def _connect(self) -> None:
+        from distributed import Client, LocalCluster
+
         if self._scheduler:
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)

@@ -9,16 +9,19 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from caviar_clients.datasets.user_rows import Columns
+
+try:
+    from torch.utils.data import IterableDataset
+except ImportError:  # `Users.torch_batches` says what is missing, before this module is needed
+    IterableDataset = object
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.user_rows import Users
 
 
-class UserSamples(Dataset[dict[str, Any]]):  # type: ignore[misc]  # it has no types
+class UserSamples:
     """Users by position, for a ``DataLoader`` that draws its own order.
 
     A user's arrays are read when it is asked for: users of one scene are read together only where they follow
@@ -42,7 +45,7 @@ class UserSamples(Dataset[dict[str, Any]]):  # type: ignore[misc]  # it has no t
         return {name: value[0] for name, value in _tensors(row).items()}
 
 
-class UserBatches(IterableDataset[dict[str, Any]]):  # type: ignore[misc]  # it has no types
+class UserBatches(IterableDataset):  # type: ignore[misc]  # it has no types
     """Batches of users in an order that the seed gives, the same for any number of loading processes.
 
     Give it to ``DataLoader(batches, batch_size=None, num_workers=N)``: the processes take the batches in
@@ -65,6 +68,8 @@ class UserBatches(IterableDataset[dict[str, Any]]):  # type: ignore[misc]  # it 
         return -(-len(self._users) // self._size)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
+        from torch.utils.data import get_worker_info
+
         info = get_worker_info()
         first, step = (info.id, info.num_workers) if info is not None else (0, 1)
         seed = None if self._seed is None else self._seed + self.epoch
@@ -73,6 +78,8 @@ class UserBatches(IterableDataset[dict[str, Any]]):  # type: ignore[misc]  # it 
 
 
 def _tensors(columns: Columns) -> dict[str, Any]:
+    import torch
+
     return {
         name: values.tolist() if values.dtype.kind == "U" else torch.from_numpy(_writable(values))
         for name, values in columns.items()
