@@ -6,10 +6,12 @@ import contextlib
 import ctypes
 import importlib.util
 import os
+import re
 import sys
 import time
 from pathlib import Path
 
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 # [B] Buffers from here on come from the system and return to it; each of their pages costs a fault.
 _LARGE = 4 << 20
@@ -33,6 +35,35 @@ def host_identity() -> str:
     except OSError:
         return ""
     return f"{boot}:{namespace}"
+
+
+def resident_mib() -> float | None:
+    """Return the resident memory of this process [MiB]; None where the system does not state it."""
+    return _status("VmRSS")
+
+
+def peak_mib() -> float | None:
+    """Return its highest value since `reset_peak` [MiB]."""
+    return _status("VmHWM")
+
+
+def reset_peak() -> float | None:
+    """Forget the highest value and return the present one [MiB]; None where that cannot be done."""
+    try:
+        # 5 resets the peak of the resident set, VmHWM (proc(5), since Linux 4.0).
+        _CLEAR.write_text("5")
+    except OSError:
+        return None
+    return resident_mib()
+
+
+def _status(name: str) -> float | None:
+    try:
+        text = _STATUS.read_text()
+    except OSError:
+        return None
+    found = re.search(rf"^{name}:\s+(\d+) kB$", text, re.MULTILINE)
+    return int(found[1]) * 1024 / 2**20 if found else None
 
 
 def steady_memory() -> None:

@@ -17,7 +17,7 @@ import pytest
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
-EPISODES = 24
+EPISODES = 16
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "from caviar_services.agent.baselines import RandomAgent\n"
         "class SlowAgent(RandomAgent):\n"
         "    def step(self, frame):\n"
-        "        time.sleep(0.05)\n"
+        "        time.sleep(0.03)\n"
         "        return super().step(frame)\n"
     )
     file = folder / "slow.toml"
@@ -222,7 +222,7 @@ def test_an_episode_that_fails_is_listed_and_the_others_are_there(tmp_path: Path
     done = generate(file, tmp_path / "d", "--workers", "1")
     assert done.returncode == 1
     assert "episode 5 failed: agent 'agent' failed" in done.stdout
-    assert "2 episodes of 24 failed" in done.stderr
+    assert "2 episodes of 16 failed" in done.stderr
     there = {int(path.name[-6:]) for path in (tmp_path / "d" / "episodes").iterdir()}
     assert there == set(range(EPISODES)) - {5, 7}
 

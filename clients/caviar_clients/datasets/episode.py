@@ -27,6 +27,7 @@ from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import CaviarError
 from caviar_protocol.files import replace_file, sync_file
+from caviar_protocol.host import resident_mib
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
@@ -101,7 +102,8 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
         folder.mkdir()
         times = _play(task, folder)
         rows = rows_of(Recording(folder))
-        measured |= {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu, **times}
+        used = {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu}
+        measured |= {**used, "memory_mib": resident_mib(), **times}
         if not task.trial:
             _put_into_place(folder, target, measured)
         else:

@@ -26,7 +26,7 @@ class SharedTraffic:
     def __init__(self, scenario: Scenario) -> None:
         self._states = list(_shared(scenario))
 
-    def save(self, episodes: int, progress: Progress) -> None:
+    def save(self, episodes: int, progress: Progress = lambda *_: None) -> None:
         """Save the states that episodes begin from, where one is not there.
 
         Args:

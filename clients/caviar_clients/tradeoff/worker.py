@@ -24,6 +24,7 @@ from caviar_clients.tradeoff.errors import Key, Noise, UserChannel, user_channel
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
+from caviar_protocol.host import peak_mib, reset_peak, resident_mib
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.scene import antennas
@@ -33,10 +34,6 @@ from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 SERVICE = "channel"
 """Name of every model, so that the seeds that they derive from it are the same."""
-MEBIBYTE = 2**20
-
-_STATUS = Path("/proc/self/status")
-_CLEAR = Path("/proc/self/clear_refs")
 
 
 def is_known(setting: Setting, scenes: Scenes) -> bool:
@@ -186,35 +183,6 @@ def _materials(file: Path) -> list[str]:
     # Mitsuba keeps the prefix of Blender's exporter, Sionna RT drops it.
     found = re.findall(r"<bsdf\b[^>]*\bid=\"([^\"]+)\"", file.read_text())
     return [name.removeprefix("mat-") for name in found]
-
-
-def resident_mib() -> float | None:
-    """Return the resident memory of this process [MiB]; None where the system does not state it."""
-    return _status("VmRSS")
-
-
-def peak_mib() -> float | None:
-    """Return its highest value since `reset_peak` [MiB]."""
-    return _status("VmHWM")
-
-
-def reset_peak() -> float | None:
-    """Forget the highest value and return the present one [MiB]; None where that cannot be done."""
-    try:
-        # 5 resets the peak of the resident set, VmHWM (proc(5), since Linux 4.0).
-        _CLEAR.write_text("5")
-    except OSError:
-        return None
-    return resident_mib()
-
-
-def _status(name: str) -> float | None:
-    try:
-        text = _STATUS.read_text()
-    except OSError:
-        return None
-    found = re.search(rf"^{name}:\s+(\d+) kB$", text, re.MULTILINE)
-    return int(found[1]) * 1024 / MEBIBYTE if found else None
 
 
 # [s] for a process to end by itself, before it is killed.
