@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.plan import with_own_traffic
+from caviar_clients.datasets.plan import with_cameras, with_own_traffic
 from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
 from caviar_clients.session.checks import check_implementations
 from caviar_protocol.errors import ScenarioError
@@ -88,3 +88,24 @@ def test_episodes_have_a_traffic_of_their_own_where_that_is_asked_for() -> None:
     scenario = with_own_traffic(load_scenario("canyon-mobile"))
     assert "between_episodes_s" not in scenario.services["traffic"].settings
     assert scenario.services["traffic"].settings["begin_s"] == 60.0
+
+
+def test_three_cameras_stand_beside_the_transmitter() -> None:
+    base = load_scenario("canyon-mobile")
+    scenario = check_implementations(with_cameras(base))
+    cameras = [device for device in scenario.devices if device.kind == "camera"]
+    assert [(camera.name, camera.yaw_deg, camera.size_px) for camera in cameras] == [
+        ("left", 150.0, (960, 540)),
+        ("centre", 90.0, (960, 540)),
+        ("right", 30.0, (960, 540)),
+    ]
+    assert {camera.position_m for camera in cameras} == {(0.0, -8.3, 5.3)}
+    assert scenario.run.record == (*base.run.record, "camera")
+    assert scenario.services["camera"].use == "camera"
+
+
+def test_cameras_need_a_transmitter_that_stands() -> None:
+    base = load_scenario("canyon-mobile")
+    flying = tuple(replace(d, on="vehicle.bus-1") if d.role == "tx" else d for d in base.devices)
+    with pytest.raises(ScenarioError, match="has no transmitter that stands"):
+        with_cameras(replace(base, devices=flying))

@@ -53,6 +53,10 @@ def generate_command(
             help="scenario, by name or file, that a preset is applied to, instead of a street canyon"
         ),
     ] = None,
+    more: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="camera: pictures of three cameras, 960 × 540, beside the transmitter"),
+    ] = None,
     traffic: Annotated[
         str, typer.Option(help="shared: all episodes are of one traffic, as the scenario says; independent")
     ] = "shared",
@@ -71,7 +75,7 @@ def generate_command(
     require_installed("caviar generate", ["datasets"])
     from caviar_clients.cli.scenarios import require_extras
     from caviar_clients.datasets.generate import generate
-    from caviar_clients.datasets.plan import plan_dataset, with_own_traffic
+    from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
     from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
     from caviar_clients.session.checks import checked_scenario
     from caviar_protocol.scenario import find_scenario
@@ -84,6 +88,9 @@ def generate_command(
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
         loaded = checked_scenario(find_scenario(scenario))
+    for extra in dict.fromkeys(more or ()):
+        require_known("--with", extra, ("camera",))
+        loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
     require_extras(loaded)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from caviar_clients.session.checks import check_implementations
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.scenario.rules import with_overrides
 from caviar_services.drjit_setup import choose_variant
 from caviar_services.recorder.base import versions
@@ -167,3 +167,59 @@ def _files(value: Any) -> Iterator[tuple[str, str]]:
     elif isinstance(value, list | tuple):
         for item in value:
             yield from _files(item)
+
+
+CAMERAS = ("left", "centre", "right")
+"""Of ``--with camera``: as in the paper's pairs, beside the transmitter."""
+CAMERA_PX = (960, 540)
+CAMERA_TURN_DEG = 60.0
+"""From one to the next."""
+
+
+def with_cameras(scenario: Scenario) -> Scenario:
+    """The scenario with three cameras beside its first standing transmitter, and their pictures recorded.
+
+    Args:
+        scenario: With a transmitter that stands.
+
+    Raises:
+        ScenarioError: It has none.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> scenario = with_cameras(load_scenario("canyon-mobile"))
+        >>> [device.name for device in scenario.devices if device.kind == "camera"]
+        ['left', 'centre', 'right']
+    """
+    standing = (d for d in scenario.devices if d.kind == "antenna" and d.role in ("tx", "both") and not d.on)
+    tx = next(standing, None)
+    if tx is None:
+        raise ScenarioError(
+            "has no transmitter that stands, beside which cameras could be; add cameras to the scenario",
+            scenario.source.file,
+            "devices",
+        )
+    x, y, z = tx.position_m
+    cameras = tuple(
+        DeviceSpec(
+            name=name,
+            kind="camera",
+            # Above the array, whose elements are no obstacle.
+            position_m=(x, y, z + 0.3),
+            yaw_deg=tx.yaw_deg + turn * CAMERA_TURN_DEG,
+            pitch_deg=tx.pitch_deg + 5.0,
+            size_px=CAMERA_PX,
+            field_of_view_deg=75.0,
+        )
+        for name, turn in zip(CAMERAS, (1, 0, -1), strict=True)
+    )
+    services = dict(scenario.services)
+    if not any(spec.use == "camera" for spec in services.values()):
+        services["camera"] = ServiceSpec(role="sensors", use="camera", budget_ms=5000.0)
+    topics = tuple(dict.fromkeys((*scenario.run.record, "camera")))
+    return replace(
+        scenario,
+        run=replace(scenario.run, record=topics),
+        services=services,
+        devices=(*scenario.devices, *cameras),
+    )
