@@ -1,4 +1,4 @@
-"""``caviar generate``: datasets of episodes."""
+"""``caviar generate``, ``caviar look`` and ``caviar tables``: datasets of episodes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from caviar_clients.cli.shared import (
     require_installed,
     require_known,
 )
+from caviar_clients.datasets.texts import duration_text
 from caviar_clients.files import printable
 from caviar_protocol.errors import RunError
 
@@ -146,17 +147,28 @@ def tables_command(
         print_line(console, file)
 
 
-def duration_text(seconds: float) -> str:
-    """Say how long something takes.
+def look_command(
+    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option(help="the page; by default look.html in the folder of the dataset")
+    ] = None,
+) -> None:
+    """Write a page of a dataset: what it is, maps, histograms, samples, and how it was generated."""
+    require_installed("caviar look", ["plot"])
+    from caviar_clients.datasets.look import write_page
 
-    Example:
-        >>> duration_text(8.25), duration_text(75.0), duration_text(7300.0)
-        ('8.2 s', '1 min 15 s', '2 h 1 min')
-    """
-    if seconds < 60.0:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+    console = Console()
+    bar = progress_bar(console, transient=True)
+    tasks: dict[str, Any] = {}
+
+    def progress(what: str, done: int, of: int) -> None:
+        if what not in tasks:
+            tasks[what] = bar.add_task(what, total=of)
+        bar.update(tasks[what], completed=done)
+
+    with bar:
+        file = write_page(dataset, out, progress)
+    print_line(console, file)
 
 
 def _remove(out: Path) -> None:

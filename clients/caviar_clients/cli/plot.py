@@ -12,7 +12,7 @@ import numpy as np
 from caviar_clients.files import make_folder_of, require_folder
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.packets import draw_traffic, packet_series
-from caviar_clients.plots.rays import Box, Footprints, footprints, with_boxes
+from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
 from caviar_clients.plots.user_curves import (
     choose_user,
@@ -267,24 +267,12 @@ def scenery(recording: Recording) -> Footprints | None:
     Returns:
         None where there is neither.
     """
-    description, boxes = find_scenery(recording.assets), _obstacles(recording)
+    description = find_scenery(recording.assets)
+    boxes = obstacle_boxes(recording.metadata.scenario.get("services"))
     drawn = None
     if description is not None:
         drawn = footprints((shape.file, shape.to_world) for shape in read_scenery(description).shapes)
     return with_boxes(drawn, boxes) if boxes else drawn
-
-
-def _obstacles(recording: Recording) -> list[Box]:
-    """The setting ``obstacles`` of the channels of the recorded scenario."""
-    services = recording.metadata.scenario.get("services")
-    # As it was recorded, perhaps by another version: nothing about its form is certain.
-    specs = [spec for spec in services.values() if isinstance(spec, dict)] if services else []
-    found = [
-        settings.get("obstacles", ())
-        for spec in specs
-        if spec.get("role") == "channel" and isinstance(settings := spec.get("settings"), dict)
-    ]
-    return [(box["minimum_m"], box["maximum_m"]) for boxes in found for box in boxes]
 
 
 def _frame(

@@ -136,7 +136,13 @@ def view_of(data: MapData, beam: Beam | None) -> View:
 
 
 def draw_scenery(
-    axes: Any, footprints: Footprints | None, width: float = 0.6, outline_zorder: float = 1.1
+    axes: Any,
+    footprints: Footprints | None,
+    width: float = 0.6,
+    outline_zorder: float = 1.1,
+    *,
+    area: str = LIGHT_GREY,
+    outline: str = GREY,
 ) -> None:
     """Draw areas and outlines of buildings.
 
@@ -145,6 +151,8 @@ def draw_scenery(
         footprints: Scenery; None: nothing is drawn.
         width: Width of outlines [points].
         outline_zorder: Place of the outlines among the layers.
+        area: Colour of the areas.
+        outline: Colour of the outlines.
     """
     from matplotlib.collections import LineCollection, PolyCollection
 
@@ -152,10 +160,8 @@ def draw_scenery(
         return
     faces: Any = footprints.faces
     edges: Any = footprints.edges
-    axes.add_collection(
-        PolyCollection(faces, facecolors=LIGHT_GREY, edgecolors=LIGHT_GREY, linewidths=0.4, zorder=1)
-    )
-    axes.add_collection(LineCollection(edges, colors=GREY, linewidths=width, zorder=outline_zorder))
+    axes.add_collection(PolyCollection(faces, facecolors=area, edgecolors=area, linewidths=0.4, zorder=1))
+    axes.add_collection(LineCollection(edges, colors=outline, linewidths=width, zorder=outline_zorder))
 
 
 def draw_rays(axes: Any, drawn: Rays, limits: tuple[float, float]) -> list[Any]:

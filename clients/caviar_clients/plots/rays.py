@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -209,6 +210,27 @@ def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:
     if drawn is not None:
         faces, edges = np.concatenate([drawn.faces, faces]), np.concatenate([drawn.edges, edges])
     return Footprints(faces=faces, edges=edges)
+
+
+def obstacle_boxes(services: Any) -> list[Box]:
+    """Find the boxes that block the channels of a scenario: their setting ``obstacles``.
+
+    Args:
+        services: Of the scenario as it was recorded, perhaps by another version: nothing about its form is
+            certain.
+
+    Example:
+        >>> box = {"minimum_m": [0, 0, 0], "maximum_m": [2, 1, 5]}
+        >>> obstacle_boxes({"channel": {"role": "channel", "settings": {"obstacles": [box]}}})
+        [([0, 0, 0], [2, 1, 5])]
+    """
+    specs = [spec for spec in services.values() if isinstance(spec, dict)] if services else []
+    found = [
+        settings.get("obstacles", ())
+        for spec in specs
+        if spec.get("role") == "channel" and isinstance(settings := spec.get("settings"), dict)
+    ]
+    return [(box["minimum_m"], box["maximum_m"]) for boxes in found for box in boxes]
 
 
 def _ground_and_buildings(

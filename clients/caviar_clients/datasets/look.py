@@ -1,0 +1,677 @@
+"""The page of a dataset: one HTML file with what it is, its maps and distributions, and how it was made.
+
+The file is whole: pictures are in it, nothing is loaded from elsewhere, and it needs no JavaScript.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.directory import DatasetDirectory
+from caviar_clients.datasets.figures import (
+    PANELS,
+    beams_height,
+    cell_m,
+    draw_angles,
+    draw_beams,
+    draw_correlation,
+    draw_counts,
+    draw_gain,
+    draw_histograms,
+    draw_scans,
+    draw_services,
+    draw_shares,
+    draw_sight_map,
+    draw_throughput,
+    lags,
+    map_height,
+    map_of,
+    picture,
+    pixels,
+)
+from caviar_clients.datasets.look_data import (
+    SAMPLE_SCENES,
+    Progress,
+    Sample,
+    UserColumns,
+    read_sample,
+    read_throughput,
+    read_users,
+)
+from caviar_clients.datasets.look_html import Section, absent, document, facts, figure, folded, table
+from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.texts import bytes_text, counted, decimal, duration_text, percent
+from caviar_clients.files import reserved, write_file
+from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
+from caviar_protocol.errors import AssetError
+from caviar_services.mesh.scenery import find_scenery, read_scenery
+
+PAGE = "look.html"
+"""Name of the page in the folder of a dataset."""
+
+CLASSES = 12
+"""Classes of objects with a bar of their own at most."""
+
+SHOWN_FAILURES = 50
+
+
+@dataclass(frozen=True, eq=False)
+class _Content:
+    """All that the sections are made of."""
+
+    data: Dataset
+    catalogue: Catalogue
+    topics: set[str]
+    users: UserColumns
+    sample: Sample
+    footprints: Footprints | None
+    scenery_error: str
+
+
+def _quiet(_what: str, _done: int, _of: int) -> None:
+    """Tell nobody."""
+
+
+def write_page(dataset: Path, out: Path | None = None, progress: Progress = _quiet) -> Path:
+    """Write the page of a dataset.
+
+    Args:
+        dataset: Folder of the dataset.
+        out: The file; None: ``look.html`` in the folder.
+        progress: Is told how far it is.
+
+    Returns:
+        The file.
+
+    Raises:
+        RecordingError: The folder is no dataset, or a recording in it cannot be read.
+        SetupError: Matplotlib is not installed.
+        RunError: The file cannot be written.
+
+    Example:
+        >>> write_page(Path("data/s008"))  # doctest: +SKIP
+        PosixPath('data/s008/look.html')
+    """
+    data = Dataset(dataset)  # before anything is written: a folder that is no dataset stays as it is
+    file = out or dataset / PAGE
+    with reserved(file):
+        write_file(file, page(data, progress))
+    return file
+
+
+def page(data: Dataset, progress: Progress = _quiet) -> str:
+    """Make the page of a dataset.
+
+    Args:
+        data: The dataset.
+        progress: Is told how far it is.
+
+    Returns:
+        HTML.
+
+    Raises:
+        RecordingError: The catalogue or a recording cannot be read.
+        SetupError: Matplotlib is not installed.
+    """
+    catalogue = Catalogue(DatasetDirectory(data.path).catalogue)
+    try:
+        _, rows = catalogue.query("SELECT DISTINCT topic FROM products WHERE status <> 'absent'")
+        topics = {topic for (topic,) in rows}
+        found, error = _scenery(data)
+        users = read_users(catalogue, progress)
+        content = _Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
+        sections = list[Section]()
+        for at, (name, title, make) in enumerate(_SECTIONS):
+            sections.append(Section(name, title, "\n".join(make(content))))
+            progress("sections of the page", at + 1, len(_SECTIONS))
+    finally:
+        catalogue.close()
+    return document(_name(data), data.path.resolve().name, sections)
+
+
+def _scenery(data: Dataset) -> tuple[Footprints | None, str]:
+    """Outlines of what stands still; and why there are none, where that is an error."""
+    files = sorted(path for path in data.assets.rglob("*") if path.is_file())
+    assets = {path.relative_to(data.assets).as_posix(): path for path in files}
+    drawn, error = None, ""
+    try:
+        description = find_scenery(assets)
+        if description is not None:
+            drawn = footprints((shape.file, shape.to_world) for shape in read_scenery(description).shapes)
+    except AssetError as caught:
+        error = str(caught)
+    boxes = obstacle_boxes(_scenario(data).get("services"))
+    return with_boxes(drawn, boxes) if boxes else drawn, error
+
+
+def _scenario(data: Dataset) -> dict[str, Any]:
+    scenario = data.settings.get("scenario")
+    return scenario if isinstance(scenario, dict) else {}
+
+
+def _name(data: Dataset) -> str:
+    return str(_scenario(data).get("run", {}).get("name", "")) or data.path.resolve().name
+
+
+# --- what it is ------------------------------------------------------------------------------------------
+
+_MAIN_VERSIONS = ("caviar-sim", "python", "numpy", "sionna", "sionna-rt", "mitsuba", "drjit", "eclipse-sumo")
+
+
+def _what_it_is(content: _Content) -> Iterator[str]:
+    data, catalogue = content.data, content.catalogue
+    scenario, settings = _scenario(data), data.settings
+    run, versions = scenario.get("run", {}), settings.get("versions", {})
+    _, ((episodes, scenes, size, least, most),) = catalogue.query(
+        "SELECT count(*), coalesce(sum(scenes), 0), coalesce(sum(bytes), 0), min(scenes), max(scenes) "
+        "FROM episodes"
+    )
+    _, ((receivers, objects),) = catalogue.query(
+        "SELECT count(DISTINCT rx), count(DISTINCT nullif(object, '')) FROM users"
+    )
+    planned = catalogue.planned
+    of_planned = f" of {planned:,} that are planned" if planned > episodes else ""
+    each = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    carried = f", on {objects:,} objects" if objects else ""
+    versioned = [f"{name} {versions[name]}" for name in _MAIN_VERSIONS if name in versions]
+    known = {
+        "Scenario": _name(data),
+        "Folder": data.path.resolve().name,
+        "Episodes": f"{episodes:,}{of_planned}",
+        "Scenes": f"{scenes:,}" + (f", {each} in each episode" if episodes else ""),
+        "Users": f"{len(content.users):,}: a receiver in a scene, for each carrier and transmitter",
+        "Receivers": f"{receivers:,} by name{carried}",
+        "Size": f"{bytes_text(size)} of recordings, {bytes_text(size / scenes)} for a scene"
+        if scenes
+        else "0 B",
+        "Seed": str(run.get("seed", "not kept")),
+        "Time between scenes": _period(run),
+        "Computed on": str(settings.get("device", "not kept")),
+        "Versions": ", ".join(versioned) or "not kept",
+    }
+    yield facts(known)
+    yield from _products(catalogue)
+    yield from _carriers_and_devices(scenario)
+    yield from _services(scenario)
+    others = {name: str(version) for name, version in sorted(versions.items())}
+    if others:
+        yield folded("All versions", table(("package", "version"), others.items()))
+    files = settings.get("files", {})
+    if files:
+        yield folded("Files of the scenario", table(("file", "SHA-256"), files.items(), code=(0, 1)))
+    if scenario:
+        text = msgspec.json.format(msgspec.json.encode(scenario), indent=2).decode()
+        yield folded("The whole scenario", f"<pre>{escape(text)}</pre>")
+
+
+def _period(run: Mapping[str, Any]) -> str:
+    if run.get("instants_s"):
+        return f"as listed in run.instants_s, {len(run['instants_s'])} instants"
+    period = run.get("sampling_period_ns")
+    return f"{period * 1e-9:g} s" if period else "not kept"
+
+
+def _products(catalogue: Catalogue) -> Iterator[str]:
+    _, rows = catalogue.query(
+        "SELECT topic, source, count(*), sum(status = 'held'), sum(status = 'absent'), sum(bytes) "
+        "FROM products GROUP BY topic, source ORDER BY topic, source"
+    )
+    if rows:
+        yield "<h3>What is recorded</h3>"
+        found = [
+            (topic, source, f"{count:,}", f"{held:,}", f"{absent:,}", bytes_text(size))
+            for topic, source, count, held, absent, size in rows
+        ]
+        heads = ("topic", "service", "products", "held", "absent", "before compression")
+        yield table(heads, found, code=(0, 1), right=(2, 3, 4, 5))
+
+
+def _carriers_and_devices(scenario: Mapping[str, Any]) -> Iterator[str]:
+    carriers = [
+        (
+            c.get("name", ""),
+            f"{c.get('frequency_hz', 0) / 1e9:g} GHz",
+            f"{c.get('bandwidth_hz', 0) / 1e6:g} MHz",
+        )
+        for c in scenario.get("carriers", ())
+    ]
+    if carriers:
+        yield "<h3>Carriers</h3>"
+        yield table(("carrier", "frequency", "bandwidth"), carriers, code=(0,), right=(1, 2))
+    devices = [
+        (
+            d.get("name", ""),
+            f"{d.get('kind', '')} {d.get('role', '')}".strip(),
+            d.get("on") or "fixed",
+            _device(d),
+        )
+        for d in scenario.get("devices", ())
+    ]
+    if devices:
+        yield "<h3>Devices</h3>"
+        yield table(("device", "kind", "on", "settings"), devices, code=(0, 2))
+
+
+def _device(device: Mapping[str, Any]) -> str:
+    """What matters of a device of its kind."""
+    array, kind = device.get("array"), device.get("kind")
+    found = []
+    if kind == "antenna" and isinstance(array, dict):
+        rows, columns = array.get("rows", 1), array.get("columns", 1)
+        found.append(f"{rows} × {columns} elements")
+        found += [f"{key} {value}" for key, value in array.items() if key not in ("rows", "columns")]
+        if device.get("role") == "tx":
+            found.append(f"{device.get('power_dbm', 0):g} dBm")
+    elif kind == "antenna":
+        found.append("1 × 1 elements")
+    if kind == "camera":
+        width, height = device.get("size_px", (0, 0))
+        found.append(f"{width} × {height} pixels, {device.get('field_of_view_deg', 0):g}°")
+    if kind == "lidar":
+        reach = device.get("range_m", (0.0, 0.0))
+        found.append(f"{device.get('beams')} beams × {device.get('azimuth_steps')}, up to {reach[1]:g} m")
+    if device.get("count", 1) != 1:
+        found.append(f"at most {device['count']}")
+    return ", ".join(found)
+
+
+def _services(scenario: Mapping[str, Any]) -> Iterator[str]:
+    rows = [
+        (name, spec.get("role", ""), spec.get("use", ""), _settings(spec.get("settings", {})))
+        for name, spec in scenario.get("services", {}).items()
+    ]
+    if rows:
+        yield "<h3>Services</h3>"
+        yield table(("service", "role", "implementation", "settings"), rows, code=(0, 2))
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    """Settings as ``key = value``; what is long is only counted, and stands in the whole scenario."""
+    found = []
+    for key, value in settings.items():
+        text = msgspec.json.encode(value).decode()
+        long = len(text) > 80 and isinstance(value, list | tuple | dict)
+        found.append(f"{key}: {len(value)} entries" if long else f"{key} = {text}")
+    return ", ".join(found)
+
+
+# --- coverage and paths ----------------------------------------------------------------------------------
+
+_NO_CHANNEL = "No channel is recorded: there are no users."
+
+
+def _coverage(content: _Content) -> Iterator[str]:
+    users = content.users
+    if not len(users):
+        yield absent(_NO_CHANNEL)
+        return
+    placed = users.placed
+    if not placed.any():
+        yield absent("No scene is recorded: where the users were is not known.")
+        return
+    if content.scenery_error:
+        yield absent(f"The scenery cannot be drawn: {content.scenery_error}")
+    number = counted(int(placed.sum()), "user")
+    place = map_of(users, content.footprints, content.sample.transmitters)
+    gains = users.gain_db[placed & np.isfinite(users.gain_db)]
+    span = f", from {decimal(gains.min())} dB to {decimal(gains.max())} dB" if len(gains) else ""
+    lacking = int((placed & ~np.isfinite(users.gain_db)).sum())
+    without = (
+        f" {counted(lacking, 'user')} without a path {'is a cross' if lacking == 1 else 'are crosses'}."
+        if lacking
+        else ""
+    )
+    buildings = "outlines of buildings" if content.footprints is not None else "no buildings"
+    height = map_height(place)
+    yield figure(
+        picture(
+            draw_gain(users, place),
+            f"Map of {number} seen from above, {buildings}, coloured by gain{span}.",
+            height,
+            map_like=True,
+        ),
+        f"Where the {number} were, coloured by gain: the sum of |a|² over the paths{span}.{without}",
+    )
+    share = float(users.los[placed].mean())
+    yield figure(
+        picture(
+            draw_sight_map(users, place),
+            f"Map of the share of users with a line of sight, {percent(share)} of all, {buildings}.",
+            height,
+            map_like=True,
+        ),
+        f"Share of users with a free line of sight, in cells of {cell_m(place):g} m; over all cells "
+        f"{percent(share)}.",
+    )
+
+
+def _sight(content: _Content) -> Iterator[str]:
+    users = content.users
+    if not len(users):
+        yield absent(_NO_CHANNEL)
+        return
+    _, rows = content.catalogue.query(
+        "SELECT object_class, count(*), sum(los AND valid), sum(valid AND NOT los), sum(NOT valid) "
+        "FROM users GROUP BY object_class ORDER BY count(*) DESC, object_class"
+    )
+    kept = rows[:CLASSES]
+    total = tuple(sum(row[column] for row in rows) for column in range(1, 5))
+    named = [(_class(name), *numbers) for name, *numbers in kept]
+    bars = [("all", *total), *named] if len(named) > 1 else named
+    yield table(
+        ("users on", "users", "valid", "line of sight", "other paths only", "no path"),
+        [
+            (name, f"{count:,}", percent(1 - none / count), percent(sight / count), percent(hidden / count),
+             percent(none / count))
+            for name, count, sight, hidden, none in (*named, ("all", *total))
+        ],
+        right=(1, 2, 3, 4, 5),
+    )  # fmt: skip
+    count, sight, hidden, none = total
+    shares = f"{percent(sight / count)} have a line of sight, {percent(hidden / count)} other paths only"
+    names, _, *parts = zip(*bars, strict=True)
+    left_out = (
+        f" The {len(rows) - CLASSES} classes with fewest users have no bar." if len(rows) > CLASSES else ""
+    )
+    yield figure(
+        picture(
+            draw_shares(names, *parts),
+            f"Bars of the shares of users by class of object: of all, {shares}, "
+            f"{percent(none / count)} no path.",
+            0.9 + 0.42 * len(bars),
+        ),
+        f"A user is valid where a path reaches it: {percent(1 - none / count)} are. "
+        f"Of all users, {shares}.{left_out}",
+    )
+    _, scenes = content.catalogue.query("SELECT users FROM scenes")
+    each = np.array([number for (number,) in scenes])
+    yield figure(
+        picture(
+            draw_counts([("Receivers of a scene", each), ("Paths of a user", users.paths)]),
+            f"Histograms of receivers of a scene, {each.min()} to {each.max()}, and of paths of a user, "
+            f"{users.paths.min()} to {users.paths.max()}.",
+            3.3,
+        ),
+        f"Receivers of a scene on each carrier and for each transmitter, on average {each.mean():.3g}; "
+        f"paths of a user, on average {users.paths.mean():.3g}.",
+    )
+
+
+def _class(name: str) -> str:
+    return name or "(stands still)"
+
+
+def _gain(content: _Content) -> Iterator[str]:
+    users = content.users
+    some = np.isfinite(users.gain_db)
+    if not len(users):
+        yield absent(_NO_CHANNEL)
+        return
+    if not some.any():
+        yield absent("No user has a path: there is neither gain nor delay.")
+        return
+    yield _histogram(users, users.gain_db, some, "Gain", "dB", "sum of |a|² over the paths of a user")
+    # Of a single path it is 0 but for rounding.
+    spread_ns = np.where(users.spread_s < _NO_SPREAD_S, 0.0, 1e9 * users.spread_s)
+    if not spread_ns[some].any():
+        yield absent("The delay spread of all users is 0: each has one path, or paths of equal length.")
+        return
+    explained = "square root of the second central moment of the power delay profile"
+    yield _histogram(users, spread_ns, some, "Delay spread", "ns", explained)
+
+
+_NO_SPREAD_S = 1e-15
+
+
+def _histogram(users: UserColumns, values: Any, some: Any, name: str, unit: str, explained: str) -> str:
+    carriers = _by_carrier(users, some)
+    panels = [(title, values[mask & some], users.los[mask & some]) for title, mask in carriers]
+    low, median, high = (f"{decimal(at)} {unit}" for at in np.percentile(values[some], [5, 50, 95]))
+    middle = f"median {median}, nine of ten from {low} to {high}"
+    alt = f"Histogram of the {name.lower()}: {middle}."
+    shown = picture(draw_histograms(panels, f"{name} [{unit}]"), alt, _rows_height(len(panels)))
+    return figure(shown, f"{name}: {explained}; {middle}.")
+
+
+def _by_carrier(users: UserColumns, some: Any) -> list[tuple[str, Any]]:
+    """Title and mask of each carrier that has users; the first ones only where they are many."""
+    names = sorted({carrier for carrier, _ in users.groups})
+    found = []
+    for name in names:
+        of_carrier = [at for at, (carrier, _) in enumerate(users.groups) if carrier == name]
+        mask = np.isin(users.group, of_carrier)
+        if (mask & some).any():
+            found.append((f"carrier {name}" if len(names) > 1 else "", mask))
+    return found[:PANELS]
+
+
+def _rows_height(panels: int) -> float:
+    return 3.0 * (-(-panels // 2)) + 0.5
+
+
+def _angles(content: _Content) -> Iterator[str]:
+    sample = content.sample
+    if "channel" not in content.topics:
+        yield absent("No channel is recorded: there are no angles.")
+    elif not sample.paths:
+        yield absent(f"No path is in {_sampled(content)}: there are no angles.")
+    else:
+        yield figure(
+            picture(
+                draw_angles(sample),
+                "Four histograms: azimuth and zenith angle of the paths at departure and at arrival, of all "
+                "paths and of the strongest path of each user.",
+                5.6,
+            ),
+            f"{sample.paths:,} paths of {_sampled(content)}. Angles are in world axes: zenith from +z, "
+            "azimuth counter-clockwise from +x (east); arrival is the direction that the wave comes from.",
+        )
+
+
+def _beams(content: _Content) -> Iterator[str]:
+    users = content.users
+    if "link" not in content.topics:
+        yield absent("No link is recorded: the best beams are not known.")
+        return
+    some = (users.tx_beam >= 0) & (users.rx_beam >= 0)
+    if not some.any():
+        yield absent("No user has a best pair of beams.")
+        return
+    counts = np.bincount(users.group[some], minlength=len(users.groups))
+    shown = [int(group) for group in np.argsort(-counts, kind="stable")[:PANELS] if counts[group]]
+    panels = []
+    for group in sorted(shown):
+        mask = some & (users.group == group)
+        carrier, tx = users.groups[group]
+        panels.append((f"{tx}, {carrier}", users.tx_beam[mask], users.rx_beam[mask]))
+    codebooks = _codebook(content, "tx"), _codebook(content, "rx")
+    pairs, numbers = np.unique(
+        np.stack([users.group, users.tx_beam, users.rx_beam])[:, some], axis=1, return_counts=True
+    )
+    at = int(numbers.argmax())
+    carrier, tx = users.groups[pairs[0, at]]
+    left = int((counts > 0).sum()) - len(shown)
+    left_out = f" {left} more with fewer users are left out." if left else ""
+    yield figure(
+        picture(
+            draw_beams(panels, codebooks),
+            f"Heat map of how often each pair of beams is the best; the most frequent one is beam "
+            f"{pairs[1, at]} of {tx} with beam {pairs[2, at]} of the receiver.",
+            beams_height(panels),
+        ),
+        f"How often a pair of beams is the best of all, on a logarithmic scale: {pairs.shape[1]:,} pairs "
+        f"occur, most often ({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam "
+        f"{pairs[2, at]} of the receiver, on carrier {carrier}.{left_out}",
+    )
+
+
+def _codebook(content: _Content, role: str) -> int:
+    """Beams that the largest array of this role has at least."""
+    sizes = [1]
+    for device in _scenario(content.data).get("devices", ()):
+        if device.get("role") in (role, "both") and isinstance(array := device.get("array"), dict):
+            sizes.append(array.get("rows", 1) * array.get("columns", 1))
+    return max(sizes)
+
+
+def _correlation(content: _Content) -> Iterator[str]:
+    sample = content.sample
+    _, ((most,),) = content.catalogue.query("SELECT max(scenes) FROM episodes")
+    if "channel" not in content.topics:
+        yield absent("No channel is recorded: there is nothing to compare.")
+    elif (most or 0) < 2:
+        yield absent("Episodes have one scene: there are no consecutive scenes to compare.")
+    elif not sample.has_h:
+        yield absent("The matrices H are not recorded (channel.h): they cannot be compared.")
+    elif not any(sample.consecutive):
+        yield absent("No user has a path in two consecutive scenes of the sample.")
+    else:
+        values = np.array(sample.correlation)[np.array(sample.consecutive)]
+        *others, last = lags(sample)
+        later = f"; of scenes {last.apart_s:g} s apart {last.median:.3f}" if others else ""
+        median = float(np.median(values))
+        yield figure(
+            picture(
+                draw_correlation(sample),
+                "Correlation of the channel matrices of scenes of an episode: a histogram for consecutive "
+                f"scenes, median {median:.3f}, and its fall with the time between the scenes.",
+                3.4,
+            ),
+            "|⟨H(k), H(k+1)⟩| / (‖H(k)‖ ‖H(k+1)‖) of the same user in two scenes of "
+            f"{_sampled(content)}: 1 where the channel has not changed but for a factor. Median of the "
+            f"{len(values):,} pairs of consecutive scenes {median:.3f}{later}.",
+        )
+
+
+def _sampled(content: _Content) -> str:
+    """The sample in words."""
+    sample, there = content.sample, len(content.data)
+    episodes = f"all {there:,} episodes" if len(sample.episodes) == there else (
+        f"{len(sample.episodes):,} of the {there:,} episodes, drawn with seed 0"
+    )  # fmt: skip
+    first = f", of each the first {SAMPLE_SCENES} scenes" if sample.cut else ""
+    return f"{episodes} ({sample.scenes:,} scenes{first})"
+
+
+# --- sensors ---------------------------------------------------------------------------------------------
+
+
+def _lidar(content: _Content) -> Iterator[str]:
+    scans = content.sample.scans
+    if "lidar" not in content.topics:
+        yield absent("No LIDAR is recorded.")
+    elif not scans:
+        yield absent(f"No scan in {_sampled(content)} has points or a grid.")
+    else:
+        grid = any(scan.grid is not None for scan in scans)
+        what = (
+            "cells of the occupancy grid: obstacles, transmitters and receivers stand out"
+            if grid
+            else "hits, coloured by their height, with the outlines of moving objects"
+        )
+        titles = "; ".join(scan.title.replace("\n", ", ") for scan in scans)
+        yield figure(
+            picture(
+                draw_scans(scans),
+                f"LIDAR scans from above ({what}): {titles}.",
+                4.4 if len(scans) > 1 else 6.0,
+                map_like=True,
+            ),
+            f"Scans from above: {what}. The star is the sensor.",
+        )
+
+
+_KINDS = {"picture": "Picture", "depth": "Depth, near is bright", "objects": "Objects, strong colours move"}
+
+
+def _cameras(content: _Content) -> Iterator[str]:
+    if not content.topics & {"camera", "depth", "segmentation"}:
+        yield absent("No camera is recorded.")
+        return
+    if not content.sample.shots:
+        yield absent(f"No camera has a picture in {_sampled(content)}.")
+    for shot in content.sample.shots:
+        yield f"<h3>{escape(shot.sensor)}: {escape(shot.moment)}</h3>"
+        yield '<div class="row">'
+        for kind, image in shot.images.items():
+            alt = f"{_KINDS[kind]}: camera {shot.sensor}, {shot.moment}."
+            yield figure(pixels(image, alt), _KINDS[kind])
+        yield "</div>"
+
+
+# --- generation ------------------------------------------------------------------------------------------
+
+
+def _generation(content: _Content) -> Iterator[str]:
+    found = read_throughput(content.catalogue)
+    if found is None:
+        yield absent("No times are kept: how fast the episodes were played is not known.")
+    else:
+        rate = found.scenes / found.elapsed_s
+        where = counted(found.processes, "process", "processes")
+        where = f"{where} of {counted(found.hosts, 'machine')}"
+        text = (
+            f"{found.scenes:,} scenes of {counted(found.episodes, 'episode')} in "
+            f"{duration_text(found.elapsed_s)} at work, by {where}: {rate:.3g} scenes/s"
+        )
+        yield figure(
+            picture(
+                draw_throughput(found), f"Scenes per second over the time of the generation; {text}.", 3.1
+            ),
+            f"{text}. Scenes of an episode are spread evenly over its wall time.",
+        )
+        if found.services_s:
+            shares = dict(sorted(found.services_s.items(), key=lambda item: -item[1]))
+            rest = found.busy_s - sum(shares.values())
+            if rest > 0.0:
+                shares["start, reset, saving"] = rest
+            longest = max(shares, key=lambda name: shares[name])
+            yield figure(
+                picture(
+                    draw_services(shares, found.scenes),
+                    "Bars of the wall time that each service takes for a scene; the longest is that of "
+                    f"{longest}, {percent(shares[longest] / sum(shares.values()))} of all.",
+                    0.9 + 0.36 * len(shares),
+                ),
+                "Wall time for a scene, by service, on average of all episodes; what is left is loading, "
+                "resetting and saving an episode.",
+            )
+    _, ((attempts,),) = content.catalogue.query("SELECT count(*) FROM failures")
+    failures = content.catalogue.failures()
+    if failures:
+        yield f"<p>{counted(len(failures), 'episode')} failed; the same command tries again:</p>"
+        yield table(
+            ("episode", "error"), [(str(n), text) for n, text in failures[:SHOWN_FAILURES]], right=(0,)
+        )
+        if len(failures) > SHOWN_FAILURES:
+            yield f"<p>… and {len(failures) - SHOWN_FAILURES:,} more, in table <code>failures</code>.</p>"
+    else:
+        yield (
+            "<p>No episode failed.</p>"
+            if not attempts
+            else (
+                f"<p>No episode is missing; {counted(attempts, 'time')} one failed and was played again.</p>"
+            )
+        )
+
+
+_SECTIONS: tuple[tuple[str, str, Callable[[_Content], Iterator[str]]], ...] = (
+    ("dataset", "What it is", _what_it_is),
+    ("coverage", "Coverage", _coverage),
+    ("sight", "Line of sight and paths", _sight),
+    ("gain", "Gain and delay spread", _gain),
+    ("angles", "Angles", _angles),
+    ("beams", "Best beams", _beams),
+    ("correlation", "Correlation of consecutive scenes", _correlation),
+    ("lidar", "LIDAR", _lidar),
+    ("cameras", "Cameras", _cameras),
+    ("generation", "Generation", _generation),
+)

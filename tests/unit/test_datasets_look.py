@@ -1,0 +1,269 @@
+"""The page of a dataset (``caviar look``)."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from caviar_clients.cli.main import app
+from caviar_clients.datasets import look_data
+from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.figures import draw_scans, picture
+from caviar_clients.datasets.look import write_page
+from caviar_clients.datasets.look_data import Scan, read_throughput, read_users
+from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.datasets.reader import Dataset
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.scenario import load_scenario
+
+pytest.importorskip("matplotlib", reason="pictures need Matplotlib: extra plot")
+
+SECTIONS = (
+    "dataset", "coverage", "sight", "gain", "angles", "beams", "correlation", "lidar", "cameras",
+    "generation",
+)  # fmt: skip
+
+
+def make(out: Path, episodes: int, scenes: int, file: Path | None = None) -> Path:
+    directory = DatasetDirectory(out)
+    scenario = load_scenario(file or "smoke")
+    plan = plan_dataset(scenario, episodes=episodes, scenes=scenes)
+    with writing_dataset(directory):
+        catalogue = Catalogue(directory.catalogue, writable=True)
+        catalogue.plan(plan.settings(), episodes)
+        for number in range(episodes):
+            result = play_episode(EpisodeTask(plan.scenario, number, str(out)))
+            assert result.rows is not None, result.error
+            catalogue.add(result.rows, result.measured)
+        catalogue.close()
+    return out
+
+
+class Page(HTMLParser):
+    """What a page names, and the text of each section."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.alts: list[str | None] = []
+        self.texts: dict[str, str] = {}
+        self.pictures: dict[str, int] = {}
+        self.tags: list[str] = []
+        self._section = ""
+        self.feed(file.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self.tags.append(tag)
+        self.addresses += [found[key] or "" for key in ("src", "href", "srcset") if key in found]
+        if tag == "img":
+            self.alts.append(found.get("alt"))
+            self.pictures[self._section] = self.pictures.get(self._section, 0) + 1
+        if tag == "section":
+            self._section = found["id"] or ""
+
+    def handle_data(self, data: str) -> None:
+        self.texts[self._section] = self.texts.get(self._section, "") + data
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("dataset"), 3, 4)
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Page:
+    return Page(write_page(folder))
+
+
+def test_a_page_has_every_section_that_its_recordings_allow(page: Page) -> None:
+    assert [name for name in page.texts if name] == list(SECTIONS)
+    assert page.pictures == {
+        "coverage": 2, "sight": 2, "gain": 1, "angles": 1, "beams": 1, "correlation": 1, "generation": 2,
+    }  # fmt: skip
+    assert page.texts["lidar"].strip().endswith("No LIDAR is recorded.")
+    assert page.texts["cameras"].strip().endswith("No camera is recorded.")
+    assert "delay spread of all users is 0" in page.texts["gain"]
+    assert re.search(r"smoke.*3.*12, 4 in each episode.*24: a receiver", page.texts["dataset"], re.DOTALL)
+    assert "100.0 %" in page.texts["sight"]
+    assert "all 3 episodes (12 scenes)" in page.texts["angles"]
+    assert "0.3 s apart" in page.texts["correlation"]
+    assert "No episode failed." in page.texts["generation"]
+
+
+def test_a_page_is_one_file_with_nothing_from_elsewhere(folder: Path, page: Page) -> None:
+    assert page.addresses
+    assert [a for a in page.addresses if not a.startswith(("data:", "#"))] == []
+    assert {a[1:] for a in page.addresses if a.startswith("#")} == set(SECTIONS)
+    text = (folder / "look.html").read_text()
+    assert "<script" not in text
+    assert "http://" not in text
+    assert "https://" not in text
+    assert str(folder) not in text  # no path of this machine
+    assert page.tags.count("h1") == page.tags.count("title") == 1
+    assert [path.name for path in folder.glob("look*")] == ["look.html"]
+
+
+def test_every_picture_has_an_alternative_text_and_a_dark_form(page: Page) -> None:
+    assert all(alt and len(alt) > 30 for alt in page.alts)
+    assert page.tags.count("source") == len(page.alts) == 10
+
+
+def test_a_dataset_of_scenes_alone_says_what_is_missing(tmp_path: Path) -> None:
+    file = tmp_path / "scenes.toml"
+    file.write_text(SCENES_ALONE)
+    page = Page(write_page(make(tmp_path / "d", 1, 1, file), tmp_path / "out" / "page.html"))
+    assert page.pictures == {"generation": 2}
+    for name, words in {
+        "coverage": "No channel is recorded",
+        "sight": "No channel is recorded",
+        "gain": "No channel is recorded",
+        "angles": "No channel is recorded",
+        "beams": "No link is recorded",
+        "correlation": "No channel is recorded",
+        "lidar": "No LIDAR is recorded",
+    }.items():
+        assert words in page.texts[name], name
+
+
+def test_a_channel_without_link_has_paths_and_no_beams(tmp_path: Path) -> None:
+    text = Path(load_scenario("smoke").source.file).read_text()
+    kept = re.sub(r"(?ms)^\[services\.(agent|link)\]\n.*?(?=^\[|\Z)", "", text)
+    kept = re.sub(r"(?m)^record = .*$", 'record = ["scene", "channel"]', kept)
+    file = tmp_path / "channel.toml"
+    file.write_text(kept)
+    page = Page(write_page(make(tmp_path / "d", 2, 1, file)))
+    assert "No link is recorded" in page.texts["beams"]
+    assert "Episodes have one scene" in page.texts["correlation"]
+    assert page.pictures["coverage"] == 2
+
+
+def test_scans_are_drawn_as_points_or_as_a_grid() -> None:
+    points, none = np.random.default_rng(1).normal(size=(50, 3)), np.zeros((0, 4, 2))
+    scan = Scan("car/top", points, None, (0.0, 0.0), none)
+    cells = np.zeros((4, 5))
+    cells[1, 2], cells[0, 0] = 1, -2
+    grid = Scan("car/top", points[:0], (cells, (0.0, 5.0, 0.0, 4.0)), (2.0, 2.0), none)
+    for scans in ([scan], [scan, grid]):
+        shown = picture(draw_scans(scans), "LIDAR", 4.0, map_like=True)
+        assert shown.light.startswith("data:image/png;base64,")
+        assert shown.light != shown.dark
+        assert 300 < shown.width < 1000
+
+
+def test_users_are_read_in_parts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, told = Dataset(folder), list[tuple[str, int, int]]()
+    catalogue = Catalogue(DatasetDirectory(folder).catalogue)
+    monkeypatch.setattr(look_data, "_ROWS_AT_ONCE", 1)
+    users = read_users(catalogue, lambda *how: told.append(how))
+    assert [done for _, done, _ in told] == [1, 2, 3]
+    table = data.table("users")
+    np.testing.assert_array_equal(users.gain_db, table["gain_db"])
+    np.testing.assert_array_equal(users.tx_beam, table["tx_beam"])
+    assert [users.groups[group] for group in users.group] == list(
+        zip(table["carrier"], table["tx"], strict=True)
+    )
+
+
+def test_a_sample_of_many_episodes_is_stated(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(look_data, "SAMPLE_EPISODES", 2)
+    page = Page(write_page(folder, tmp_path / "page.html"))
+    assert "2 of the 3 episodes, drawn with seed 0 (8 scenes)" in page.texts["angles"]
+
+
+def test_throughput_leaves_interruptions_out_and_adds_workers_up(tmp_path: Path) -> None:
+    catalogue = Catalogue(tmp_path / "catalogue.sqlite", writable=True)
+    starts = ("00:00:00", "00:00:00", "00:00:10", "05:00:00")
+    for number, start in enumerate(starts):
+        catalogue._connection.execute("INSERT INTO episodes VALUES (?, 20, 1, '', 1, '')", (number,))
+        catalogue._connection.execute(
+            "INSERT INTO timings VALUES (?, ?, 'a', ?, 10.0, 9.0, ?)",
+            (number, f"2026-11-24T{start}+00:00", number % 2, '{"services_s": {"channel": 4.0}}'),
+        )
+    found = read_throughput(catalogue)
+    assert found is not None
+    assert found.elapsed_s == pytest.approx(30.0)
+    assert found.interruptions_s == pytest.approx((20.0,))
+    assert found.services_s == {"channel": 16.0}
+    assert (found.busy_s, found.processes, found.hosts) == (40.0, 2, 1)
+    width = float(np.diff(found.edges_s)[0])
+    assert found.rate.sum() * width == pytest.approx(80.0)
+    assert found.rate[0] == pytest.approx(4.0)
+    assert found.rate[-1] == pytest.approx(2.0)
+
+
+def test_failures_are_listed(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "d"
+    shutil.copytree(folder, copy)
+    catalogue = Catalogue(DatasetDirectory(copy).catalogue, writable=True)
+    catalogue.add_failure(7, "2026-11-24T00:00:00", "the <world> ended", "host")
+    catalogue.close()
+    page = Page(write_page(copy))
+    assert "1 episode failed" in page.texts["generation"]
+    assert "the <world> ended" in page.texts["generation"]
+
+
+def test_a_folder_that_is_no_dataset_stays_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"is no dataset, it has no catalogue\.sqlite; make one with"):
+        write_page(tmp_path / "nothing")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.html"
+    result = CliRunner().invoke(app, ["look", str(folder), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert result.output.splitlines()[-1] == str(out)
+    assert out.stat().st_size > 100_000
+
+
+def test_a_browser_opens_the_page_without_an_error(folder: Path, page: Page, tmp_path: Path) -> None:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (Debian's package chromium)")
+    answer = subprocess.run(
+        [
+            chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+            "--enable-logging=stderr", "--dump-dom", (folder / "look.html").as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert [line for line in answer.stderr.splitlines() if "CONSOLE" in line] == []
+    assert answer.stdout.count("<img ") == len(page.alts)
+    assert "<title>smoke – dataset" in answer.stdout
+
+
+SCENES_ALONE = """
+[run]
+name = "scenes"
+frames = 1
+seed = 1
+sampling_period_ns = 100_000_000
+record = ["scene"]
+
+[services.world]
+role = "world"
+use = "trajectory"
+budget_ms = 20
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, 0.0, 0.0, 0.75], [5.0, 5.0, 0.0, 0.75]]
+
+[services.recorder]
+role = "recorder"
+use = "mcap"
+budget_ms = 100
+"""
