@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import sqlite3
@@ -252,3 +253,35 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
     gone, alive = psutil.wait_procs(workers, timeout=10.0)
     assert (len(gone) >= 2, alive) == (True, [])
     assert list((out / ".work").iterdir()) == []
+
+
+@pytest.mark.parametrize("small_disk", ["4m"], indirect=True)
+def test_a_disk_that_fills_up_ends_the_command_and_loses_nothing(scenario: Path, small_disk: Path) -> None:
+    """The estimate finds it large enough, and then something else is written there."""
+    out = small_disk / "d"
+    command = [
+        *COMMAND,
+        str(scenario),
+        "--out",
+        str(out),
+        "--episodes",
+        "3",
+        "--scenes",
+        "2",
+        "--workers",
+        "1",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    wait_for(out, 1, process)
+    filler = small_disk / "filler"
+    with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+    said, _ = process.communicate(timeout=60.0)
+    assert process.returncode == 1, said
+    assert "free space" in said
+    assert "Traceback" not in said
+    filler.unlink()
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert sorted(path.name[-1] for path in (out / "episodes").iterdir()) == ["0", "1", "2"]

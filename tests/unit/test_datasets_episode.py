@@ -152,5 +152,5 @@ def test_an_estimate_has_a_part_for_the_episode_and_one_for_each_scene() -> None
 
 
 def test_a_disk_that_is_too_small_is_refused_with_both_figures(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"too small: 1050000000\.00 GB are needed, \d+\.\d+ GB are free"):
+    with pytest.raises(RunError, match=r"too small: 1,050,000,000,000 MB are needed, [\d,]+ MB are free"):
         check_disk(tmp_path, 10**18)

@@ -17,6 +17,7 @@ from caviar_clients.cli.shared import (
     progress_bar,
     require_installed,
     require_known,
+    scaled,
 )
 from caviar_clients.datasets.texts import duration_text
 from caviar_clients.files import printable
@@ -113,7 +114,7 @@ def generate_command(
     print_line(
         console,
         f"{counted(outcome.episodes, 'episode')}, {counted(outcome.scenes, 'scene')}, "
-        f"{outcome.bytes / 1e6:.1f} MB in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
+        f"{_size(outcome.bytes)} in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
     )
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
@@ -169,6 +170,11 @@ def look_command(
     with bar:
         file = write_page(dataset, out, progress)
     print_line(console, file)
+
+
+def _size(count: int) -> str:
+    value, unit = scaled(float(count), ("B", "kB", "MB", "GB", "TB"))
+    return f"{value:.3g} {unit}"
 
 
 def _remove(out: Path) -> None:
@@ -228,7 +234,7 @@ class _Screen:
         print_line(
             self._bar.console,
             f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, "
-            f"{found.bytes / 1e6:.1f} MB of {free / 1e9:.1f} GB that are free",
+            f"{_size(found.bytes)} of {_size(free)} that are free",
         )
         self._began = time.monotonic()
         self._task = self._bar.add_task("episodes", total=episodes, rate="")

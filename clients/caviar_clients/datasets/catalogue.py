@@ -72,6 +72,9 @@ class Catalogue:
             if writable:
                 self._connection.execute("PRAGMA journal_mode = WAL")
                 self._connection.execute("PRAGMA synchronous = NORMAL")
+                self._connection.execute(
+                    "PRAGMA wal_autocheckpoint = 100"
+                )  # pages of 4 KiB beside the database
                 self._connection.executescript(_schema())
             else:
                 self._connection.execute("SELECT count(*) FROM dataset").fetchone()
@@ -208,7 +211,9 @@ class Catalogue:
         try:
             yield
         except sqlite3.Error as error:
-            raise RecordingError(f"{self.path}: {error}") from error
+            is_full = getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
+            remedy = "; free space there: the same command then goes on" if is_full else ""
+            raise RecordingError(f"{self.path}: {error}{remedy}") from error
 
 
 def _quoted(path: Path) -> str:

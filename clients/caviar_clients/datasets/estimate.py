@@ -20,6 +20,8 @@ from caviar_protocol.scenario import Scenario
 
 FEW = 3
 """Scenes of the longer episode that is tried."""
+ROW_B = 200
+"""[B] of a row of the catalogue, with its index."""
 SPARE = 1.05
 """So much more than the estimate has to be free on the disk."""
 
@@ -100,7 +102,10 @@ def try_worker(scenario: Scenario, out: str, episodes: Sequence[int], cached: Ma
         if result.error:
             error = error or result.error
         else:
-            done.append((count, time.monotonic() - began, int(result.measured["disk_b"])))
+            rows = result.rows
+            listed = len(rows.scenes) + len(rows.users) + len(rows.products) if rows is not None else 0
+            size = int(result.measured["disk_b"]) + listed * ROW_B
+            done.append((count, time.monotonic() - began, size))
     if not done:
         return Trial(cold_s, error=error)
     counts, walls, sizes = zip(*done, strict=True)
@@ -153,8 +158,8 @@ def check_disk(folder: Path, needed: int) -> int:
     free = shutil.disk_usage(folder).free
     if needed * SPARE > free:
         raise RunError(
-            f"the disk of {folder} is too small: {needed * SPARE / 1e9:.2f} GB are needed, "
-            f"{free / 1e9:.2f} GB are free; free some, give another --out or "
+            f"the disk of {folder} is too small: {needed * SPARE / 1e6:,.0f} MB are needed, "
+            f"{free / 1e6:,.0f} MB are free; free some, give another --out or "
             "fewer --episodes, or record less (record below [run])"
         )
     return free
