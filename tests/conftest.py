@@ -40,8 +40,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
-    """A file system of 256 KiB, or of the size that a test asks for, which only root may mount; skips where that
-    is not allowed."""
+    """A file system of 256 KiB, or of a test's size, which root may mount; skips where that is refused."""
     folder = tmp_path / "disk"
     folder.mkdir()
     command = [
