@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from caviar_clients.cli.datasets import _remove
 from caviar_clients.cli.main import app
-from caviar_clients.datasets import look_data
+from caviar_clients.datasets import figures, look_data
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
-from caviar_clients.datasets.figures import draw_scans, picture
+from caviar_clients.datasets.figures import cell_m, draw_gain, draw_scans, map_of, picture
 from caviar_clients.datasets.look import write_page
-from caviar_clients.datasets.look_data import Scan, read_throughput, read_users
+from caviar_clients.datasets.look_data import Scan, UserColumns, read_throughput, read_users
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_protocol.errors import RecordingError
@@ -160,6 +161,29 @@ def test_scans_are_drawn_as_points_or_as_a_grid() -> None:
         assert 300 < shown.width < 1000
 
 
+def users_at(x: list[float], gain_db: list[float]) -> UserColumns:
+    places, gains, some = np.array(x), np.array(gain_db), np.ones(len(x), dtype=int)
+    has = np.isfinite(gains)
+    return UserColumns((("c", "bs"),), places, 0 * places, has, has, some, gains, gains, some, some, 0 * some)
+
+
+def test_receivers_that_stand_still_are_one_dot_with_the_median() -> None:
+    users = users_at([5.0, 5.0, 5.0, 9.0, 9.0], [-90.0, -80.0, np.nan, np.nan, np.nan])
+    place = map_of(users, None, {(0.0, 0.0)})
+    np.testing.assert_allclose(place.dots, [[5.0, 0.0, -85.0], [9.0, 0.0, np.nan]])
+    (left, right), _ = place.view
+    assert right - left >= 40.0
+
+
+def test_many_places_are_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "DOTS", 2)
+    users = users_at([0.0, 1.0, 30.0, 60.0], [-90.0, -80.0, np.nan, -70.0])
+    place = map_of(users, None, set())
+    assert place.dots is None
+    assert cell_m(place) == 1.0
+    assert picture(draw_gain(users, place), "map", 4.0, map_like=True).light.startswith("data:image/png")
+
+
 def test_users_are_read_in_parts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, told = Dataset(folder), list[tuple[str, int, int]]()
     catalogue = Catalogue(DatasetDirectory(folder).catalogue)
@@ -218,6 +242,16 @@ def test_a_folder_that_is_no_dataset_stays_as_it_is(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"is no dataset, it has no catalogue\.sqlite; make one with"):
         write_page(tmp_path / "nothing")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_overwrite_removes_the_page_of_what_is_removed(tmp_path: Path) -> None:
+    out = make(tmp_path / "d", 1, 1)
+    page, other = DatasetDirectory(out).page, out / "notes.txt"
+    for file in (page, other):
+        file.write_text("text")
+    _remove(out)
+    assert not page.exists()
+    assert other.exists()
 
 
 def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> None:

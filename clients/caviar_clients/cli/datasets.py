@@ -187,8 +187,8 @@ def _remove(out: Path) -> None:
     with writing_dataset(directory):
         for folder in (directory.episodes, directory.assets, directory.tables):
             shutil.rmtree(folder, ignore_errors=True)
-        for file in out.glob(f"{directory.catalogue.name}*"):
-            file.unlink()
+        for file in (*out.glob(f"{directory.catalogue.name}*"), directory.page):
+            file.unlink(missing_ok=True)
 
 
 class _Screen:

@@ -41,6 +41,11 @@ class DatasetDirectory:
         return self.path / "tables"
 
     @property
+    def page(self) -> Path:
+        """Page that shows what the dataset is (`look`)."""
+        return self.path / "look.html"
+
+    @property
     def episodes(self) -> Path:
         """Folder of the recordings."""
         return self.path / "episodes"

@@ -21,7 +21,7 @@ from caviar_clients.datasets.look_data import (
 )
 from caviar_clients.plots.map import View, colour_limits, draw_scenery
 from caviar_clients.plots.rays import Footprints
-from caviar_clients.plots.style import BLUE, ORANGE, SKY, VERMILION, styled
+from caviar_clients.plots.style import BLUE, ORANGE, SKY, VERMILION, legend_square, styled
 from caviar_protocol.arrays import BoolArray, Float64Array, UInt8Array
 
 WIDTH_IN = 9.0
@@ -29,7 +29,7 @@ WIDTH_IN = 9.0
 DPI = 144
 """Of the pictures; a page shows them at 96, so that screens with small pixels have more to show."""
 DOTS = 3000
-"""Users up to this number are dots in a map; more are cells with their median."""
+"""Places up to this number are dots in a map of gains; more are cells."""
 CELLS = 80
 """Cells of a map, along its longer side."""
 PANELS = 4
@@ -172,6 +172,9 @@ class MapOf:
     transmitters: Float64Array
     """x and y [m], Shape ``[T, 2]``."""
     view: View
+    dots: Float64Array | None
+    """Where users were: x and y [m], and the median of their gains [dB], NaN where nobody has a path, Shape
+    ``[N, 3]``; None where these places are too many for dots."""
 
 
 def map_of(
@@ -194,7 +197,32 @@ def map_of(
     centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.06 + 4.0, 20.0)
     half = np.maximum(half, half.max() * np.array([0.9, 0.35]))  # neither a tower nor a strip
     (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
-    return MapOf(_within(footprints, left, right, bottom, top), fixed, ((left, right), (bottom, top)))
+    return MapOf(
+        _within(footprints, left, right, bottom, top), fixed, ((left, right), (bottom, top)), _dots(users)
+    )
+
+
+def _dots(users: UserColumns) -> Float64Array | None:
+    """Places to 0.1 m: receivers that stand still are there in every scene, on every carrier."""
+    placed = users.placed
+    x, y, gain = (column[placed] for column in (users.x, users.y, users.gain_db))
+    key = np.round(10.0 * x).astype(np.int64) * 2**32 + np.round(10.0 * y).astype(np.int64)
+    order = np.argsort(key, kind="stable")
+    _, starts = np.unique(key[order], return_index=True)
+    if len(starts) > DOTS:
+        return None
+    median = [
+        float(np.median(known)) if len(known := part[np.isfinite(part)]) else np.nan
+        for part in np.split(gain[order], starts[1:])
+    ]
+    return np.column_stack([x[order][starts], y[order][starts], median])
+
+
+def _gains(users: UserColumns, place: MapOf) -> Float64Array:
+    """What is coloured: of the dots, or of all users that have a place and a path."""
+    if place.dots is not None:
+        return place.dots[:, 2]
+    return users.gain_db[users.placed & np.isfinite(users.gain_db)]
 
 
 def _within(
@@ -225,30 +253,40 @@ def draw_gain(users: UserColumns, place: MapOf) -> Draw:
     """A map of the users, coloured by their gain."""
 
     def draw(drawn: Any, theme: Theme) -> None:
+        from matplotlib.colors import ListedColormap
+
         axes = _map_axes(drawn, theme, place)
-        without = users.placed & ~np.isfinite(users.gain_db)
-        some = users.placed & np.isfinite(users.gain_db)
-        gains = users.gain_db[some]
-        low, high, extend = colour_limits(gains)
-        x, y = users.x[some], users.y[some]
+        gains = _gains(users, place)
+        low, high, extend = colour_limits(gains[np.isfinite(gains)])
         colours: dict[str, Any] = {"cmap": theme.colours, "vmin": low, "vmax": high}
         shown = None
-        if without.any():
-            lacking = np.unique(np.round(np.stack([users.x[without], users.y[without]], axis=1), 1), axis=0)
-            axes.scatter(
-                *lacking.T, s=16, marker="x", color=theme.ink, linewidths=0.9, zorder=4, label="no path",
-            )  # fmt: skip
-        if 0 < len(gains) <= DOTS:
-            order = np.argsort(gains, kind="stable")  # the strongest on top
-            size = float(np.clip(18000.0 / len(gains), 10.0, 40.0))
-            shown = axes.scatter(
-                x[order], y[order], c=gains[order], s=size, linewidths=0.3, edgecolors=theme.paper, zorder=3,
-                **colours,
-            )  # fmt: skip
-        elif len(gains):
-            shown = _cells(axes, place, x, y, gains, np.median, **colours)
+        if place.dots is not None:
+            none = ~np.isfinite(gains)
+            if none.any():
+                axes.scatter(
+                    *place.dots[none, :2].T, s=16, marker="x", color=theme.ink, linewidths=0.9, zorder=4,
+                    label="no path",
+                )  # fmt: skip
+            if not none.all():
+                order = np.argsort(gains[~none], kind="stable")  # the strongest on top
+                size = float(np.clip(18000.0 / len(gains), 10.0, 40.0))
+                shown = axes.scatter(
+                    *place.dots[~none, :2][order].T, c=gains[~none][order], s=size, linewidths=0.3,
+                    edgecolors=theme.paper, zorder=3, **colours,
+                )  # fmt: skip
+        else:
+            some = users.placed & np.isfinite(users.gain_db)
+            without = users.placed & ~some
+            if without.any():
+                # Below the others: what shows are cells in which nobody has a path.
+                plain = ListedColormap([theme.third])
+                ones = np.ones(int(without.sum()))
+                _cells(axes, place, users.x[without], users.y[without], ones, np.mean, cmap=plain, zorder=1.9)
+                legend_square(axes, "no path for any user", theme.third, theme.muted)
+            if some.any():
+                shown = _cells(axes, place, users.x[some], users.y[some], gains, np.median, **colours)
         if shown is not None:
-            what = "Gain [dB]" if len(gains) <= DOTS else "Median gain of a cell [dB]"
+            what = "Gain [dB]" if place.dots is not None else "Median gain of a cell [dB]"
             drawn.colorbar(shown, ax=axes, label=what, shrink=0.85, pad=0.01, extend=extend)
         _finish_map(drawn, axes, theme, place)
 
@@ -316,8 +354,8 @@ def _cells(
     for cell, part in zip(cells, np.split(values[order], starts[1:]), strict=True):
         grid[cell] = of(part)
     shown = axes.imshow(
-        np.ma.masked_invalid(grid.reshape(rows, columns)), origin="lower", interpolation="none", zorder=2,
-        extent=(west, west + columns * edge, south, south + rows * edge), **colours,
+        np.ma.masked_invalid(grid.reshape(rows, columns)), origin="lower", interpolation="none",
+        extent=(west, west + columns * edge, south, south + rows * edge), **{"zorder": 2, **colours},
     )  # fmt: skip
     axes.set(xlim=place.view[0], ylim=place.view[1])
     return shown
@@ -488,12 +526,10 @@ def draw_beams(panels: Sequence[tuple[str, Any, Any]], codebooks: tuple[int, int
         rows = max(codebooks[1], *(int(rx.max()) + 1 for _, _, rx in panels))
         grids = [np.bincount(rx * columns + tx, minlength=rows * columns) for _, tx, rx in panels]
         most = max(int(grid.max()) for grid in grids)
-        # Equal squares where they are few and the picture stays a picture; else as wide as there is room.
-        aspect = "equal" if 0.2 < rows / columns < 1.2 else "auto"
         found = _panels(drawn, len(panels))
         for axes, (title, _, _), grid in zip(found, panels, grids, strict=True):
             shown = axes.imshow(
-                np.ma.masked_equal(grid.reshape(rows, columns), 0), origin="lower", aspect=aspect,
+                np.ma.masked_equal(grid.reshape(rows, columns), 0), origin="lower", aspect="auto",
                 interpolation="none", cmap=theme.colours, norm=LogNorm(0.9, max(most, 2)),
             )  # fmt: skip
             for axis in (axes.xaxis, axes.yaxis):

@@ -54,9 +54,6 @@ from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, wi
 from caviar_protocol.errors import AssetError
 from caviar_services.mesh.scenery import find_scenery, read_scenery
 
-PAGE = "look.html"
-"""Name of the page in the folder of a dataset."""
-
 CLASSES = 12
 """Classes of objects with a bar of their own at most."""
 
@@ -101,7 +98,7 @@ def write_page(dataset: Path, out: Path | None = None, progress: Progress = _qui
         PosixPath('data/s008/look.html')
     """
     data = Dataset(dataset)  # before anything is written: a folder that is no dataset stays as it is
-    file = out or dataset / PAGE
+    file = out or DatasetDirectory(dataset).page
     with reserved(file):
         write_file(file, page(data, progress))
     return file
@@ -323,14 +320,15 @@ def _coverage(content: _Content) -> Iterator[str]:
     place = map_of(users, content.footprints, content.sample.transmitters)
     gains = users.gain_db[placed & np.isfinite(users.gain_db)]
     span = f", from {decimal(gains.min())} dB to {decimal(gains.max())} dB" if len(gains) else ""
-    lacking = int((placed & ~np.isfinite(users.gain_db)).sum())
-    without = (
-        f" {counted(lacking, 'user')} without a path {'is a cross' if lacking == 1 else 'are crosses'}."
-        if lacking
-        else ""
-    )
     buildings = "outlines of buildings" if content.footprints is not None else "no buildings"
     height = map_height(place)
+    dots = place.dots is not None
+    where = "at each place, to 0.1 m" if dots else f"in cells of {cell_m(place):g} m"
+    lacking = int((placed & ~np.isfinite(users.gain_db)).sum())
+    without = ""
+    if lacking:
+        marked = "a cross stands" if dots else "cells are grey"
+        without = f" {counted(lacking, 'user')} had no path; {marked} where nobody had one."
     yield figure(
         picture(
             draw_gain(users, place),
@@ -338,7 +336,8 @@ def _coverage(content: _Content) -> Iterator[str]:
             height,
             map_like=True,
         ),
-        f"Where the {number} were, coloured by gain: the sum of |a|² over the paths{span}.{without}",
+        f"Where the {number} were, coloured by the median gain {where}. Gain is the sum of |a|² over the "
+        f"paths{span}.{without}",
     )
     share = float(users.los[placed].mean())
     yield figure(
@@ -395,12 +394,12 @@ def _sight(content: _Content) -> Iterator[str]:
     each = np.array([number for (number,) in scenes])
     yield figure(
         picture(
-            draw_counts([("Receivers of a scene", each), ("Paths of a user", users.paths)]),
-            f"Histograms of receivers of a scene, {each.min()} to {each.max()}, and of paths of a user, "
+            draw_counts([("Users of a scene", each), ("Paths of a user", users.paths)]),
+            f"Histograms of users of a scene, {each.min()} to {each.max()}, and of paths of a user, "
             f"{users.paths.min()} to {users.paths.max()}.",
             3.3,
         ),
-        f"Receivers of a scene on each carrier and for each transmitter, on average {each.mean():.3g}; "
+        f"Users of a scene, receivers for each carrier and transmitter, on average {each.mean():.3g}; "
         f"paths of a user, on average {users.paths.mean():.3g}.",
     )
 
@@ -542,7 +541,7 @@ def _correlation(content: _Content) -> Iterator[str]:
             picture(
                 draw_correlation(sample),
                 "Correlation of the channel matrices of scenes of an episode: a histogram for consecutive "
-                f"scenes, median {median:.3f}, and its fall with the time between the scenes.",
+                f"scenes, median {median:.3f}{later}.",
                 3.4,
             ),
             "|⟨H(k), H(k+1)⟩| / (‖H(k)‖ ‖H(k+1)‖) of the same user in two scenes of "
