@@ -18,7 +18,7 @@ from caviar_clients.datasets import figures, look_data
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
-from caviar_clients.datasets.figures import cell_m, draw_gain, draw_scans, map_of, picture
+from caviar_clients.datasets.figures import cell_m, draw_gain, draw_scans, map_of, picture, scans_height
 from caviar_clients.datasets.look import write_page
 from caviar_clients.datasets.look_data import Scan, UserColumns, read_throughput, read_users
 from caviar_clients.datasets.plan import plan_dataset
@@ -96,7 +96,7 @@ def test_a_page_has_every_section_that_its_recordings_allow(page: Page) -> None:
     assert "delay spread of all users is 0" in page.texts["gain"]
     assert re.search(r"smoke.*3.*12, 4 in each episode.*24: a receiver", page.texts["dataset"], re.DOTALL)
     assert "100.0 %" in page.texts["sight"]
-    assert "all 3 episodes (12 scenes)" in page.texts["angles"]
+    assert "3 recorded episodes (12 scenes)" in page.texts["angles"]
     assert "0.3 s apart" in page.texts["correlation"]
     assert "No episode failed." in page.texts["generation"]
 
@@ -154,8 +154,10 @@ def test_scans_are_drawn_as_points_or_as_a_grid() -> None:
     cells = np.zeros((4, 5))
     cells[1, 2], cells[0, 0] = 1, -2
     grid = Scan("car/top", points[:0], (cells, (0.0, 5.0, 0.0, 4.0)), (2.0, 2.0), none)
-    for scans in ([scan], [scan, grid]):
-        shown = picture(draw_scans(scans), "LIDAR", 4.0, map_like=True)
+    street = Scan("bus/top", points[:0], (np.zeros((2, 20)), (0.0, 20.0, 0.0, 2.0)), (2.0, 2.0), none)
+    assert scans_height([street] * 3) > scans_height([street])
+    for scans in ([scan], [scan, grid], [street, street]):
+        shown = picture(draw_scans(scans), "LIDAR", scans_height(scans), map_like=True)
         assert shown.light.startswith("data:image/png;base64,")
         assert shown.light != shown.dark
         assert 300 < shown.width < 1000
@@ -203,7 +205,7 @@ def test_a_sample_of_many_episodes_is_stated(
 ) -> None:
     monkeypatch.setattr(look_data, "SAMPLE_EPISODES", 2)
     page = Page(write_page(folder, tmp_path / "page.html"))
-    assert "2 of the 3 episodes, drawn with seed 0 (8 scenes)" in page.texts["angles"]
+    assert "2 of the 3 recorded episodes, drawn with seed 0 (8 scenes)" in page.texts["angles"]
 
 
 def test_throughput_leaves_interruptions_out_and_adds_workers_up(tmp_path: Path) -> None:
@@ -236,6 +238,26 @@ def test_failures_are_listed(folder: Path, tmp_path: Path) -> None:
     page = Page(write_page(copy))
     assert "1 episode failed" in page.texts["generation"]
     assert "the <world> ended" in page.texts["generation"]
+
+
+def test_a_catalogue_without_recordings_has_its_tables_on_the_page(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "catalogue.sqlite", tmp_path)
+    page = Page(write_page(tmp_path))
+    assert "recordings of 3 episodes are not in the folder" in page.texts["dataset"]
+    assert page.pictures == {"coverage": 2, "sight": 2, "gain": 1, "beams": 1, "generation": 2}
+    assert "No recording is in the folder" in page.texts["correlation"]
+
+
+def test_a_dataset_without_an_episode_says_so(tmp_path: Path) -> None:
+    out = make(tmp_path / "d", 0, 1)
+    catalogue = Catalogue(DatasetDirectory(out).catalogue, writable=True)
+    catalogue.add_failure(0, "2026-11-24T00:00:00", "no <world>", "host")
+    catalogue.close()
+    page = Page(write_page(out))
+    assert page.pictures == {}
+    assert all("No episode is there yet." in page.texts[name] for name in SECTIONS[1:-1])
+    assert "no <world>" in page.texts["generation"]
+    assert "smoke" in page.texts["dataset"]
 
 
 def test_a_folder_that_is_no_dataset_stays_as_it_is(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ from caviar_clients.datasets.figures import (
     map_of,
     picture,
     pixels,
+    scans_height,
 )
 from caviar_clients.datasets.look_data import (
     SAMPLE_SCENES,
@@ -127,7 +128,9 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
         content = _Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
         sections = list[Section]()
         for at, (name, title, make) in enumerate(_SECTIONS):
-            sections.append(Section(name, title, "\n".join(make(content))))
+            some = len(data) or name in ("dataset", "generation")
+            parts = make(content) if some else [absent("No episode is there yet.")]
+            sections.append(Section(name, title, "\n".join(parts)))
             progress("sections of the page", at + 1, len(_SECTIONS))
     finally:
         catalogue.close()
@@ -176,7 +179,7 @@ def _what_it_is(content: _Content) -> Iterator[str]:
     )
     planned = catalogue.planned
     of_planned = f" of {planned:,} that are planned" if planned > episodes else ""
-    each = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    each = f"{least}" if least == most else f"{least:,} to {most:,}"
     carried = f", on {objects:,} objects" if objects else ""
     versioned = [f"{name} {versions[name]}" for name in _MAIN_VERSIONS if name in versions]
     known = {
@@ -195,6 +198,11 @@ def _what_it_is(content: _Content) -> Iterator[str]:
         "Versions": ", ".join(versioned) or "not kept",
     }
     yield facts(known)
+    if gone := episodes - content.sample.there:
+        yield absent(
+            f"The recordings of {counted(gone, 'episode')} are not in the folder: of them there is what the "
+            "catalogue says."
+        )
     yield from _products(catalogue)
     yield from _carriers_and_devices(scenario)
     yield from _services(scenario)
@@ -528,6 +536,8 @@ def _correlation(content: _Content) -> Iterator[str]:
         yield absent("No channel is recorded: there is nothing to compare.")
     elif (most or 0) < 2:
         yield absent("Episodes have one scene: there are no consecutive scenes to compare.")
+    elif not sample.episodes:
+        yield absent("No recording is in the folder: there is nothing to compare.")
     elif not sample.has_h:
         yield absent("The matrices H are not recorded (channel.h): they cannot be compared.")
     elif not any(sample.consecutive):
@@ -552,12 +562,12 @@ def _correlation(content: _Content) -> Iterator[str]:
 
 def _sampled(content: _Content) -> str:
     """The sample in words."""
-    sample, there = content.sample, len(content.data)
-    episodes = f"all {there:,} episodes" if len(sample.episodes) == there else (
-        f"{len(sample.episodes):,} of the {there:,} episodes, drawn with seed 0"
-    )  # fmt: skip
+    sample, read = content.sample, len(content.sample.episodes)
+    episodes = counted(read, "recorded episode")
+    if read < sample.there:
+        episodes = f"{read:,} of the {counted(sample.there, 'recorded episode')}, drawn with seed 0"
     first = f", of each the first {SAMPLE_SCENES} scenes" if sample.cut else ""
-    return f"{episodes} ({sample.scenes:,} scenes{first})"
+    return f"{episodes} ({counted(sample.scenes, 'scene')}{first})"
 
 
 # --- sensors ---------------------------------------------------------------------------------------------
@@ -572,7 +582,7 @@ def _lidar(content: _Content) -> Iterator[str]:
     else:
         grid = any(scan.grid is not None for scan in scans)
         what = (
-            "cells of the occupancy grid: obstacles, transmitters and receivers stand out"
+            "what stands in the cells of the occupancy grid, at any height"
             if grid
             else "hits, coloured by their height, with the outlines of moving objects"
         )
@@ -581,29 +591,34 @@ def _lidar(content: _Content) -> Iterator[str]:
             picture(
                 draw_scans(scans),
                 f"LIDAR scans from above ({what}): {titles}.",
-                4.4 if len(scans) > 1 else 6.0,
+                scans_height(scans),
                 map_like=True,
             ),
-            f"Scans from above: {what}. The star is the sensor.",
+            f"Scans from above: {what}.",
         )
 
 
-_KINDS = {"picture": "Picture", "depth": "Depth, near is bright", "objects": "Objects, strong colours move"}
+_KINDS = {"picture": "picture", "depth": "depth, near is bright", "objects": "objects, strong colours move"}
 
 
 def _cameras(content: _Content) -> Iterator[str]:
+    shots = content.sample.shots
     if not content.topics & {"camera", "depth", "segmentation"}:
         yield absent("No camera is recorded.")
         return
-    if not content.sample.shots:
+    if not shots:
         yield absent(f"No camera has a picture in {_sampled(content)}.")
-    for shot in content.sample.shots:
-        yield f"<h3>{escape(shot.sensor)}: {escape(shot.moment)}</h3>"
-        yield '<div class="row">'
-        for kind, image in shot.images.items():
-            alt = f"{_KINDS[kind]}: camera {shot.sensor}, {shot.moment}."
-            yield figure(pixels(image, alt), _KINDS[kind])
-        yield "</div>"
+    for moment in dict.fromkeys(shot.moment for shot in shots):
+        yield f"<h3>{escape(moment[:1].upper() + moment[1:])}</h3>"
+        seen = [shot for shot in shots if shot.moment == moment]
+        rows = [seen] if all(len(shot.images) == 1 for shot in seen) else [[shot] for shot in seen]
+        for row in rows:
+            yield '<div class="row">'
+            for shot in row:
+                for kind, image in shot.images.items():
+                    alt = f"Camera {shot.sensor}, {_KINDS[kind]}: {moment}."
+                    yield figure(pixels(image, alt), f"{shot.sensor}: {_KINDS[kind]}")
+            yield "</div>"
 
 
 # --- generation ------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.plots.sensors import object_colours
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
@@ -259,9 +260,11 @@ class Sample:
 
     Args:
         episodes: Numbers of the episodes.
+        there: Of how many they are drawn.
     """
 
     episodes: tuple[int, ...]
+    there: int
     scenes: int = 0
     cut: bool = False
     """Whether the episodes have more scenes than were read."""
@@ -294,10 +297,11 @@ def read_sample(data: Dataset, topics: set[str], progress: Progress) -> Sample:
     Raises:
         RecordingError: A recording cannot be read.
     """
-    numbers = sorted(data.episodes)
-    if len(numbers) > SAMPLE_EPISODES:
+    on_disk = set(DatasetDirectory(data.path).finished())
+    there = numbers = sorted(on_disk.intersection(data.episodes))
+    if len(there) > SAMPLE_EPISODES:
         numbers = sorted(random.Random(0).sample(numbers, SAMPLE_EPISODES))  # noqa: S311 - no secret
-    sample = Sample(tuple(numbers))
+    sample = Sample(tuple(numbers), there=len(there))
     for at, number in enumerate(numbers):
         recording = data.episode(number)
         sample.cut |= len(recording) > SAMPLE_SCENES

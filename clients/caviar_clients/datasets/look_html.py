@@ -123,7 +123,8 @@ summary { cursor: pointer; color: var(--link); }
 figure { margin: 1.2rem 0 1.8rem; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
 figcaption { font-size: .9rem; margin-top: .5rem; }
-.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); gap: 1rem; }
+.row { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem;
+  margin-bottom: 1rem; }
 .row figure { margin: 0; }
 .row img { width: 100%; }
 @media (max-width: 40rem) {
