@@ -23,7 +23,7 @@ from caviar_clients.datasets.look import write_page
 from caviar_clients.datasets.look_data import Scan, UserColumns, read_throughput, read_users
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.scenario import load_scenario
 
 pytest.importorskip("matplotlib", reason="pictures need Matplotlib: extra plot")
@@ -282,6 +282,13 @@ def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> Non
     assert result.exit_code == 0, result.output
     assert result.output.splitlines()[-1] == str(out)
     assert out.stat().st_size > 100_000
+
+
+def test_the_command_names_the_extra_that_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("caviar_clients.cli.shared.has_extra", lambda extra: False)
+    result = CliRunner().invoke(app, ["look", str(folder)])
+    assert isinstance(result.exception, SetupError)
+    assert re.search(r"caviar look needs what is not installed \(plot\); run: .*plot", str(result.exception))
 
 
 def test_a_browser_opens_the_page_without_an_error(folder: Path, page: Page, tmp_path: Path) -> None:
