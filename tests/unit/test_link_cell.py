@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given, random_h, scene_of
 from msgspec.structs import replace
 
+from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ProductError, ScenarioError
-from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
 from caviar_services.link.cell import CellLink
@@ -302,6 +304,48 @@ def two_cells(
 
 def servers(links: list[Link]) -> list[str]:
     return ["".join(tx for tx, serves in zip(x.tx, x.serving, strict=True) if serves) for x in links]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            "average_slots = 50",
+            "has no effect with scheduler 'round-robin'; leave it out, or write scheduler",
+        ),
+        ("average_slots = 100", "average_slots: has no effect"),  # also where it is the default
+        ('rate_model = "capped"\nmcs_table = 1', "mcs_table: has no effect with rate_model 'capped'; leave"),
+        ("target_block_error = 0.2", 'or write rate_model = "nr"'),
+        ("outer_loop_db = 0", "outer_loop_db: has no effect with rate_model 'shannon'"),
+        ("hysteresis_db = 6", "has no effect with association 'best'; leave it out, or write association"),
+        (
+            'sharing = "band"',
+            "sharing: has no effect with users_per_slot 1; leave it out, or write users_per",
+        ),
+    ],
+)
+def test_a_key_without_effect_is_refused_at_its_line(given: str, words: str, tmp_path: Path) -> None:
+    head, table, rest = find_scenario("cell").read_text().partition("[services.link.settings]\n")
+    rest = rest[rest.index("[[services.link.settings.traffic]]") :]
+    path = tmp_path / "my.toml"
+    path.write_text(f"{head}{table}{given}\n{rest}")
+    line = path.read_text().splitlines().index(given.splitlines()[-1]) + 1
+    with pytest.raises(ScenarioError) as refused:
+        checked_scenario(path)
+    assert f"my.toml:{line}: services.link.settings." in str(refused.value)
+    assert words in str(refused.value)
+
+
+def test_keys_with_effect_are_taken() -> None:
+    for settings in (
+        {"scheduler": "proportional-fair", "average_slots": 50.0},
+        {"rate_model": "nr", "mcs_table": 1, "target_block_error": 0.2, "outer_loop_db": 0.5},
+        {"association": "sticky", "hysteresis_db": 6.0},
+        {"users_per_slot": 2, "sharing": "space"},
+    ):
+        CellLink.check_settings(CellSettings(**settings), Place("settings"))
+    with pytest.raises(ScenarioError, match=r"settings\.hysteresis_db: has no effect"):
+        CellLink.check_settings(CellSettings(hysteresis_db=6.0), Place("settings"))
 
 
 COURSE = [(4.0, 1.0), (3.0, 4.0), (2.0, 5.0), (4.0, 3.0), (9.0, 3.0)]

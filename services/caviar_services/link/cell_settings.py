@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -105,6 +105,16 @@ def check_traffic_users(settings: CellSettings, devices: Sequence[DeviceSpec], p
                 raise mine.at(position).error(text)
 
 
+# What a key belongs to: another key, and its value; with other values it has no effect.
+_BELONGS: Mapping[str, tuple[str, str]] = {
+    "average_slots": ("scheduler", "proportional-fair"),
+    "mcs_table": ("rate_model", "nr"),
+    "target_block_error": ("rate_model", "nr"),
+    "outer_loop_db": ("rate_model", "nr"),
+    "hysteresis_db": ("association", "sticky"),
+}
+
+
 def check_cell_settings(settings: CellSettings, place: Place) -> None:
     """Check what the types of settings do not say.
 
@@ -134,3 +144,21 @@ def check_cell_settings(settings: CellSettings, place: Place) -> None:
         raise place.at("max_spectral_efficiency").error(
             f'has no effect with rate_model {settings.rate_model!r}; write rate_model = "capped"'
         )
+    for key, (owner, value) in _BELONGS.items():
+        found = getattr(settings, owner)
+        if found != value and _is_given(settings, key, place):
+            raise place.at(key).error(
+                f'has no effect with {owner} {found!r}; leave it out, or write {owner} = "{value}"'
+            )
+    if settings.users_per_slot == 1 and _is_given(settings, "sharing", place):
+        raise place.at("sharing").error(
+            "has no effect with users_per_slot 1; leave it out, or write users_per_slot = 2 or more"
+        )
+
+
+def _is_given(settings: CellSettings, key: str, place: Place) -> bool:
+    """Whether a key stands in the file; of settings made in Python, whether it is not its default."""
+    return place.source.holds(place.at(key).key) or getattr(settings, key) != getattr(_DEFAULTS, key)
+
+
+_DEFAULTS = CellSettings()
