@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from caviar_clients.cli.shared import (
+    FiguresFile,
     complete_scenario,
     counted,
     print_line,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from caviar_clients.datasets.estimate import Estimate
 
 SHOWN_FAILURES = 10
+SHOWN_FINDINGS = 40
 
 
 def generate_command(
@@ -170,6 +173,42 @@ def look_command(
     with bar:
         file = write_page(dataset, out, progress)
     print_line(console, file)
+
+
+def verify_command(
+    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    json: FiguresFile = None,
+) -> None:
+    """Verify a dataset: its files, its catalogue, and the physics of each scene; status 1 if one is wrong."""
+    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+    from rich.table import Column, Table
+
+    from caviar_clients.cli.shared import write_json
+    from caviar_clients.datasets.verify import as_rows, verify
+
+    console = Console()
+    with progress_bar(console, MofNCompleteColumn(), TimeRemainingColumn(), transient=True) as bar:
+        task = bar.add_task("episodes", total=None)
+        findings = list(verify(dataset, lambda done, total: bar.update(task, completed=done, total=total)))
+    write_json(json, as_rows(findings))
+    if not findings:
+        print_line(console, f"{dataset}: nothing is wrong")
+        return
+    table = Table(
+        Column("episode", justify="right"),
+        Column("scene", justify="right"),
+        *(Column(name, overflow="fold") for name in ("user", "what", "expected", "found")),
+        box=None,
+        pad_edge=False,
+    )
+    for one in findings[:SHOWN_FINDINGS]:
+        scene = "" if one.scene is None else str(one.scene)
+        cells = (str(one.episode), scene, one.user, one.what, one.expected, one.found)
+        table.add_row(*(Text(printable(cell)) for cell in cells))
+    console.print(table)
+    more = f", the first {SHOWN_FINDINGS} are above" if len(findings) > SHOWN_FINDINGS else ""
+    hint = "" if json else "; --json FILE writes all"
+    raise RunError(f"{dataset}: {counted(len(findings), 'finding')}{more}{hint if more else ''}")
 
 
 def _size(count: int) -> str:

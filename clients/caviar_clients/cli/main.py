@@ -12,7 +12,12 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from caviar_clients.cli.datasets import generate_command, look_command, tables_command
+from caviar_clients.cli.datasets import (
+    generate_command,
+    look_command,
+    tables_command,
+    verify_command,
+)
 from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
 from caviar_clients.cli.paper import app as paper
@@ -477,6 +482,7 @@ app.command("generate", rich_help_panel=RUN)(generate_command)
 app.command("train", rich_help_panel=RUN)(train_command)
 app.command("evaluate", rich_help_panel=MEASURE)(evaluate_command)
 app.command("look", rich_help_panel=LOOK)(look_command)
+app.command("verify", rich_help_panel=LOOK)(verify_command)
 app.command("tables", rich_help_panel=LOOK)(tables_command)
 app.command("export-policy", rich_help_panel=OPERATE)(export_command)
 app.command("swap", rich_help_panel=OPERATE)(swap_command)
