@@ -14,13 +14,16 @@ from typer.testing import CliRunner
 
 from caviar_clients.cli.datasets import _remove
 from caviar_clients.cli.main import app
-from caviar_clients.datasets import figures, look_data
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
-from caviar_clients.datasets.figures import cell_m, draw_gain, draw_scans, map_of, picture, scans_height
-from caviar_clients.datasets.look import write_page
-from caviar_clients.datasets.look_data import Scan, UserColumns, read_throughput, read_users
+from caviar_clients.datasets.look import data as look_data
+from caviar_clients.datasets.look import maps
+from caviar_clients.datasets.look.data import Scan, UserColumns, read_throughput, read_users
+from caviar_clients.datasets.look.maps import cell_m, draw_gain, map_of
+from caviar_clients.datasets.look.page import write_page
+from caviar_clients.datasets.look.pictures import picture
+from caviar_clients.datasets.look.scans import draw_scans, scans_height
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_protocol.errors import RecordingError, SetupError
@@ -178,7 +181,7 @@ def test_receivers_that_stand_still_are_one_dot_with_the_median() -> None:
 
 
 def test_many_places_are_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "DOTS", 2)
+    monkeypatch.setattr(maps, "DOTS", 2)
     users = users_at([0.0, 1.0, 30.0, 60.0], [-90.0, -80.0, np.nan, -70.0])
     place = map_of(users, None, set())
     assert place.dots is None

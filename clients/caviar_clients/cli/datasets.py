@@ -19,9 +19,8 @@ from caviar_clients.cli.shared import (
     progress_bar,
     require_installed,
     require_known,
-    scaled,
 )
-from caviar_clients.datasets.texts import duration_text
+from caviar_clients.datasets.texts import bytes_text, duration_text
 from caviar_clients.files import printable
 from caviar_protocol.errors import RunError
 
@@ -117,7 +116,7 @@ def generate_command(
     print_line(
         console,
         f"{counted(outcome.episodes, 'episode')}, {counted(outcome.scenes, 'scene')}, "
-        f"{_size(outcome.bytes)} in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
+        f"{bytes_text(outcome.bytes)} in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
     )
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
@@ -159,7 +158,7 @@ def look_command(
 ) -> None:
     """Write a page of a dataset: what it is, maps, histograms, samples, and how it was generated."""
     require_installed("caviar look", ["plot"])
-    from caviar_clients.datasets.look import write_page
+    from caviar_clients.datasets.look.page import write_page
 
     console = Console()
     bar = progress_bar(console, transient=True)
@@ -209,11 +208,6 @@ def verify_command(
     more = f", the first {SHOWN_FINDINGS} are above" if len(findings) > SHOWN_FINDINGS else ""
     hint = "" if json else "; --json FILE writes all"
     raise RunError(f"{dataset}: {counted(len(findings), 'finding')}{more}{hint if more else ''}")
-
-
-def _size(count: int) -> str:
-    value, unit = scaled(float(count), ("B", "kB", "MB", "GB", "TB"))
-    return f"{value:.3g} {unit}"
 
 
 def _remove(out: Path) -> None:
@@ -273,7 +267,7 @@ class _Screen:
         print_line(
             self._bar.console,
             f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, "
-            f"{_size(found.bytes)} of {_size(free)} that are free",
+            f"{bytes_text(found.bytes)} of {bytes_text(free)} that are free",
         )
         self._began = time.monotonic()
         self._task = self._bar.add_task("episodes", total=episodes, rate="")

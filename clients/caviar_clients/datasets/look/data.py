@@ -15,6 +15,7 @@ import numpy as np
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.reader import Dataset
+from caviar_clients.plots.rays import Footprints
 from caviar_clients.plots.sensors import object_colours
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.recording import RecordedFrame
@@ -434,3 +435,16 @@ def _depth_picture(depth: Any) -> UInt8Array:
 
 def _moment(frame: RecordedFrame) -> str:
     return f"episode {frame.episode}, scene {frame.number}, t = {frame.t_ns * 1e-9:g} s"
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """All that the sections are made of."""
+
+    data: Dataset
+    catalogue: Catalogue
+    topics: set[str]
+    users: UserColumns
+    sample: Sample
+    footprints: Footprints | None
+    scenery_error: str

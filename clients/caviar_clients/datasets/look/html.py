@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
-from caviar_clients.datasets.figures import Picture
+from caviar_clients.datasets.look.pictures import Picture
 
 
 @dataclass(frozen=True)

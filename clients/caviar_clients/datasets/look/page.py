@@ -5,51 +5,45 @@ The file is whole: pictures are in it, nothing is loaded from elsewhere, and it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from html import escape
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.figures import (
-    PANELS,
-    beams_height,
-    cell_m,
-    draw_angles,
-    draw_beams,
-    draw_correlation,
-    draw_counts,
-    draw_gain,
-    draw_histograms,
-    draw_scans,
-    draw_services,
-    draw_shares,
-    draw_sight_map,
-    draw_throughput,
-    lags,
-    map_height,
-    map_of,
-    picture,
-    pixels,
-    scans_height,
-)
-from caviar_clients.datasets.look_data import (
-    SAMPLE_SCENES,
+from caviar_clients.datasets.look.data import (
+    Content,
     Progress,
-    Sample,
     UserColumns,
     read_sample,
     read_throughput,
     read_users,
 )
-from caviar_clients.datasets.look_html import Section, absent, document, facts, figure, folded, table
+from caviar_clients.datasets.look.description import name_of, scenario_of, what_it_is
+from caviar_clients.datasets.look.distributions import (
+    beams_height,
+    draw_angles,
+    draw_beams,
+    draw_correlation,
+    draw_counts,
+    draw_histograms,
+    draw_services,
+    draw_shares,
+    draw_throughput,
+    lags,
+)
+from caviar_clients.datasets.look.html import Section, absent, document, figure, table
+from caviar_clients.datasets.look.maps import cell_m, draw_gain, draw_sight_map, map_height, map_of
+from caviar_clients.datasets.look.pictures import PANELS, picture
+from caviar_clients.datasets.look.scans import (
+    camera_section,
+    lidar_section,
+    sampled,
+)
 from caviar_clients.datasets.reader import Dataset
-from caviar_clients.datasets.texts import bytes_text, counted, decimal, duration_text, percent
+from caviar_clients.datasets.texts import counted, decimal, duration_text, percent
 from caviar_clients.files import reserved, write_file
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_protocol.errors import AssetError
@@ -59,19 +53,6 @@ CLASSES = 12
 """Classes of objects with a bar of their own at most."""
 
 SHOWN_FAILURES = 50
-
-
-@dataclass(frozen=True, eq=False)
-class _Content:
-    """All that the sections are made of."""
-
-    data: Dataset
-    catalogue: Catalogue
-    topics: set[str]
-    users: UserColumns
-    sample: Sample
-    footprints: Footprints | None
-    scenery_error: str
 
 
 def _quiet(_what: str, _done: int, _of: int) -> None:
@@ -125,7 +106,7 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
         topics = {topic for (topic,) in rows}
         found, error = _scenery(data)
         users = read_users(catalogue, progress)
-        content = _Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
+        content = Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
         sections = list[Section]()
         for at, (name, title, make) in enumerate(_SECTIONS):
             some = len(data) or name in ("dataset", "generation")
@@ -134,7 +115,7 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
             progress("sections of the page", at + 1, len(_SECTIONS))
     finally:
         catalogue.close()
-    return document(_name(data), data.path.resolve().name, sections)
+    return document(name_of(data), data.path.resolve().name, sections)
 
 
 def _scenery(data: Dataset) -> tuple[Footprints | None, str]:
@@ -148,172 +129,20 @@ def _scenery(data: Dataset) -> tuple[Footprints | None, str]:
             drawn = footprints((shape.file, shape.to_world) for shape in read_scenery(description).shapes)
     except AssetError as caught:
         error = str(caught)
-    boxes = obstacle_boxes(_scenario(data).get("services"))
+    boxes = obstacle_boxes(scenario_of(data).get("services"))
     return with_boxes(drawn, boxes) if boxes else drawn, error
-
-
-def _scenario(data: Dataset) -> dict[str, Any]:
-    scenario = data.settings.get("scenario")
-    return scenario if isinstance(scenario, dict) else {}
-
-
-def _name(data: Dataset) -> str:
-    return str(_scenario(data).get("run", {}).get("name", "")) or data.path.resolve().name
 
 
 # --- what it is ------------------------------------------------------------------------------------------
 
-_MAIN_VERSIONS = ("caviar-sim", "python", "numpy", "sionna", "sionna-rt", "mitsuba", "drjit", "eclipse-sumo")
-
-
-def _what_it_is(content: _Content) -> Iterator[str]:
-    data, catalogue = content.data, content.catalogue
-    scenario, settings = _scenario(data), data.settings
-    run, versions = scenario.get("run", {}), settings.get("versions", {})
-    _, ((episodes, scenes, size, least, most),) = catalogue.query(
-        "SELECT count(*), coalesce(sum(scenes), 0), coalesce(sum(bytes), 0), min(scenes), max(scenes) "
-        "FROM episodes"
-    )
-    _, ((receivers, objects),) = catalogue.query(
-        "SELECT count(DISTINCT rx), count(DISTINCT nullif(object, '')) FROM users"
-    )
-    planned = catalogue.planned
-    of_planned = f" of {planned:,} that are planned" if planned > episodes else ""
-    each = f"{least}" if least == most else f"{least:,} to {most:,}"
-    carried = f", on {objects:,} objects" if objects else ""
-    versioned = [f"{name} {versions[name]}" for name in _MAIN_VERSIONS if name in versions]
-    known = {
-        "Scenario": _name(data),
-        "Folder": data.path.resolve().name,
-        "Episodes": f"{episodes:,}{of_planned}",
-        "Scenes": f"{scenes:,}" + (f", {each} in each episode" if episodes else ""),
-        "Users": f"{len(content.users):,}: a receiver in a scene, for each carrier and transmitter",
-        "Receivers": f"{receivers:,} by name{carried}",
-        "Size": f"{bytes_text(size)} of recordings, {bytes_text(size / scenes)} for a scene"
-        if scenes
-        else "0 B",
-        "Seed": str(run.get("seed", "not kept")),
-        "Time between scenes": _period(run),
-        "Computed on": str(settings.get("device", "not kept")),
-        "Versions": ", ".join(versioned) or "not kept",
-    }
-    yield facts(known)
-    if gone := episodes - content.sample.there:
-        yield absent(
-            f"The recordings of {counted(gone, 'episode')} are not in the folder: of them there is what the "
-            "catalogue says."
-        )
-    yield from _products(catalogue)
-    yield from _carriers_and_devices(scenario)
-    yield from _services(scenario)
-    others = {name: str(version) for name, version in sorted(versions.items())}
-    if others:
-        yield folded("All versions", table(("package", "version"), others.items()))
-    files = settings.get("files", {})
-    if files:
-        yield folded("Files of the scenario", table(("file", "SHA-256"), files.items(), code=(0, 1)))
-    if scenario:
-        text = msgspec.json.format(msgspec.json.encode(scenario), indent=2).decode()
-        yield folded("The whole scenario", f"<pre>{escape(text)}</pre>")
-
-
-def _period(run: Mapping[str, Any]) -> str:
-    if run.get("instants_s"):
-        return f"as listed in run.instants_s, {len(run['instants_s'])} instants"
-    period = run.get("sampling_period_ns")
-    return f"{period * 1e-9:g} s" if period else "not kept"
-
-
-def _products(catalogue: Catalogue) -> Iterator[str]:
-    _, rows = catalogue.query(
-        "SELECT topic, source, count(*), sum(status = 'held'), sum(status = 'absent'), sum(bytes) "
-        "FROM products GROUP BY topic, source ORDER BY topic, source"
-    )
-    if rows:
-        yield "<h3>What is recorded</h3>"
-        found = [
-            (topic, source, f"{count:,}", f"{held:,}", f"{absent:,}", bytes_text(size))
-            for topic, source, count, held, absent, size in rows
-        ]
-        heads = ("topic", "service", "products", "held", "absent", "before compression")
-        yield table(heads, found, code=(0, 1), right=(2, 3, 4, 5))
-
-
-def _carriers_and_devices(scenario: Mapping[str, Any]) -> Iterator[str]:
-    carriers = [
-        (
-            c.get("name", ""),
-            f"{c.get('frequency_hz', 0) / 1e9:g} GHz",
-            f"{c.get('bandwidth_hz', 0) / 1e6:g} MHz",
-        )
-        for c in scenario.get("carriers", ())
-    ]
-    if carriers:
-        yield "<h3>Carriers</h3>"
-        yield table(("carrier", "frequency", "bandwidth"), carriers, code=(0,), right=(1, 2))
-    devices = [
-        (
-            d.get("name", ""),
-            f"{d.get('kind', '')} {d.get('role', '')}".strip(),
-            d.get("on") or "fixed",
-            _device(d),
-        )
-        for d in scenario.get("devices", ())
-    ]
-    if devices:
-        yield "<h3>Devices</h3>"
-        yield table(("device", "kind", "on", "settings"), devices, code=(0, 2))
-
-
-def _device(device: Mapping[str, Any]) -> str:
-    """What matters of a device of its kind."""
-    array, kind = device.get("array"), device.get("kind")
-    found = []
-    if kind == "antenna" and isinstance(array, dict):
-        rows, columns = array.get("rows", 1), array.get("columns", 1)
-        found.append(f"{rows} × {columns} elements")
-        found += [f"{key} {value}" for key, value in array.items() if key not in ("rows", "columns")]
-        if device.get("role") == "tx":
-            found.append(f"{device.get('power_dbm', 0):g} dBm")
-    elif kind == "antenna":
-        found.append("1 × 1 elements")
-    if kind == "camera":
-        width, height = device.get("size_px", (0, 0))
-        found.append(f"{width} × {height} pixels, {device.get('field_of_view_deg', 0):g}°")
-    if kind == "lidar":
-        reach = device.get("range_m", (0.0, 0.0))
-        found.append(f"{device.get('beams')} beams × {device.get('azimuth_steps')}, up to {reach[1]:g} m")
-    if device.get("count", 1) != 1:
-        found.append(f"at most {device['count']}")
-    return ", ".join(found)
-
-
-def _services(scenario: Mapping[str, Any]) -> Iterator[str]:
-    rows = [
-        (name, spec.get("role", ""), spec.get("use", ""), _settings(spec.get("settings", {})))
-        for name, spec in scenario.get("services", {}).items()
-    ]
-    if rows:
-        yield "<h3>Services</h3>"
-        yield table(("service", "role", "implementation", "settings"), rows, code=(0, 2))
-
-
-def _settings(settings: Mapping[str, Any]) -> str:
-    """Settings as ``key = value``; what is long is only counted, and stands in the whole scenario."""
-    found = []
-    for key, value in settings.items():
-        text = msgspec.json.encode(value).decode()
-        long = len(text) > 80 and isinstance(value, list | tuple | dict)
-        found.append(f"{key}: {len(value)} entries" if long else f"{key} = {text}")
-    return ", ".join(found)
-
-
-# --- coverage and paths ----------------------------------------------------------------------------------
-
 _NO_CHANNEL = "No channel is recorded: there are no users."
 
 
-def _coverage(content: _Content) -> Iterator[str]:
+def _what_it_is(content: Content) -> Iterator[str]:
+    return what_it_is(content.data, content.catalogue, len(content.users), content.sample.there)
+
+
+def _coverage(content: Content) -> Iterator[str]:
     users = content.users
     if not len(users):
         yield absent(_NO_CHANNEL)
@@ -360,7 +189,7 @@ def _coverage(content: _Content) -> Iterator[str]:
     )
 
 
-def _sight(content: _Content) -> Iterator[str]:
+def _sight(content: Content) -> Iterator[str]:
     users = content.users
     if not len(users):
         yield absent(_NO_CHANNEL)
@@ -416,7 +245,7 @@ def _class(name: str) -> str:
     return name or "(stands still)"
 
 
-def _gain(content: _Content) -> Iterator[str]:
+def _gain(content: Content) -> Iterator[str]:
     users = content.users
     some = np.isfinite(users.gain_db)
     if not len(users):
@@ -464,12 +293,12 @@ def _rows_height(panels: int) -> float:
     return 3.0 * (-(-panels // 2)) + 0.5
 
 
-def _angles(content: _Content) -> Iterator[str]:
+def _angles(content: Content) -> Iterator[str]:
     sample = content.sample
     if "channel" not in content.topics:
         yield absent("No channel is recorded: there are no angles.")
     elif not sample.paths:
-        yield absent(f"No path is in {_sampled(content)}: there are no angles.")
+        yield absent(f"No path is in {sampled(content)}: there are no angles.")
     else:
         yield figure(
             picture(
@@ -478,12 +307,12 @@ def _angles(content: _Content) -> Iterator[str]:
                 "paths and of the strongest path of each user.",
                 5.6,
             ),
-            f"{sample.paths:,} paths of {_sampled(content)}. Angles are in world axes: zenith from +z, "
+            f"{sample.paths:,} paths of {sampled(content)}. Angles are in world axes: zenith from +z, "
             "azimuth counter-clockwise from +x (east); arrival is the direction that the wave comes from.",
         )
 
 
-def _beams(content: _Content) -> Iterator[str]:
+def _beams(content: Content) -> Iterator[str]:
     users = content.users
     if "link" not in content.topics:
         yield absent("No link is recorded: the best beams are not known.")
@@ -520,16 +349,16 @@ def _beams(content: _Content) -> Iterator[str]:
     )
 
 
-def _codebook(content: _Content, role: str) -> int:
+def _codebook(content: Content, role: str) -> int:
     """Beams that the largest array of this role has at least."""
     sizes = [1]
-    for device in _scenario(content.data).get("devices", ()):
+    for device in scenario_of(content.data).get("devices", ()):
         if device.get("role") in (role, "both") and isinstance(array := device.get("array"), dict):
             sizes.append(array.get("rows", 1) * array.get("columns", 1))
     return max(sizes)
 
 
-def _correlation(content: _Content) -> Iterator[str]:
+def _correlation(content: Content) -> Iterator[str]:
     sample = content.sample
     _, ((most,),) = content.catalogue.query("SELECT max(scenes) FROM episodes")
     if "channel" not in content.topics:
@@ -555,76 +384,12 @@ def _correlation(content: _Content) -> Iterator[str]:
                 3.4,
             ),
             "|⟨H(k), H(k+1)⟩| / (‖H(k)‖ ‖H(k+1)‖) of the same user in two scenes of "
-            f"{_sampled(content)}: 1 where the channel has not changed but for a factor. Median of the "
+            f"{sampled(content)}: 1 where the channel has not changed but for a factor. Median of the "
             f"{len(values):,} pairs of consecutive scenes {median:.3f}{later}.",
         )
 
 
-def _sampled(content: _Content) -> str:
-    """The sample in words."""
-    sample, read = content.sample, len(content.sample.episodes)
-    episodes = counted(read, "recorded episode")
-    if read < sample.there:
-        episodes = f"{read:,} of the {counted(sample.there, 'recorded episode')}, drawn with seed 0"
-    first = f", of each the first {SAMPLE_SCENES} scenes" if sample.cut else ""
-    return f"{episodes} ({counted(sample.scenes, 'scene')}{first})"
-
-
-# --- sensors ---------------------------------------------------------------------------------------------
-
-
-def _lidar(content: _Content) -> Iterator[str]:
-    scans = content.sample.scans
-    if "lidar" not in content.topics:
-        yield absent("No LIDAR is recorded.")
-    elif not scans:
-        yield absent(f"No scan in {_sampled(content)} has points or a grid.")
-    else:
-        grid = any(scan.grid is not None for scan in scans)
-        what = (
-            "what stands in the cells of the occupancy grid, at any height"
-            if grid
-            else "hits, coloured by their height, with the outlines of moving objects"
-        )
-        titles = "; ".join(scan.title.replace("\n", ", ") for scan in scans)
-        yield figure(
-            picture(
-                draw_scans(scans),
-                f"LIDAR scans from above ({what}): {titles}.",
-                scans_height(scans),
-                map_like=True,
-            ),
-            f"Scans from above: {what}.",
-        )
-
-
-_KINDS = {"picture": "picture", "depth": "depth, near is bright", "objects": "objects, strong colours move"}
-
-
-def _cameras(content: _Content) -> Iterator[str]:
-    shots = content.sample.shots
-    if not content.topics & {"camera", "depth", "segmentation"}:
-        yield absent("No camera is recorded.")
-        return
-    if not shots:
-        yield absent(f"No camera has a picture in {_sampled(content)}.")
-    for moment in dict.fromkeys(shot.moment for shot in shots):
-        yield f"<h3>{escape(moment[:1].upper() + moment[1:])}</h3>"
-        seen = [shot for shot in shots if shot.moment == moment]
-        rows = [seen] if all(len(shot.images) == 1 for shot in seen) else [[shot] for shot in seen]
-        for row in rows:
-            yield '<div class="row">'
-            for shot in row:
-                for kind, image in shot.images.items():
-                    alt = f"Camera {shot.sensor}, {_KINDS[kind]}: {moment}."
-                    yield figure(pixels(image, alt), f"{shot.sensor}: {_KINDS[kind]}")
-            yield "</div>"
-
-
-# --- generation ------------------------------------------------------------------------------------------
-
-
-def _generation(content: _Content) -> Iterator[str]:
+def _generation(content: Content) -> Iterator[str]:
     found = read_throughput(content.catalogue)
     if found is None:
         yield absent("No times are kept: how fast the episodes were played is not known.")
@@ -677,7 +442,7 @@ def _generation(content: _Content) -> Iterator[str]:
         )
 
 
-_SECTIONS: tuple[tuple[str, str, Callable[[_Content], Iterator[str]]], ...] = (
+_SECTIONS: tuple[tuple[str, str, Callable[[Content], Iterator[str]]], ...] = (
     ("dataset", "What it is", _what_it_is),
     ("coverage", "Coverage", _coverage),
     ("sight", "Line of sight and paths", _sight),
@@ -685,7 +450,7 @@ _SECTIONS: tuple[tuple[str, str, Callable[[_Content], Iterator[str]]], ...] = (
     ("angles", "Angles", _angles),
     ("beams", "Best beams", _beams),
     ("correlation", "Correlation of consecutive scenes", _correlation),
-    ("lidar", "LIDAR", _lidar),
-    ("cameras", "Cameras", _cameras),
+    ("lidar", "LIDAR", lidar_section),
+    ("cameras", "Cameras", camera_section),
     ("generation", "Generation", _generation),
 )
