@@ -65,6 +65,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "broker.md",
         {"broker-transports": ""},
     ),
+    "datasets": Measurement(
+        "python tests/bench/bench_datasets.py --seconds 20 --markdown {out}/datasets.md",
+        "python tests/bench/bench_datasets.py --markdown {out}/datasets.md",
+        "datasets.md",
+        {"dataset-costs": "Cost of scenes", "dataset-workers": "Scenes a second"},
+    ),
     "detail": Measurement(
         "python tests/bench/bench_detail.py --frames 10 --rounds 1 --markdown {out}/detail.md",
         "python tests/bench/bench_detail.py --markdown {out}/detail.md",

@@ -183,17 +183,18 @@ def tables(costs: Sequence[Cost], dispatch: float, disk: float) -> str:
     lines = [
         "## Cost of scenes",
         "",
-        "| preset | s a scene | core-hours, 1e6 | 1e9 | kB a scene | TB, 1e6 | 1e9 | most of the time |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |",
+        "| preset | s a scene | kB a scene | 1e6 scenes | 1e9 scenes | most of the time |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
     ]
     for cost in costs:
-        hours = cost.scene_s * 1e6 / 3600
-        size = cost.bytes * 1e6 / 1e12
-        lines.append(
-            f"| `{cost.preset}` | {cost.scene_s:.3f} | {hours:,.0f} | {hours * 1e3:,.0f} | "
-            f"{cost.bytes / 1e3:.0f} | {size:.2f} | {size * 1e3:,.0f} | {cost.greatest} |"
+        million = cost.scene_s * 1e6 / 3600, cost.bytes * 1e6 / 1e12
+        totals = " | ".join(
+            f"{million[0] * more:,.0f} core-hours, {million[1] * more:,.2f} TB" for more in (1, 1000)
         )
-    heads = " | ".join(f"{workers:,} workers" for workers in WORKERS)
+        lines.append(
+            f"| `{cost.preset}` | {cost.scene_s:.3f} | {cost.bytes / 1e3:.0f} | {totals} | {cost.greatest} |"
+        )
+    heads = " | ".join(f"{workers:,} worker{'s' * (workers > 1)}" for workers in WORKERS)
     lines += [
         "",
         "## Scenes a second",

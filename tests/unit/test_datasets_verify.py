@@ -25,6 +25,7 @@ from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.verify import verify
 from caviar_protocol.arrays import Payload
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
@@ -111,6 +112,11 @@ def test_recording_an_episode_anew_is_no_fault_by_itself(data: Path) -> None:
     assert found(data) == []
 
 
+PATH_AXES = {
+    "id": 0, "a": 1, "tau": 0, "aod": 0, "aoa": 0, "doppler": 1, "interactions": 0, "points": 0, "objects": 0
+}  # fmt: skip
+"""Fields of a channel with a row for each path, and which axis that is."""
+
 CONTENT: dict[str, tuple[str, Callable[[Any], Payload], str, str]] = {
     "the sign of an angle": (
         "channel",
@@ -129,6 +135,18 @@ CONTENT: dict[str, tuple[str, Callable[[Any], Payload], str, str]] = {
         of_channel(tau=lambda c: changed(c.tau, 0, lambda tau: tau * 0.99)),
         "car/rx",
         "delay",
+    ),
+    "a free line of sight without a path": (
+        "channel",
+        of_channel(
+            offsets=lambda c: np.maximum(c.offsets - 1, 0),
+            **{
+                name: lambda c, name=name, axis=axis: np.delete(getattr(c, name), 0, axis)
+                for name, axis in PATH_AXES.items()
+            },
+        ),
+        "car/rx",
+        "line of sight",
     ),
     "swapped beams": (
         "link",
@@ -309,3 +327,34 @@ def test_the_command_says_what_is_wrong_and_fails(data: Path, tmp_path: Path) ->
             "found": "0",
         }
     ]
+
+
+def test_a_product_that_is_held_is_no_fault(data: Path) -> None:
+    """It is that of an earlier scene, in which positions were others."""
+    folder = DatasetDirectory(data).episode(1)
+    recording = Recording(folder)
+    frames = []
+    earlier: dict[str, Payload] = {}
+    for one in recording.frames():
+        held = {"channel", "link"} if one.number == 3 else set()
+        inputs = tuple(
+            product(p.provenance.topic, p.provenance.source, p.payload, one.number)
+            if p.provenance.topic not in held
+            else product(
+                p.provenance.topic,
+                p.provenance.source,
+                earlier[p.provenance.topic],
+                2,
+                Status.HELD,
+                used_in=3,
+            )
+            for p in one.products
+        )
+        earlier = {p.provenance.topic: p.payload for p in one.products}
+        frames.append(frame(one.number, *inputs, episode=1, seed=one.entry.seed))
+    shutil.rmtree(folder)
+    record(folder, frames, assets={})
+    catalogue = Catalogue(DatasetDirectory(data).catalogue, writable=True)
+    catalogue.add(rows_of(Recording(folder)), {})
+    catalogue.close()
+    assert found(data) == []

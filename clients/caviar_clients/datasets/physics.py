@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -25,10 +25,14 @@ from caviar_services.link.beam_sweep import best_pairs, sweep
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_services.world.scenery import scenery_triangles
 
+T = TypeVar("T", Channel, Link)
+
 GAIN_DB = 0.5
 """Of a line of sight from free space; air and foliage take no more over a street."""
 GREATEST_ELEMENT_DB = 8.0
-"""Gain of the strongest built-in element at each end (3GPP TR 38.901, 8 dBi)."""
+"""Gain of the strongest built-in element (3GPP TR 38.901, 8 dBi)."""
+TRACED = ("siso-rt", "spherical", "mimo-rt")
+"""Rungs on which something can hide a line of sight."""
 DELAY = 1e-6
 """Relative, of delays from lengths."""
 ANGLE_RAD = 1e-4
@@ -68,15 +72,6 @@ class PhysicsChecks:
     def __init__(self, assets: Path, settings: dict[str, Any]) -> None:
         files = {str(file.relative_to(assets)): file for file in sorted(assets.rglob("*")) if file.is_file()}
         self._surfaces: Surfaces | None = None
-        services = settings.get("scenario", {}).get("services", {})
-        channels = [spec for spec in services.values() if spec.get("role") == "channel"]
-        self._rung_occludes = bool(channels) and all(
-            "sionna" in spec.get("use", "") or "adaptive" in spec.get("use", "") for spec in channels
-        )
-        # The geometric model draws its paths, and free space has no other.
-        self._by_formula = bool(channels) and all(
-            spec.get("use") in ("sionna-rt", "free-space") for spec in channels
-        )
         try:
             triangles = scenery_triangles(dict(files))
         except AssetError:
@@ -85,7 +80,7 @@ class PhysicsChecks:
             self._surfaces = Surfaces(triangles, outside=lambda number, normal: True)
         self._free: FreeSpaceChannel | None = None
         carriers = _carriers(settings)
-        if carriers and self._by_formula:
+        if carriers:
             run = RunInfo(name="free-space", carriers=carriers)
             self._free = FreeSpaceChannel(FreeSpaceSettings(), run)
             self._free.prepare(
@@ -106,9 +101,10 @@ class PhysicsChecks:
             if before is not None:
                 yield from _continuity(*before, frame, scene)
             before = frame, scene
-            for channel in frame.payloads("channel", Channel).values():
+            # A held product is that of an earlier scene, where it was looked at.
+            for channel in _fresh(frame, "channel", Channel):
                 yield from self._channel(frame, scene, channel)
-                for link in frame.payloads("link", Link).values():
+                for link in _fresh(frame, "link", Link):
                     yield from _beams(frame, scene, channel, link)
 
     def _channel(self, frame: RecordedFrame, scene: Scene, channel: Channel) -> Iterator[Finding]:
@@ -126,8 +122,10 @@ class PhysicsChecks:
                     continue
                 cut = _cut(channel, t, r)
                 yield from self._sight(place, scene, channel, (t, r), at[tx], at[rx])
-                if self._by_formula:
-                    yield from _lengths(place, channel, cut, rx, at[tx], at[rx])
+                if channel.rung == "geometric":  # it draws its paths
+                    continue
+                bound = _bound_db(devices[tx]) + _bound_db(devices[rx])
+                yield from _lengths(place, channel, cut, rx, at[tx], at[rx], bound)
                 if free is not None and free.tx == channel.tx and free.rx == channel.rx:
                     yield from _line_of_sight(place, channel, free, t, r)
         yield from _reciprocity(place, channel)
@@ -156,7 +154,7 @@ class PhysicsChecks:
         end: Float64Array,
     ) -> Iterator[Finding]:
         """A line of sight that is hidden for sure and said to be free, or the other way round."""
-        if not self._rung_occludes:
+        if channel.rung not in TRACED:
             return
         is_free = bool(channel.los[pair])
         hidden = self._hidden(scene, start, end)
@@ -192,6 +190,17 @@ class PhysicsChecks:
         return decided.pop() if len(decided) == 1 else None
 
 
+def _fresh(frame: RecordedFrame, topic: str, cls: type[T]) -> list[T]:
+    """Products of a topic that were computed for this scene."""
+    return [
+        product.payload
+        for product in frame.products
+        if product.provenance.topic == topic
+        and product.provenance.status is Status.FRESH
+        and isinstance(product.payload, cls)
+    ]
+
+
 def _carriers(settings: dict[str, Any]) -> tuple[Carrier, ...]:
     """The carriers of a dataset; none where the settings are not of this version."""
     try:
@@ -200,13 +209,24 @@ def _carriers(settings: dict[str, Any]) -> tuple[Carrier, ...]:
         return ()
 
 
+def _bound_db(device: AntennaDevice) -> float:
+    """Greatest gain of an element [dB]; without a bound where a file says it."""
+    return math.inf if device.array.pattern_file else GREATEST_ELEMENT_DB
+
+
 def _cut(channel: Channel, t: int, r: int) -> slice:
     pair = t * len(channel.rx) + r
     return slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
 
 
 def _lengths(
-    place: tuple[int, int], channel: Channel, cut: slice, rx: str, start: Float64Array, end: Float64Array
+    place: tuple[int, int],
+    channel: Channel,
+    cut: slice,
+    rx: str,
+    start: Float64Array,
+    end: Float64Array,
+    bound: float,
 ) -> Iterator[Finding]:
     """Paths shorter than the straight line, or stronger than free space over their length."""
     tau = channel.tau[cut]
@@ -218,8 +238,7 @@ def _lengths(
     for c, carrier in enumerate(channel.carriers):
         friis = SPEED_OF_LIGHT / carrier.frequency_hz / (4 * math.pi * SPEED_OF_LIGHT * tau)
         over = 20 * np.log10(np.maximum(np.abs(channel.a[c, cut]), 1e-300) / friis)
-        if over.max() > 2 * GREATEST_ELEMENT_DB + GAIN_DB:
-            bound = 2 * GREATEST_ELEMENT_DB
+        if over.max() > bound + GAIN_DB:
             yield Finding(
                 *place, rx, "path gain", f"at most {bound:.1f} dB above free space", f"{over.max():.1f} dB"
             )
@@ -236,7 +255,7 @@ def _line_of_sight(
         return
     rx = channel.rx[r]
     if not len(direct):
-        if channel.los[t, r] and channel.options.los and cut.stop > cut.start:
+        if channel.los[t, r] and channel.options.los:
             yield Finding(*place, rx, "line of sight", "a direct path", "none")
         return
     path, line = cut.start + int(direct[0]), right.start
@@ -250,7 +269,9 @@ def _line_of_sight(
             yield Finding(*place, rx, name, _angles(expected), _angles(got))
     for c, carrier in enumerate(channel.carriers):
         ratio = 20 * math.log10(max(abs(channel.a[c, path]), 1e-300) / max(abs(free.a[c, line]), 1e-300))
-        if abs(ratio) > GAIN_DB and abs(free.a[c, line]) > 1e-30:
+        lossy = bool(channel.options.foliage or channel.options.absorption_db_per_km)
+        is_wrong = ratio > GAIN_DB or (ratio < -GAIN_DB and not lossy)
+        if is_wrong and abs(free.a[c, line]) > 1e-30:
             expected_db = 20 * math.log10(abs(free.a[c, line]))
             what = f"gain of the line of sight, {carrier.name}"
             yield Finding(*place, rx, what, f"{expected_db:.2f} dB", f"{expected_db + ratio:.2f} dB")
