@@ -76,7 +76,7 @@ def measure(name: str, seconds: float, out: Path) -> Cost:
     plan = plan_dataset(scenario, episodes=preset.episodes)
     directory = DatasetDirectory(out / name)
     traffic = SharedTraffic(plan.scenario)
-    many = min(preset.episodes, 500)
+    many = min(preset.episodes, 60)
     traffic.save(many)
     results = list[tuple[EpisodeRows, dict[str, Any]]]()
     catalogue_s = list[float]()
