@@ -38,8 +38,8 @@ class EngineAxes:
 
     Args:
         name: Of the engine.
-        world: 3 × 3, takes a direction in ENU to the engine's world axes; its determinant is −1 where these are
-            left-handed.
+        world: 3 × 3, takes a direction in ENU to the engine's world axes; its determinant is −1 where these
+            are left-handed.
         body: The same from a body's axes (forward, left, up) to the engine's.
         unit: Length in the engine of 1 m.
 
@@ -146,8 +146,8 @@ ENGINES = {axes.name: axes for axes in (UNREAL, UNITY, GODOT, NED)}
 def _conjugated(q: Sequence[float], world: Float64Array, body: Float64Array) -> UnitQuaternion:
     """Orientation in other axes: W·R·Bᵀ as a quaternion, w ≥ 0.
 
-    With W = s·P and B = s·Q, where P and Q are rotations and s = ±1 is their determinant, it is P·R·Qᵀ: the sign
-    cancels.
+    With W = s·P and B = s·Q, where P and Q are rotations and s = ±1 is their determinant, it is P·R·Qᵀ: the
+    sign cancels.
     """
     hand = float(round(np.linalg.det(world)))
     w, x, y, z = multiply(multiply(_quaternion(hand * world), q), _inverse(_quaternion(hand * body)))
