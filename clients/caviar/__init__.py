@@ -123,7 +123,7 @@ def dataset(path: str | Path) -> Dataset:
     """Open a dataset that ``caviar generate`` wrote.
 
     Args:
-        path: Folder of the dataset.
+        path: Folder of the dataset, or its address (``s3://bucket/s008``).
 
     Returns:
         The dataset: tables as columns (``data.users(los=True)["gain_db"]``), recorded arrays a row for each

@@ -13,8 +13,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+
+import caviar
+from caviar_clients.datasets.verify import verify
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
@@ -39,7 +43,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def generate(
-    scenario: Path, out: Path, *options: str, seconds: float = 120.0
+    scenario: Path, out: Path | str, *options: str, seconds: float = 120.0
 ) -> subprocess.CompletedProcess[str]:
     command = [
         *COMMAND,
@@ -285,3 +289,55 @@ def test_a_disk_that_fills_up_ends_the_command_and_loses_nothing(scenario: Path,
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert sorted(path.name[-1] for path in (out / "episodes").iterdir()) == ["0", "1", "2"]
+
+
+@pytest.mark.slow
+def test_a_dataset_at_an_address_has_the_bytes_of_a_folder(
+    scenario: Path, reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``file://`` stands for any store of fsspec: no rename, markers, the catalogue uploaded at the end."""
+    store = tmp_path / "store"
+    address = f"file://{store}"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "first-machine"))
+    process = subprocess.Popen(
+        [*COMMAND, str(scenario), "--out", address, "--episodes", str(EPISODES), "--scenes", "5"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    wait_for(store, 4, process)
+    process.kill()
+    process.wait(60.0)
+    marked = len(list(store.glob("episodes/*/complete.json")))
+    assert 3 <= marked < EPISODES
+    # Another machine goes on: what it knows it has from the address.
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "second-machine"))
+    done = generate(scenario, address)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "episodes were there" in done.stdout
+    assert content(store) == content(reference)
+
+    data = caviar.dataset(address)
+    assert len(data) == EPISODES
+    users, same = data.users(valid=True), caviar.dataset(reference).users(valid=True)
+    np.testing.assert_array_equal(users["channel.h"], same["channel.h"])
+    assert list(verify(address)) == []
+    (store / "episodes" / "episode-000003" / "complete.json").unlink()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "third-machine"))
+    assert [(one.episode, one.what) for one in verify(address)] == [(3, "recording")]
+    again = generate(scenario, address)
+    assert "1 recordings were removed, episode 3 the first" in again.stdout
+    assert list(verify(address)) == []
+    other = generate(scenario, address, "--seed", "5")
+    assert other.returncode == 1
+    assert "holds another dataset: scenario.run.seed was 1, is 5" in other.stderr
+
+
+def test_addresses_that_cannot_be_used_are_refused(scenario: Path, tmp_path: Path) -> None:
+    done = generate(scenario, "nosuch://bucket/d")
+    assert done.returncode == 1
+    assert "nosuch://bucket/d cannot be opened: Protocol not known: nosuch" in done.stderr.replace("\n", " ")
+    (tmp_path / "file").write_text("")
+    done = generate(scenario, f"file://{tmp_path}/file/d")
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "cannot be written" in done.stderr

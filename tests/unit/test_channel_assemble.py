@@ -223,3 +223,19 @@ def test_ids_of_paths_of_one_kind_count_within_their_pair() -> None:
     alone = stable_ids(mixed.take(types[:, 0] == 0))
     assert alone.tolist() == stable_ids(mixed)[types[:, 0] == 0].tolist()
     assert alone[0] == alone[2] != alone[1]
+
+
+def test_h_in_single_precision_is_within_6e_8_of_each_number() -> None:
+    table = random_table(np.random.default_rng(5))
+    product = Product(rung="siso-rt", options=ChannelOptions(), carriers=CARRIERS, with_h=True)
+    ends = [antenna("t0", 0.0, columns=4)], [antenna("r0", 50.0, columns=2)]
+    table = table.take(table.pair == 0)
+    exact, rounded = (
+        assemble(replace(product, rounds_h=rounds), *ends, table, np.ones((1, 1), bool))[0]
+        for rounds in (False, True)
+    )
+    for one, other in zip(exact.h, rounded.h, strict=True):
+        assert (one.h != other.h).any()
+        np.testing.assert_allclose(other.h.view(float), one.h.view(float), rtol=6e-8)
+        np.testing.assert_array_equal(other.h, other.h.astype(np.complex64))
+    assert decode_payload("channel", *encode_payload(rounded)).h[0].h.dtype == np.complex128

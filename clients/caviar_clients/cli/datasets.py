@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from caviar_clients.datasets.episode import EpisodeResult
     from caviar_clients.datasets.estimate import Estimate
 
+DatasetLocation = Annotated[
+    str, typer.Argument(help="folder or address of a dataset", metavar="DATASET", show_default=False)
+]
 SHOWN_FAILURES = 10
 SHOWN_FINDINGS = 40
 
@@ -44,7 +47,13 @@ def generate_command(
             autocompletion=complete_scenario,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder of the dataset; one that is begun is continued")],
+    out: Annotated[
+        str,
+        typer.Option(
+            help="folder of the dataset, or address as s3://bucket/name; one that is begun is continued",
+            metavar="FOLDER|ADDRESS",
+        ),
+    ],
     episodes: Annotated[
         int | None, typer.Option(min=1, help="episodes of the dataset, instead of the scenario's")
     ] = None,
@@ -123,12 +132,12 @@ def generate_command(
             print_line(console, f"episode {number} failed: {printable(error)}", "red")
         raise RunError(
             f"{counted(len(outcome.failed), 'episode')} of {plan.episodes} failed, all are listed in "
-            f"table failures of {out / 'catalogue.sqlite'}; the same command tries them again"
+            f"table failures of {out.rstrip('/')}/catalogue.sqlite; the same command tries them again"
         )
 
 
 def tables_command(
-    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    dataset: DatasetLocation,
     form: Annotated[
         str, typer.Option("--format", help="csv, or parquet, which DuckDB and pandas read")
     ] = "parquet",
@@ -138,20 +147,20 @@ def tables_command(
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
     from caviar_clients.datasets.catalogue import Catalogue
-    from caviar_clients.datasets.directory import DatasetDirectory
     from caviar_clients.datasets.export import export_tables
+    from caviar_clients.datasets.remote import located
 
     require_known("--format", form, ("csv", "parquet"))
     if form == "parquet":
         require_installed("caviar tables --format parquet", ["datasets"])
-    directory = DatasetDirectory(dataset)
+    directory, _ = located(dataset)
     catalogue, console = Catalogue(directory.catalogue), Console()
     for file in export_tables(catalogue, out or directory.tables, form):  # type: ignore[arg-type]
         print_line(console, file)
 
 
 def look_command(
-    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    dataset: DatasetLocation,
     out: Annotated[
         Path | None, typer.Option(help="the page; by default look.html in the folder of the dataset")
     ] = None,
@@ -175,7 +184,7 @@ def look_command(
 
 
 def verify_command(
-    dataset: Annotated[Path, typer.Argument(help="folder of a dataset", show_default=False)],
+    dataset: DatasetLocation,
     json: FiguresFile = None,
 ) -> None:
     """Verify a dataset: its files, its catalogue, and the physics of each scene; status 1 if one is wrong."""
@@ -210,17 +219,22 @@ def verify_command(
     raise RunError(f"{dataset}: {counted(len(findings), 'finding')}{more}{hint if more else ''}")
 
 
-def _remove(out: Path) -> None:
+def _remove(out: str) -> None:
     """Remove a dataset; what else is in the folder stays."""
     from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+    from caviar_clients.datasets.remote import RemoteDataset, is_address
 
-    directory = DatasetDirectory(out)
+    directory = DatasetDirectory(Path(out))
+    if is_address(out):
+        remote = RemoteDataset(out)
+        remote.remove()
+        directory = remote.written()
     if not directory.catalogue.exists():
         return
     with writing_dataset(directory):
         for folder in (directory.episodes, directory.assets, directory.tables):
             shutil.rmtree(folder, ignore_errors=True)
-        for file in (*out.glob(f"{directory.catalogue.name}*"), directory.page):
+        for file in (*directory.path.glob(f"{directory.catalogue.name}*"), directory.page):
             file.unlink(missing_ok=True)
 
 
@@ -262,12 +276,12 @@ class _Screen:
             self._bar.remove_task(self._traffic)
             self._traffic = None
 
-    def estimated(self, found: Estimate, free: int, episodes: int, workers: int) -> None:
+    def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """See `generate.Observer`."""
+        space = bytes_text(found.bytes) + ("" if free is None else f" of {bytes_text(free)} that are free")
         print_line(
             self._bar.console,
-            f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, "
-            f"{bytes_text(found.bytes)} of {bytes_text(free)} that are free",
+            f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, {space}",
         )
         self._began = time.monotonic()
         self._task = self._bar.add_task("episodes", total=episodes, rate="")

@@ -7,6 +7,7 @@ and stand apart for that reason. Its schema is in docs/reference/datasets.md.
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -85,6 +86,15 @@ class Catalogue:
             if self._is_writable:  # one file, which can be read where nothing can be written
                 self._connection.execute("PRAGMA journal_mode = DELETE")
             self._connection.close()
+
+    def copy_to(self, file: Path) -> None:
+        """Write the catalogue as it is now to another file, which is not there.
+
+        Args:
+            file: Of the copy.
+        """
+        with self._errors():
+            self._connection.execute("VACUUM INTO ?", (str(file),))
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -251,3 +261,16 @@ def _columns(cls: type[Any]) -> Iterator[str]:
         optional = isinstance(hint, UnionType)
         kind = get_args(hint)[0] if optional else hint
         yield f"{name} {_SQL_TYPES[kind]}{'' if optional else ' NOT NULL'}"
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Digest of the settings of a dataset; the number of its episodes is none of them.
+
+    Args:
+        settings: Of `plan.DatasetPlan.settings`.
+
+    Example:
+        >>> fingerprint({"device": "llvm"}) == fingerprint({"device": "cuda"})
+        False
+    """
+    return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()

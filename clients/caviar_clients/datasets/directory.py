@@ -72,15 +72,28 @@ class DatasetDirectory:
         """
         try:
             with os.scandir(self.episodes) as entries:
-                names = [entry.name for entry in entries if entry.name.startswith(_EPISODE)]
+                names = [entry.name for entry in entries]
         except FileNotFoundError:
             return []
         except OSError as error:
             raise RunError(
                 f"{self.episodes} cannot be read: {error.strerror} (errno {error.errno})"
             ) from error
-        numbers = (name.removeprefix(_EPISODE) for name in names)
-        return sorted(int(number) for number in numbers if number.isascii() and number.isdecimal())
+        return sorted(number for name in names if (number := self.number_of(name)) is not None)
+
+    @staticmethod
+    def number_of(name: str) -> int | None:
+        """Number of the episode whose folder has a name; None where it is no such folder.
+
+        Args:
+            name: Last part of a path.
+
+        Example:
+            >>> DatasetDirectory.number_of("episode-000007"), DatasetDirectory.number_of(".work")
+            (7, None)
+        """
+        digits = name.removeprefix(_EPISODE)
+        return int(digits) if digits != name and digits.isascii() and digits.isdecimal() else None
 
 
 @contextmanager
@@ -111,6 +124,22 @@ def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
         clear_work(directory)
     finally:
         os.close(lock)
+
+
+def rename_unless_there(folder: Path, target: Path) -> None:
+    """Rename a folder in one step; where another process was quicker, its folder stays.
+
+    Args:
+        folder: Complete, on the same file system.
+        target: Its new path.
+    """
+    if target.exists():
+        return
+    try:
+        folder.rename(target)
+    except OSError:
+        if not target.exists():
+            raise
 
 
 def clear_work(directory: DatasetDirectory) -> None:

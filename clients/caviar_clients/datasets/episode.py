@@ -19,7 +19,8 @@ from typing import Any
 
 import msgspec
 
-from caviar_clients.datasets.directory import DatasetDirectory, unwritable
+from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there, unwritable
+from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
 from caviar_clients.files import printable
 from caviar_clients.session.checks import check_implementations
@@ -44,7 +45,7 @@ class EpisodeTask:
     """With the settings of a dataset (`plan.dataset_scenario`)."""
     episode: int
     out: str
-    """Folder of the dataset, as the process sees it."""
+    """Folder of the dataset, as the process sees it, or its address (`remote`)."""
     trial: bool = False
     """Whether the recording is removed once its time and size are known."""
     kept: str = ""
@@ -85,13 +86,14 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
         "pid": os.getpid(),
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
     }
+    remote = RemoteDataset(task.out) if is_address(task.out) else None
     directory = DatasetDirectory(Path(task.out))
     target = directory.episode(task.episode)
     try:
-        if target.exists() and not task.trial:  # by a twin of this task, on a worker that was given up
+        if remote is None and target.exists() and not task.trial:
+            # By a twin of this task, on a worker that was given up.
             return EpisodeResult(task.episode, rows=rows_of(Recording(target)), measured=measured)
-        directory.work.mkdir(exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f"{task.episode}-", dir=directory.work))
+        work = work_folder(task.out, str(task.episode))
     except OSError as error:
         return EpisodeResult(task.episode, str(unwritable(error.filename or task.out, error)))
     except CaviarError as error:
@@ -105,7 +107,7 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
         used = {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu}
         measured |= {**used, "memory_mib": resident_mib(), **times}
         if not task.trial:
-            _put_into_place(folder, target, measured)
+            _put_into_place(folder, remote or target, task.episode, measured)
         else:
             measured["disk_b"] = _on_disk(folder)
             if task.kept:
@@ -141,15 +143,32 @@ def _on_disk(folder: Path) -> int:
     return sum(stat.st_blocks * 512 for stat in about) + about[0].st_blksize
 
 
-def _put_into_place(folder: Path, target: Path, measured: dict[str, Any]) -> None:
-    """Have the disk hold a recording, and rename it in one step."""
+def work_folder(out: str, prefix: str) -> Path:
+    """Make a folder for what is half-written: on the disk of what is complete, so that it can be renamed.
+
+    Of a dataset with an address it is one of the temporary folders of this machine.
+
+    Args:
+        out: Folder or address of the dataset.
+        prefix: Of its name.
+    """
+    if is_address(out):
+        return Path(tempfile.mkdtemp(prefix=f"caviar-{prefix}-"))
+    work = DatasetDirectory(Path(out)).work
+    work.mkdir(exist_ok=True)
+    return Path(tempfile.mkdtemp(prefix=f"{prefix}-", dir=work))
+
+
+def _put_into_place(
+    folder: Path, target: Path | RemoteDataset, episode: int, measured: dict[str, Any]
+) -> None:
+    """Have the disk hold a recording, and rename it in one step; upload it where the dataset is elsewhere."""
     replace_file(folder / MEASURED, msgspec.json.encode(measured) + b"\n", durable=False)
+    if isinstance(target, RemoteDataset):
+        target.put_episode(episode, folder)
+        return
     for file in (*RunDirectory(folder).segments(), RunDirectory(folder).manifest, folder):
         sync_file(file)
-    try:
-        folder.rename(target)
-    except OSError:
-        # A twin was quicker; a recording depends on the episode alone, so that its is as good.
-        if not target.exists():
-            raise
+    # Where a twin was quicker, its recording is as good: it depends on the episode alone.
+    rename_unless_there(folder, target)
     sync_file(target.parent)

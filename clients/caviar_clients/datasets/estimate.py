@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,8 +11,9 @@ from statistics import fmean
 
 import msgspec
 
-from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there
+from caviar_clients.datasets.episode import EpisodeTask, play_episode, work_folder
+from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_protocol.errors import RunError
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
@@ -85,7 +85,7 @@ def try_worker(scenario: Scenario, out: str, episodes: Sequence[int], cached: Ma
 
     Args:
         scenario: Of the episodes.
-        out: Folder of the dataset.
+        out: Folder or address of the dataset.
         episodes: To be tried, three.
         cached: Files of the cache that these need.
     """
@@ -118,20 +118,19 @@ def _put_scenery(scenario: Scenario, out: str, episode: int, cached: Mapping[str
     settings = {**recorder.settings, "copy_assets": True}
     services = {**scenario.services, name: msgspec.structs.replace(recorder, settings=settings)}
     shortened = _shortened(msgspec.structs.replace(scenario, services=services), 1)
-    directory = DatasetDirectory(Path(out))
-    work = Path(tempfile.mkdtemp(prefix="scenery-", dir=directory.work))
+    work = work_folder(out, "scenery")
     try:
         task = replace(
             EpisodeTask(shortened, episode, out, trial=True, cached=cached), kept=str(work / "episode")
         )
         result = play_episode(task)
         found = RunDirectory(work / "episode").assets
-        if found.is_dir() and not directory.assets.exists():
-            try:
-                found.rename(directory.assets)
-            except OSError:  # another worker was quicker
-                if not directory.assets.exists():
-                    raise
+        if not found.is_dir():
+            return result.error
+        if is_address(out):
+            RemoteDataset(out).put_assets(found)
+        else:
+            rename_unless_there(found, DatasetDirectory(Path(out)).assets)
         return result.error
     finally:
         shutil.rmtree(work, ignore_errors=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -9,12 +11,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
-from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.catalogue import Catalogue, fingerprint
 from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask
 from caviar_clients.datasets.estimate import Estimate, check_disk, estimate, try_worker
-from caviar_clients.datasets.plan import DatasetPlan, differences, fingerprint
+from caviar_clients.datasets.plan import DatasetPlan, differences
+from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.traffic import SharedTraffic
 from caviar_protocol.errors import RunError
@@ -30,8 +33,8 @@ class Observer(Protocol):
     def traffic(self, now_s: float, end_s: float) -> None:
         """How far the pass through the traffic has come [s]."""
 
-    def estimated(self, found: Estimate, free: int, episodes: int, workers: int) -> None:
-        """What the episodes that are left take, and what is free on the disk [B]."""
+    def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
+        """What the episodes that are left take, and what is free on the disk [B]; None: of an address."""
 
     def ended(self, result: EpisodeResult) -> None:
         """An episode ended, well or not."""
@@ -55,13 +58,13 @@ class Outcome:
 
 
 def generate(
-    plan: DatasetPlan, out: Path, observer: Observer, *, workers: int = 0, scheduler: str = ""
+    plan: DatasetPlan, out: str | Path, observer: Observer, *, workers: int = 0, scheduler: str = ""
 ) -> Outcome:
     """Play the episodes of a dataset that are not there.
 
     Args:
         plan: The dataset.
-        out: Its folder; one that holds a part of the dataset is continued.
+        out: Its folder or address; one that holds a part of the dataset is continued.
         observer: Is told of what happens.
         workers: Processes of this machine; 0: one for each core.
         scheduler: Address of a Dask scheduler; empty: processes of this machine.
@@ -73,25 +76,68 @@ def generate(
         RunError: The folder holds another dataset, or cannot be written; the disk is too small; no scene can
             be played.
     """
-    directory = DatasetDirectory(out)
+    remote = RemoteDataset(str(out)) if is_address(out) else None
+    directory = DatasetDirectory(Path(out)) if remote is None else remote.written()
     with writing_dataset(directory):
+        if remote is not None and not directory.catalogue.exists():
+            remote.fetch_catalogue(
+                directory.catalogue
+            )  # of another machine, or of before the cache was emptied
         catalogue = Catalogue(directory.catalogue, writable=True)
+        ledger = _Ledger(str(out), directory, remote, catalogue)
         try:
-            return _generate(plan, directory, catalogue, observer, workers, scheduler)
+            return _generate(plan, ledger, observer, workers, scheduler)
         finally:
-            catalogue.close()
+            try:
+                ledger.upload()
+            finally:
+                catalogue.close()
+
+
+@dataclass(frozen=True)
+class _Ledger:
+    """What is there of a dataset, and where."""
+
+    out: str
+    """Folder or address, as the user wrote it."""
+    directory: DatasetDirectory
+    """Of the catalogue; of a folder that of the recordings too."""
+    remote: RemoteDataset | None
+    catalogue: Catalogue
+
+    @property
+    def place(self) -> str:
+        """Folder or address, as every process of this machine sees it."""
+        return self.out if self.remote is not None else str(self.directory.path.resolve())
+
+    def finished(self) -> list[int]:
+        """Numbers of the episodes whose recordings are there."""
+        return self.directory.finished() if self.remote is None else self.remote.episodes()
+
+    def add_unlisted(self, number: int) -> None:
+        """List a recording that is there, and that a killed command had not listed."""
+        if self.remote is not None:
+            self.remote.fetch_episode(number, self.directory)
+        self.catalogue.add(rows_of(Recording(self.directory.episode(number))), {})
+        if self.remote is not None:
+            shutil.rmtree(self.directory.episode(number))
+
+    def upload(self) -> None:
+        """Have the catalogue of now at the address."""
+        if self.remote is None or not self.catalogue.settings:
+            return
+        with tempfile.TemporaryDirectory(dir=self.directory.work) as folder:
+            copy = Path(folder) / self.directory.catalogue.name
+            self.catalogue.copy_to(copy)
+            self.remote.put_catalogue(copy)
 
 
 def _generate(
-    plan: DatasetPlan,
-    directory: DatasetDirectory,
-    catalogue: Catalogue,
-    observer: Observer,
-    workers: int,
-    scheduler: str,
+    plan: DatasetPlan, ledger: _Ledger, observer: Observer, workers: int, scheduler: str
 ) -> Outcome:
-    _agree(plan, directory, catalogue)
-    _agree_with_disk(directory, catalogue, observer)
+    catalogue = ledger.catalogue
+    _agree(plan, ledger)
+    _agree_with_recordings(ledger, observer)
     there = set(catalogue.episodes())
     left = [number for number in range(plan.episodes) if number not in there]
     outcome = Outcome(before=len(there))
@@ -100,19 +146,16 @@ def _generate(
     traffic = SharedTraffic(plan.scenario)
     traffic.save(plan.episodes, observer.traffic)
     with Episodes(workers, scheduler, observer.note) as episodes:
-        _estimate(plan, directory, left, traffic, episodes, observer)
+        _estimate(plan, ledger, left, traffic, episodes, observer)
         began = time.monotonic()
-        for result in episodes.play(_tasks(plan, directory, left, traffic)):
+        for result in episodes.play(_tasks(plan, ledger.place, left, traffic)):
             _keep(result, catalogue, outcome)
             outcome.wall_s = time.monotonic() - began
             observer.ended(result)
     return outcome
 
 
-def _tasks(
-    plan: DatasetPlan, directory: DatasetDirectory, left: list[int], traffic: SharedTraffic
-) -> Iterator[EpisodeTask]:
-    out = str(directory.path.resolve())
+def _tasks(plan: DatasetPlan, out: str, left: list[int], traffic: SharedTraffic) -> Iterator[EpisodeTask]:
     for number in left:
         yield EpisodeTask(plan.scenario, number, out, cached=traffic.states_of(number))
 
@@ -131,7 +174,7 @@ def _keep(result: EpisodeResult, catalogue: Catalogue, outcome: Outcome) -> None
 
 def _estimate(
     plan: DatasetPlan,
-    directory: DatasetDirectory,
+    ledger: _Ledger,
     left: list[int],
     traffic: SharedTraffic,
     episodes: Episodes,
@@ -139,34 +182,37 @@ def _estimate(
 ) -> None:
     tried = [left[len(left) * quarter // 4] for quarter in (1, 2, 3)]
     cached = {name: data for number in tried for name, data in traffic.states_of(number).items()}
-    trials = episodes.run_on_each(try_worker, plan.scenario, str(directory.path.resolve()), tried, cached)
+    trials = episodes.run_on_each(try_worker, plan.scenario, ledger.place, tried, cached)
     good = [trial for trial in trials if trial.scenes]
     if not good:
         raise RunError(f"no scene can be played: {trials[0].error}")
     found = estimate(good, len(left), plan.scenes)
-    observer.estimated(found, check_disk(directory.path, found.bytes), len(left), episodes.workers)
+    free = check_disk(ledger.directory.path, found.bytes) if ledger.remote is None else None
+    observer.estimated(found, free, len(left), episodes.workers)
 
 
-def _agree(plan: DatasetPlan, directory: DatasetDirectory, catalogue: Catalogue) -> None:
-    """Raise `RunError` where the folder holds another dataset; note the plan where it does not."""
+def _agree(plan: DatasetPlan, ledger: _Ledger) -> None:
+    """Raise `RunError` where another dataset is there; note the plan where none is."""
+    catalogue = ledger.catalogue
     settings, before = plan.settings(), catalogue.settings
-    if (catalogue.episodes() or directory.finished()) and fingerprint(before) != fingerprint(settings):
+    if (catalogue.episodes() or ledger.finished()) and fingerprint(before) != fingerprint(settings):
         found = list(differences(before, settings))
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
         raise RunError(
-            f"{directory.path} holds another dataset: {'; '.join(found[:3])}{more}; give another --out, or "
+            f"{ledger.out} holds another dataset: {'; '.join(found[:3])}{more}; give another --out, or "
             "--overwrite to remove it"
         )
     catalogue.plan(settings, max(plan.episodes, catalogue.planned))
+    ledger.upload()  # so that another machine can go on where this one is lost
 
 
-def _agree_with_disk(directory: DatasetDirectory, catalogue: Catalogue, observer: Observer) -> None:
+def _agree_with_recordings(ledger: _Ledger, observer: Observer) -> None:
     """List the recordings that a killed command had not listed, and forget those that were removed."""
-    on_disk, listed = set(directory.finished()), set(catalogue.episodes())
-    for number in sorted(on_disk - listed):
-        catalogue.add(rows_of(Recording(directory.episode(number))), {})
-    if gone := sorted(listed - on_disk):
+    recorded, listed = set(ledger.finished()), set(ledger.catalogue.episodes())
+    for number in sorted(recorded - listed):
+        ledger.add_unlisted(number)
+    if gone := sorted(listed - recorded):
         observer.note(
             f"{len(gone)} recordings were removed, episode {gone[0]} the first: they are played again"
         )
-        catalogue.forget(gone)
+        ledger.catalogue.forget(gone)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,19 +109,6 @@ def with_own_traffic(scenario: Scenario) -> Scenario:
         for name, spec in scenario.services.items()
     }
     return replace(scenario, services=services)
-
-
-def fingerprint(settings: Mapping[str, Any]) -> str:
-    """Digest of the settings of a dataset; the number of its episodes is none of them.
-
-    Args:
-        settings: Of `DatasetPlan.settings`.
-
-    Example:
-        >>> fingerprint({"device": "llvm"}) == fingerprint({"device": "cuda"})
-        False
-    """
-    return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:

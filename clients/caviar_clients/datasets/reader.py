@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_clients.datasets.catalogue import TABLES, Catalogue
-from caviar_clients.datasets.directory import DatasetDirectory
+from caviar_clients.datasets.remote import located
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.recording import Recording
@@ -29,11 +29,13 @@ class Dataset:
     """A dataset, or some episodes of one.
 
     Args:
-        path: Folder of the dataset.
+        path: Folder of the dataset, or its address (``s3://bucket/s008``): what is read of it is then kept in
+            the cache of the user.
         episodes: Numbers of episodes; None: all that are there.
 
     Raises:
         RecordingError: The folder has no catalogue, or it cannot be read; or an episode is not there.
+        RunError: The store of an address does not answer.
 
     Example:
         >>> data = Dataset("data/s008")  # doctest: +SKIP
@@ -42,15 +44,17 @@ class Dataset:
     """
 
     def __init__(self, path: str | Path, episodes: Iterable[int] | None = None) -> None:
-        self.path = Path(path)
-        self._directory = DatasetDirectory(self.path)
-        self._catalogue = Catalogue(self._directory.catalogue)
+        self.location = str(path)
+        """Folder or address."""
+        self.directory, self._remote = located(path)
+        """Folder of this machine; of an address that in the cache."""
+        self._catalogue = Catalogue(self.directory.catalogue)
         there = self._catalogue.episodes()
         self.episodes = tuple(there) if episodes is None else tuple(episodes)
         """Numbers of the episodes, in the order in which they are read."""
         if lacking := sorted(set(self.episodes) - set(there)):
             has = f"{there[0]} to {there[-1]}" if there else "none"
-            raise RecordingError(f"{self.path} has no episode {lacking[0]}; it has {len(there)}: {has}")
+            raise RecordingError(f"{self.location} has no episode {lacking[0]}; it has {len(there)}: {has}")
         self._open = lru_cache(maxsize=KEPT_RECORDINGS)(self._opened)
 
     def __len__(self) -> int:
@@ -59,14 +63,19 @@ class Dataset:
 
     def __repr__(self) -> str:
         scenes = int(self.table("episodes")["scenes"].sum()) if self.episodes else 0
-        return f"Dataset of {self.path}: {len(self)} episodes, {scenes} scenes"
+        return f"Dataset of {self.location}: {len(self)} episodes, {scenes} scenes"
 
     def __getstate__(self) -> dict[str, Any]:
         # Of processes that load in parallel each opens its own files.
-        return {"path": self.path, "episodes": self.episodes}
+        return {"location": self.location, "episodes": self.episodes}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        self.__init__(state["path"], state["episodes"])  # type: ignore[misc]
+        self.__init__(state["location"], state["episodes"])  # type: ignore[misc]
+
+    @property
+    def name(self) -> str:
+        """Last part of its folder or address."""
+        return Path(self.location).resolve().name
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -76,7 +85,7 @@ class Dataset:
     @property
     def assets(self) -> Path:
         """Folder of the scenery: meshes, and the file that names their materials."""
-        return self._directory.assets
+        return self.directory.assets
 
     def episode(self, number: int) -> Recording:
         """The recording of an episode: ``data.episode(7)["channel"].h``.
@@ -88,7 +97,7 @@ class Dataset:
             RecordingError: It is none of this dataset, or its recording cannot be read.
         """
         if number not in self.episodes:
-            raise RecordingError(f"{self.path} has no episode {number} here")
+            raise RecordingError(f"{self.location} has no episode {number} here")
         return self._open(number)
 
     def split(self, shares: Sequence[float], *, seed: int = 0) -> tuple[Dataset, ...]:
@@ -112,7 +121,7 @@ class Dataset:
         order = sorted(self.episodes)
         random.Random(seed).shuffle(order)  # noqa: S311 - no secret; its algorithm is the same everywhere
         bounds = [round(len(order) * sum(shares[:at])) for at in range(len(shares) + 1)]
-        return tuple(Dataset(self.path, sorted(order[low:high])) for low, high in pairwise(bounds))
+        return tuple(Dataset(self.location, sorted(order[low:high])) for low, high in pairwise(bounds))
 
     def select(self, episodes: Iterable[int]) -> Dataset:
         """These episodes only.
@@ -120,7 +129,7 @@ class Dataset:
         Args:
             episodes: Their numbers.
         """
-        return Dataset(self.path, episodes)
+        return Dataset(self.location, episodes)
 
     def table(self, name: str) -> Columns:
         """A table of the catalogue, for these episodes, as columns.
@@ -178,7 +187,8 @@ class Dataset:
                 known = np.unique(table[column])
                 if name not in known:
                     raise RecordingError(
-                        f"{self.path} has no users of {column} {name!r}; {suggestion(name, known.tolist())}"
+                        f"{self.location} has no users of {column} {name!r}; "
+                        f"{suggestion(name, known.tolist())}"
                     )
                 mask &= table[column] == name
         return Users(self, table.where(mask))
@@ -205,5 +215,12 @@ class Dataset:
         table = self.table("scenes")
         yield from zip(table["episode"].tolist(), table["scene"].tolist(), strict=True)
 
+    def finished(self) -> list[int]:
+        """Numbers of the episodes whose recordings are there now, in order."""
+        there = self._remote.episodes() if self._remote is not None else self.directory.finished()
+        return sorted(set(there).intersection(self.episodes))
+
     def _opened(self, number: int) -> Recording:
-        return Recording(self._directory.episode(number))
+        if self._remote is not None:
+            self._remote.fetch_episode(number, self.directory)
+        return Recording(self.directory.episode(number))

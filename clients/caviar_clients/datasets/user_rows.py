@@ -101,7 +101,7 @@ class Users:
         return len(self._table)
 
     def __repr__(self) -> str:
-        lines = [f"{len(self)} users of {self._dataset.path}", f"  columns: {', '.join(self._table)}"]
+        lines = [f"{len(self)} users of {self._dataset.location}", f"  columns: {', '.join(self._table)}"]
         lines += [f"  {name}: {doc}" for name, doc in self.recorded().items()]
         return "\n".join(lines)
 

@@ -14,6 +14,7 @@ from typing import Any
 from caviar_clients.datasets.catalogue import TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.physics import Finding, PhysicsChecks
+from caviar_clients.datasets.remote import located
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
@@ -22,11 +23,11 @@ TOLERANCE = 1e-12
 """Of figures of the catalogue that are computed anew, relative: they are the same arithmetic."""
 
 
-def verify(path: Path, progress: Callable[[int, int], None] = lambda *_: None) -> Iterator[Finding]:
+def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: None) -> Iterator[Finding]:
     """Verify a dataset.
 
     Args:
-        path: Folder of the dataset.
+        path: Folder or address of the dataset.
         progress: Called after each episode with how many are verified, and how many there are.
 
     Yields:
@@ -35,9 +36,10 @@ def verify(path: Path, progress: Callable[[int, int], None] = lambda *_: None) -
     Raises:
         RecordingError: The folder is no dataset.
     """
-    directory = DatasetDirectory(path)
+    directory, remote = located(path)
     catalogue = Catalogue(directory.catalogue)
-    listed, on_disk = catalogue.episodes(), set(directory.finished())
+    listed = catalogue.episodes()
+    on_disk = set(directory.finished() if remote is None else remote.episodes())
     failed = dict(catalogue.failures())
     for number in range(catalogue.planned):
         if number not in listed:
@@ -48,7 +50,13 @@ def verify(path: Path, progress: Callable[[int, int], None] = lambda *_: None) -
     settings = catalogue.settings
     checks = PhysicsChecks(directory.assets, settings)
     for done, number in enumerate(listed, 1):
-        yield from _episode(directory, catalogue, checks, settings, number)
+        try:
+            if remote is not None:
+                remote.fetch_episode(number, directory)
+        except RecordingError as error:
+            yield Finding(number, None, "", "recording", "a whole recording", str(error))
+        else:
+            yield from _episode(directory, catalogue, checks, settings, number)
         progress(done, len(listed))
 
 

@@ -58,6 +58,8 @@ class Product:
     """Wideband parts in demand."""
     absorption_db_per_km: Float64Array | None = None
     """By the air, on each carrier, Shape ``[C]``; None: no atmosphere."""
+    rounds_h: bool = False
+    """Whether H is rounded to single precision."""
 
 
 def assemble(
@@ -115,8 +117,11 @@ def assemble(
         located = _located(product, row, table, offsets, geometry, a)
         made = (matrices or PlaneWaves)(product.carriers, transmitters, receivers, located)
         if product.with_h:
+            kept = _in_single_precision if product.rounds_h else np.asarray
             h = tuple(
-                ChannelMatrix(carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=between)
+                ChannelMatrix(
+                    carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=kept(between)
+                )
                 for index in range(len(product.carriers))
                 for pair, between in enumerate(made.matrices(index))
             )
@@ -157,6 +162,11 @@ def assemble(
         taps=wideband.taps,
     )
     return channel, dropped_pairs
+
+
+def _in_single_precision(h: Complex128Array) -> Complex128Array:
+    """The values that single precision has, in the type of the protocol: zeros at their ends compress."""
+    return h.astype(np.complex64).astype(np.complex128)
 
 
 def _located(

@@ -399,6 +399,9 @@ class PathModel(ChannelModel[S]):
     The arguments are those of `ChannelModel`. `docs/howto/channel-models.md` has a whole model.
     """
 
+    rounds_h = False
+    """Whether H is rounded to single precision."""
+
     # Episode, frame and product of the last frame, for births and deaths of paths.
     _before: tuple[int, int, Channel] | None = None
 
@@ -443,6 +446,7 @@ class PathModel(ChannelModel[S]):
             with_h=self.with_h,
             wideband=self.wideband,
             absorption_db_per_km=self.absorption_db_per_km,
+            rounds_h=self.rounds_h,
         )
         channel, dropped = assemble(product, tx, rx, found.table, found.los, found.matrices)
         # A passive channel brings no more than was sent: above 1, far-field gains are used in the near field.

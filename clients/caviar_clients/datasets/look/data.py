@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
-from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.plots.rays import Footprints
 from caviar_clients.plots.sensors import object_colours
@@ -298,8 +297,7 @@ def read_sample(data: Dataset, topics: set[str], progress: Progress) -> Sample:
     Raises:
         RecordingError: A recording cannot be read.
     """
-    on_disk = set(DatasetDirectory(data.path).finished())
-    there = numbers = sorted(on_disk.intersection(data.episodes))
+    there = numbers = data.finished()
     if len(there) > SAMPLE_EPISODES:
         numbers = sorted(random.Random(0).sample(numbers, SAMPLE_EPISODES))  # noqa: S311 - no secret
     sample = Sample(tuple(numbers), there=len(there))

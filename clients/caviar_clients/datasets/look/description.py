@@ -33,7 +33,7 @@ def what_it_is(data: Dataset, catalogue: Catalogue, users: int, there: int) -> I
     versioned = [f"{name} {versions[name]}" for name in _MAIN_VERSIONS if name in versions]
     known = {
         "Scenario": name_of(data),
-        "Folder": data.path.resolve().name,
+        "Folder": data.name,
         "Episodes": f"{episodes:,}{of_planned}",
         "Scenes": f"{scenes:,}" + (f", {each} in each episode" if episodes else ""),
         "Users": f"{users:,}: a receiver in a scene, for each carrier and transmitter",
@@ -166,4 +166,4 @@ def scenario_of(data: Dataset) -> dict[str, Any]:
 
 
 def name_of(data: Dataset) -> str:
-    return str(scenario_of(data).get("run", {}).get("name", "")) or data.path.resolve().name
+    return str(scenario_of(data).get("run", {}).get("name", "")) or data.name

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
-from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.look.data import (
     Content,
     Progress,
@@ -59,12 +58,12 @@ def _quiet(_what: str, _done: int, _of: int) -> None:
     """Tell nobody."""
 
 
-def write_page(dataset: Path, out: Path | None = None, progress: Progress = _quiet) -> Path:
+def write_page(dataset: str | Path, out: Path | None = None, progress: Progress = _quiet) -> Path:
     """Write the page of a dataset.
 
     Args:
-        dataset: Folder of the dataset.
-        out: The file; None: ``look.html`` in the folder.
+        dataset: Folder or address of the dataset.
+        out: The file; None: ``look.html`` in the folder, of an address in that of the cache.
         progress: Is told how far it is.
 
     Returns:
@@ -80,7 +79,7 @@ def write_page(dataset: Path, out: Path | None = None, progress: Progress = _qui
         PosixPath('data/s008/look.html')
     """
     data = Dataset(dataset)  # before anything is written: a folder that is no dataset stays as it is
-    file = out or DatasetDirectory(dataset).page
+    file = out or data.directory.page
     with reserved(file):
         write_file(file, page(data, progress))
     return file
@@ -100,7 +99,7 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
         RecordingError: The catalogue or a recording cannot be read.
         SetupError: Matplotlib is not installed.
     """
-    catalogue = Catalogue(DatasetDirectory(data.path).catalogue)
+    catalogue = Catalogue(data.directory.catalogue)
     try:
         _, rows = catalogue.query("SELECT DISTINCT topic FROM products WHERE status <> 'absent'")
         topics = {topic for (topic,) in rows}
@@ -115,7 +114,7 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
             progress("sections of the page", at + 1, len(_SECTIONS))
     finally:
         catalogue.close()
-    return document(name_of(data), data.path.resolve().name, sections)
+    return document(name_of(data), data.name, sections)
 
 
 def _scenery(data: Dataset) -> tuple[Footprints | None, str]:

@@ -80,6 +80,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def __init__(self, settings: SionnaSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self.rung = settings.rung
+        self.rounds_h = settings.h_precision == "single"
         self._variant = ""
         self._scene: SionnaScene
         self._finder: PathFinder

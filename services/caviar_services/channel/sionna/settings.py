@@ -65,6 +65,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     max_depth: Annotated[int, quantity("1", "interactions of a path at most", ge=0, le=16)] = 3
     rung: Literal["siso-rt", "spherical", "mimo-rt"] = "siso-rt"
     """How arrays are treated: plane waves, spherical waves, or every antenna pair traced."""
+    h_precision: Literal["double", "single"] = "double"
+    """``single``: H is rounded to single precision, 6e-8 of each of its numbers, and takes about 0.6 of the
+    space in a compressed recording."""
     candidates: Literal["enumerated", "launched"] | None = None
     """How reflected paths are looked for: ``enumerated``, chains of scenery by launches from where
     transmitters stand, before the first frame, and chains by way of moving objects face by face in each
