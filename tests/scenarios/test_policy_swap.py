@@ -48,7 +48,7 @@ def test_a_policy_is_swapped_while_the_run_goes_on_and_the_replay_is_the_same(tm
     scenario = scenario_with(tmp_path, first.name, 4000, "\n[timeouts]\nrejoin_s = 20.0\n")
     out = tmp_path / "out"
     out.mkdir()
-    with running(scenario, out, "--http", "127.0.0.1:0") as (process, mark):
+    with running(scenario, out, "--http", "127.0.0.1:0", "--pace", "2") as (process, mark):
         eventually(lambda: recorded_below(out) > 20, 30, "frame 20 is recorded")
         directory = next(out.glob("*/"))
         swapped = caviar("swap", second, "--run", directory)
