@@ -10,6 +10,9 @@ WORKERS  ?= 3
 
 # The tests start some two thousand processes; without bytecode on the disk each compiles 80 modules: 0.2 s of CPU.
 unexport PYTHONDONTWRITEBYTECODE
+# WORKERS share the cores already: threads of BLAS and PyTorch that wait for each other take longer than one.
+test test-all check: export OMP_NUM_THREADS := 1
+test test-all check: export OPENBLAS_NUM_THREADS := 1
 
 # A .venv of another Python than the one that is asked for with PYTHON=… is made again.
 ifeq ($(origin PYTHON),command line)
