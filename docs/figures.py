@@ -113,6 +113,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
     ),
+    "pizza": Measurement(
+        "caviar paper pizza --quick --out {out}",
+        "caviar paper pizza --out {out}",
+        "pizza.md",
+        {"pizza-pairs": "Pairs of agents", "pizza-ratios": "The trained pair over the baseline"},
+    ),
     "processes": Measurement(
         "python tests/bench/bench_processes.py street-canyon --markdown {out}/processes.md",
         "python tests/bench/bench_processes.py street-canyon --frames 400 --markdown {out}/processes.md",
