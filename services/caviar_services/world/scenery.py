@@ -295,6 +295,33 @@ class Obstacles:
         x, y, z = normals[worst].tolist()
         return (x, y, z)
 
+    def touched(self, point: Vector, radius: float) -> tuple[float, Vector] | None:
+        """Find the triangle nearest to a ball that touches one.
+
+        Args:
+            point: Centre of the ball [m].
+            radius: Radius of the ball [m].
+
+        Returns:
+            Distance [m] of the triangle and unit vector away from it; None where the ball touches none.
+
+        Example:
+            >>> wall = np.array([[[5.0, -9.0, 0.0], [5.0, 9.0, 0.0], [5.0, 0.0, 9.0]]])
+            >>> Obstacles(wall).touched((4.75, 0.0, 1.0), 0.5)
+            (0.25, (-1.0, 0.0, 0.0))
+        """
+        if self._reach - math.dist(point, self._centre) < radius:
+            self._look_around(point, radius)
+        if self._around is None:
+            return None
+        distances, gaps = self._around.gaps(point)
+        nearest = int(distances.argmin())
+        distance = float(distances[nearest])
+        if distance >= radius:
+            return None
+        x, y, z = (gaps[nearest] / max(distance, _ROUNDING)).tolist()
+        return distance, (x + 0.0, y + 0.0, z + 0.0)
+
     def _look_around(self, centre: Vector, need: float) -> None:
         """Keep the triangles that steps from places around this one can come near."""
         # Far from walls none is kept, and the reach is the distance of the nearest: until the ball has gone
