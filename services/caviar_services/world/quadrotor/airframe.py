@@ -55,10 +55,12 @@ class Airframe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ] = (0.03, 0.03, 0.05)
     """Principal moments of inertia about x, y and z."""
     arm_m: Annotated[float, quantity("m", "from the centre to the axis of a rotor", gt=0)] = 0.3
-    thrust_n_s2: Annotated[float, quantity("N·s²", "thrust of a rotor over its squared speed", gt=0)] = 1.389e-5
-    torque_n_m_s2: Annotated[
-        float, quantity("N·m·s²", "torque of a rotor over its squared speed", gt=0)
-    ] = 1.95e-7
+    thrust_n_s2: Annotated[float, quantity("N·s²", "thrust of a rotor over its squared speed", gt=0)] = (
+        1.389e-5
+    )
+    torque_n_m_s2: Annotated[float, quantity("N·m·s²", "torque of a rotor over its squared speed", gt=0)] = (
+        1.95e-7
+    )
     max_rotor_rad_s: Annotated[float, quantity("rad/s", "greatest speed of a rotor", gt=0)] = 850.0
     rotor_lag_s: Annotated[float, quantity("s", "time constant of the speed of a rotor", gt=0)] = 0.03
     linear_drag_n_s_m: tuple[NonNegative, NonNegative, NonNegative] = (0.3, 0.3, 0.1)
@@ -150,9 +152,7 @@ class Plant:
         v4, q4, o4 = _plus3(v, a3, h), _plus4(q, d3, h), _plus3(o, e3, h)
         a4, d4, e4 = derivative(v4, q4, o4, w2, air)
         sixth = h / 6.0
-        w, x, y, z = (
-            q[i] + sixth * (d1[i] + 2.0 * (d2[i] + d3[i]) + d4[i]) for i in (0, 1, 2, 3)
-        )
+        w, x, y, z = (q[i] + sixth * (d1[i] + 2.0 * (d2[i] + d3[i]) + d4[i]) for i in (0, 1, 2, 3))
         # The method keeps the norm to the order of its error alone.
         scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
         moved = Body(

@@ -43,7 +43,9 @@ class Controller(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     position_1_s: Annotated[float, quantity("1/s", "velocity over position error", gt=0)] = 1.0
     velocity_1_s: Annotated[float, quantity("1/s", "acceleration over velocity error", gt=0)] = 3.0
-    integral_1_s2: Annotated[float, quantity("1/s2", "acceleration over integrated velocity error", ge=0)] = 1.0
+    integral_1_s2: Annotated[float, quantity("1/s2", "acceleration over integrated velocity error", ge=0)] = (
+        1.0
+    )
     attitude_rad_s: Annotated[float, quantity("rad/s", "natural frequency of the attitude", gt=0)] = 12.0
     attitude_damping: Annotated[float, quantity("1", "damping ratio of the attitude", gt=0)] = 0.9
     max_tilt_deg: Annotated[float, quantity("°", "of the thrust from the vertical", gt=0, lt=90)] = 40.0
@@ -209,7 +211,7 @@ class Autopilot:
         return self._mixed(wanted.thrust, mx, my, mz)
 
     def _mixed(self, thrust: float, mx: float, my: float, mz: float) -> Rotors:
-        """Rotor speeds of a thrust and moments; where they cannot be had, yaw gives way first, then thrust."""
+        """Rotor speeds of a thrust and moments; where they cannot be had, yaw gives way first."""
         mean, roll, pitch = 0.25 * thrust, self._per_side * mx, self._per_side * my
         most = self._most
         span = abs(roll) + abs(pitch)

@@ -1,8 +1,8 @@
 """One flown quadrotor: what it is commanded, what follows from it slice by slice, and when its battery ends.
 
-Time is cut into slices of 10 ms, counted from the beginning of the episode, so that it makes no difference how
-a flight is cut into frames. In each slice the outer loops of the controller and the gust are computed once,
-attitude loop, rotors and body in five steps of 2 ms, and contacts are looked for at its end.
+Time is cut into slices of 10 ms, counted from the beginning of the episode, so that it makes no difference
+how a flight is cut into frames. In each slice the outer loops of the controller and the gust are computed
+once, attitude loop, rotors and body in five steps of 2 ms, and contacts are looked for at its end.
 """
 
 from __future__ import annotations
@@ -12,21 +12,20 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import accumulate, pairwise
-from typing import Annotated, Literal
 
-import msgspec
-
-from caviar_protocol.arrays import quantity
-from caviar_protocol.space.coordinates import (
-    UnitQuaternion,
-    Vector,
-    euler_from_quaternion,
-    quaternion_from_euler,
-)
+from caviar_protocol.space.coordinates import Vector, euler_from_quaternion, quaternion_from_euler
 from caviar_services.world.flight_dynamics import LIMITED_SPEED, STOPPED_BY_GEOFENCE, Limits
 from caviar_services.world.quadrotor.airframe import Airframe, Body, Plant, Rotors
 from caviar_services.world.quadrotor.contacts import GROUND, Contact, OnCollision, answered
 from caviar_services.world.quadrotor.control import Attitude, Autopilot, Controller, braking_speed
+from caviar_services.world.quadrotor.state import (
+    BATTERY_EMPTY,
+    BATTERY_LOW,
+    HOVER,
+    Battery,
+    Order,
+    QuadrotorState,
+)
 from caviar_services.world.quadrotor.wind import Gusts, Wind
 
 SLICE_NS = 10_000_000
@@ -34,18 +33,6 @@ SLICE_NS = 10_000_000
 
 STEP_NS = 2_000_000
 """Step of the integration [ns]."""
-
-COLLIDED = "collided/"
-"""Begins the count of collisions; the quadrotor and what it touched follow, as in ``collided/uav/scenery``."""
-
-ENERGY = "energy-j/"
-"""Begins the count of the energy that a quadrotor took from its battery [J]."""
-
-BATTERY_LOW = "battery-low/"
-"""Begins the count of the frame in which a quadrotor began to land since its battery was low."""
-
-BATTERY_EMPTY = "battery-empty/"
-"""Begins the count of the frame in which the rotors stopped for want of energy."""
 
 _REST: Vector = (0.0, 0.0, 0.0)
 _OFF: Rotors = (0.0, 0.0, 0.0, 0.0)
@@ -66,77 +53,6 @@ _TURNING = 4.0
 _BEARS = 0.7
 
 _ROUNDING = 1e-12
-
-
-class Battery(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the energy comes from: torque times speed at the rotors' shafts, over an efficiency.
-
-    Example:
-        >>> Battery(capacity_wh=77.0).drive_efficiency
-        0.8
-    """
-
-    capacity_wh: Annotated[float, quantity("Wh", "of the full battery; unset: it never ends", gt=0)] | None = None
-    drive_efficiency: Annotated[float, quantity("1", "shaft power over electric power", gt=0, le=1)] = 0.8
-    avionics_w: Annotated[float, quantity("W", "beside the rotors", ge=0)] = 10.0
-    land_below: Annotated[float, quantity("1", "share of the capacity with which it lands", ge=0, lt=1)] = 0.1
-
-
-class Order(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a quadrotor is commanded; without a target, points or an attitude, a velocity.
-
-    Example:
-        >>> Order(target=(10.0, 0.0, 30.0), speed=5.0).velocity
-        (0.0, 0.0, 0.0)
-    """
-
-    velocity: Vector = _REST
-    """[m/s]"""
-    target: Vector | None = None
-    """[m]"""
-    points: tuple[Vector, ...] = ()
-    """Corners of a path [m]."""
-    speed: float = 0.0
-    """To the target or along the path [m/s]."""
-    orientation: UnitQuaternion | None = None
-    thrust: float = 0.0
-    """With an orientation: over the mass [m/s²]."""
-
-    @property
-    def asked_speed(self) -> float:
-        """[m/s]"""
-        return self.speed if self.target is not None or self.points else math.hypot(*self.velocity)
-
-
-HOVER = Order()
-
-
-class QuadrotorState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """All that the further way of a `Quadrotor` follows from, beside commands, obstacles and the seed."""
-
-    body: Body
-    rotors: Rotors
-    """Speeds [rad/s]."""
-    reference: Vector = _REST
-    """Set-point of the velocity [m/s]."""
-    integral: Vector = _REST
-    """Of the velocity error [m/s²]."""
-    yaw: float = 0.0
-    """Set-point of the heading [rad]."""
-    order: Order = HOVER
-    hold: Vector | None = None
-    """Where it hovers [m]."""
-    along: float = 0.0
-    """Way along the path [m]."""
-    gust: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """State of the gust filters."""
-    energy_j: float = 0.0
-    """Taken from the battery in the episode."""
-    counted_j: int = 0
-    """Of these, how many were counted in frames."""
-    mode: Literal["flying", "landing", "falling", "landed"] = "flying"
-    touching: tuple[str, ...] = ()
-    """What it touched at the end of the last slice."""
 
 
 class Quadrotor:
@@ -175,7 +91,7 @@ class Quadrotor:
     ) -> None:
         self.limits = limits
         self.on_collision: OnCollision = on_collision
-        # Below the bounds too there may be ground: what falls comes down to z = 0, or farther where it may fly.
+        # The ground may lie below the bounds: what falls comes down to z = 0, or where it may fly.
         self.floor = min(limits.low[2], 0.5 * height)
         self._restitution = restitution
         self._hover: Rotors = (airframe.hover_speed,) * 4
@@ -190,7 +106,9 @@ class Quadrotor:
         self._lengths: tuple[tuple[Vector, ...], list[float]] = ((), [])
         self.state = QuadrotorState(body=Body(_REST), rotors=self._hover)
 
-    def reset(self, position: Vector, yaw: float, noise: Callable[[int], Sequence[float]] | None = None) -> None:
+    def reset(
+        self, position: Vector, yaw: float, noise: Callable[[int], Sequence[float]] | None = None
+    ) -> None:
         """Let it hover, with a full battery.
 
         Args:
@@ -301,9 +219,7 @@ class Quadrotor:
         if self.on_collision == "bounce" and state.mode == "flying":
             into = -state.body.velocity[2]
             bounce = self._restitution * into if into > 2.0 * _SINKING else 0.0
-        state.body = state.body._replace(
-            position=(x, y, z + depth), velocity=(0.0, 0.0, bounce), rates=_REST
-        )
+        state.body = state.body._replace(position=(x, y, z + depth), velocity=(0.0, 0.0, bounce), rates=_REST)
         if state.mode in ("landing", "falling"):
             self._land(state)
 
@@ -332,7 +248,9 @@ class Quadrotor:
             work += done
             left -= STEP_NS
         state.body, state.rotors = body, rotors
-        self._discharge(state, work / self._battery.drive_efficiency + self._battery.avionics_w * length, events)
+        self._discharge(
+            state, work / self._battery.drive_efficiency + self._battery.avionics_w * length, events
+        )
 
     def _discharge(self, state: QuadrotorState, energy_j: float, events: set[str]) -> None:
         state.energy_j += energy_j
@@ -358,9 +276,7 @@ class Quadrotor:
         state.gust = self._gusts.state
         return (mean[0] + x, mean[1] + y, mean[2] + z)
 
-    def _wanted(
-        self, state: QuadrotorState, order: Order, length: float, events: set[str]
-    ) -> Attitude:
+    def _wanted(self, state: QuadrotorState, order: Order, length: float, events: set[str]) -> Attitude:
         """The outer loops: attitude and thrust for a slice."""
         body = state.body
         if order.orientation is not None and state.mode == "flying":
@@ -427,7 +343,11 @@ class Quadrotor:
         wish = []
         for at, v, low, high in zip(position, velocity, limits.low, limits.high, strict=True):
             room = (high - at) if v > 0.0 else (at - low)
-            most = limits.speed if math.isinf(room) else braking_speed(max(room, 0.0), gain, limits.acceleration / 2)
+            most = (
+                limits.speed
+                if math.isinf(room)
+                else braking_speed(max(room, 0.0), gain, limits.acceleration / 2)
+            )
             if abs(scale * v) > most:
                 events.add(STOPPED_BY_GEOFENCE)
             wish.append(math.copysign(min(abs(scale * v), most), v))
