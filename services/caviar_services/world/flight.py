@@ -388,15 +388,16 @@ def _quadrotor(thing: FlownObject, wind: Wind, key: str) -> Quadrotor:
     limits = _limits(thing, key)
     if airframe.thrust_ratio <= _LEAST_RATIO:
         raise ScenarioError(
-            f"four rotors at {airframe.max_rotor_rad_s:g} rad/s lift {airframe.thrust_ratio:.2f} of the weight, "
-            f"and control needs {_LEAST_RATIO}; raise max_rotor_rad_s or thrust_n_s2, or lower mass_kg",
+            f"four rotors at {airframe.max_rotor_rad_s:g} rad/s lift {airframe.thrust_ratio:.2f} of the "
+            f"weight, and control needs {_LEAST_RATIO}; raise max_rotor_rad_s or thrust_n_s2, or lower "
+            "mass_kg",
             key=f"{key}.airframe.max_rotor_rad_s",
         )
     steepest = GRAVITY * math.tan(math.radians(controller.max_tilt_deg))
     if limits.acceleration > steepest:
         raise ScenarioError(
-            f"{limits.acceleration:g} m/s² is more than a tilt of {controller.max_tilt_deg:g}° gives; write at "
-            f"most {math.floor(steepest * 100) / 100}, or raise controller.max_tilt_deg",
+            f"{limits.acceleration:g} m/s² is more than a tilt of {controller.max_tilt_deg:g}° gives; write "
+            f"at most {math.floor(steepest * 100) / 100}, or raise controller.max_tilt_deg",
             key=f"{key}.max_acceleration_m_s2",
         )
     radius = math.hypot(*thing.dimensions_m) / 2

@@ -124,7 +124,8 @@ def answered(body: Body, contact: Contact, restitution: float, *, stops: bool) -
     """
     n, v, u = contact.normal, body.velocity, contact.velocity
     depth = contact.depth
-    position = tuple(a + depth * b for a, b in zip(body.position, n, strict=True))
+    x, y, z = (a + depth * b for a, b in zip(body.position, n, strict=True))
+    position = (x, y, z)
     into = dot((v[0] - u[0], v[1] - u[1], v[2] - u[2]), n)
     if into >= 0.0:
         return body._replace(position=position)

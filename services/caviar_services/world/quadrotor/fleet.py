@@ -84,7 +84,8 @@ class Fleet:
         limits, counts = set[str](), Counter[str]()
         for number in range(self._slices, elapsed_ns // SLICE_NS):
             for name, uav in self.quadrotors.items():
-                limits |= uav.fly_slice(orders.get(name), number)
+                for event in uav.fly_slice(orders.get(name), number):
+                    limits.add(event + name if event.endswith("/") else event)
             self._touch((number + 1) * SLICE_NS, counts)
         self._slices = elapsed_ns // SLICE_NS
         rest = elapsed_ns - self._slices * SLICE_NS

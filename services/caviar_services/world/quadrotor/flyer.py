@@ -46,6 +46,9 @@ _STANDING = 0.2
 # Horizontal speed [m/s] of the set-point from which on the heading follows it.
 _COURSE = 0.5
 
+# Share of the greatest acceleration with which it brakes before bounds and at the end of a path.
+_BRAKING = 0.5
+
 # Yaw rate over the error of the heading [1/s].
 _TURNING = 4.0
 
@@ -342,15 +345,12 @@ class Quadrotor:
         scale = min(1.0, limits.speed / math.hypot(*velocity))
         wish = []
         for at, v, low, high in zip(position, velocity, limits.low, limits.high, strict=True):
-            room = (high - at) if v > 0.0 else (at - low)
-            most = (
-                limits.speed
-                if math.isinf(room)
-                else braking_speed(max(room, 0.0), gain, limits.acceleration / 2)
-            )
-            if abs(scale * v) > most:
+            up = braking_speed(high - at, gain, _BRAKING * limits.acceleration)
+            down = -braking_speed(at - low, gain, _BRAKING * limits.acceleration)
+            kept = max(down, min(up, scale * v))  # outside of the bounds, back to them
+            if kept != scale * v:
                 events.add(STOPPED_BY_GEOFENCE)
-            wish.append(math.copysign(min(abs(scale * v), most), v))
+            wish.append(kept)
         x, y, z = wish
         return (x, y, z)
 
@@ -366,7 +366,7 @@ class Quadrotor:
         lag = math.dist(self._inside(point, events), state.body.position)
         lead = max(1.0, 0.5 * speed)
         gain = self._controller.position_1_s
-        pace = min(speed, braking_speed(lengths[-1] - state.along, gain, 0.5 * self.limits.acceleration))
+        pace = min(speed, braking_speed(lengths[-1] - state.along, gain, _BRAKING * self.limits.acceleration))
         pace *= max(0.0, min(1.0, 2.0 - lag / lead))
         state.along = min(lengths[-1], state.along + pace * length)
         x, y, z = self._pilot.towards(state.body.position, self._inside(point, events), speed)
