@@ -46,7 +46,7 @@ def test_scales_are_those_of_the_specification() -> None:
 def test_variances_do_not_depend_on_the_step(step: float) -> None:
     """σ² of the formulas within 6 standard errors, with the closed form of short and of long steps."""
     wind = Wind(velocity_m_s=(60.0, 0.0, 0.0), gusts="dryden", speed_6m_m_s=15.4)
-    long, tall, sigma, sigma_w = scales(HEIGHT, 15.4)
+    long, _, sigma, sigma_w = scales(HEIGHT, 15.4)
     # At 60 m/s a length passes in 1 to 2 s; variances of samples that far apart are independent.
     count = 60_000 if step < 0.1 else 20_000
     found = series(wind, count, step).var(axis=0)

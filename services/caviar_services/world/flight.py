@@ -28,7 +28,7 @@ from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, turning
 from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits, Motion
-from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe
+from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, Plant
 from caviar_services.world.quadrotor.contacts import OnCollision
 from caviar_services.world.quadrotor.control import Controller
 from caviar_services.world.quadrotor.fleet import Fleet
@@ -76,6 +76,9 @@ class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=
     """Of a quadrotor; unset: the defaults."""
     battery: Battery | None = None
     """Of a quadrotor; unset: the defaults."""
+    engine: Literal["caviar", "mujoco"] | None = None
+    """What integrates the rigid body of a quadrotor: ``caviar``, or ``mujoco``, which the extra of that name
+    brings; unset: ``caviar``."""
     on_collision: OnCollision | None = None
     """What a quadrotor does that touches scenery, an object of this world, or the ground at more than 2 m/s.
     ``stop``: it comes to rest there, and flies on where the way is free. ``bounce``: it rebounds. ``land``:
@@ -87,7 +90,7 @@ class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=
     """Of a quadrotor that bounces; unset: 0.5."""
 
 
-_QUADROTOR_KEYS = ("airframe", "controller", "battery", "on_collision", "restitution")
+_QUADROTOR_KEYS = ("airframe", "controller", "battery", "engine", "on_collision", "restitution")
 
 
 class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -417,7 +420,17 @@ def _quadrotor(thing: FlownObject, wind: Wind, key: str) -> Quadrotor:
         thing.on_collision or "stop",
         0.5 if thing.restitution is None else thing.restitution,
         thing.dimensions_m[2],
+        _plant(thing.engine, airframe),
     )
+
+
+def _plant(engine: str | None, airframe: Airframe) -> Plant:
+    if engine != "mujoco":
+        return Plant(airframe)
+    # Only here: a world without such a quadrotor needs no MuJoCo.
+    from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
+
+    return MujocoPlant(airframe)
 
 
 def _limits(thing: FlownObject, key: str) -> Limits:

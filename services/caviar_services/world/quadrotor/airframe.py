@@ -139,9 +139,10 @@ class Plant:
         Returns:
             Body and rotor speeds at the end, and the work at the rotors' shafts [J].
         """
-        middle = _lagged(speeds, commands, math.exp(-0.5 * h / self.airframe.rotor_lag_s))
-        end = _lagged(middle, commands, math.exp(-0.5 * h / self.airframe.rotor_lag_s))
-        w0, w1, w2 = self._wrench(speeds), self._wrench(middle), self._wrench(end)
+        left = math.exp(-0.5 * h / self.airframe.rotor_lag_s)
+        middle = lagged(speeds, commands, left)
+        end = lagged(middle, commands, left)
+        w0, w1, w2 = self.wrench(speeds), self.wrench(middle), self.wrench(end)
         v, q, o = body.velocity, body.orientation, body.rates
         derivative, half = self._derivative, 0.5 * h
         a1, d1, e1 = derivative(v, q, o, w0, air)
@@ -164,8 +165,12 @@ class Plant:
         work = sixth * (w0[4] + 4.0 * w1[4] + w2[4])
         return moved, end, work
 
-    def _wrench(self, speeds: Rotors) -> tuple[float, float, float, float, float]:
-        """Thrust [N], moments about x, y and z [N·m], and shaft power [W]."""
+    def wrench(self, speeds: Rotors) -> tuple[float, float, float, float, float]:
+        """Thrust [N], moments about x, y and z [N·m], and shaft power [W].
+
+        Args:
+            speeds: Of the rotors [rad/s].
+        """
         a, b, c, d = speeds
         aa, bb, cc, dd = a * a, b * b, c * c, d * d
         k, side = self.airframe.thrust_n_s2, self._side
@@ -224,8 +229,18 @@ class Plant:
         )
 
 
-def _lagged(speeds: Rotors, commands: Rotors, left: float) -> Rotors:
-    """Speeds after a time in which the share ``left`` of their distance from the commands is left."""
+def lagged(speeds: Rotors, commands: Rotors, left: float) -> Rotors:
+    """Rotor speeds after some time.
+
+    Args:
+        speeds: Before [rad/s].
+        commands: What they strive for [rad/s].
+        left: Share of the distance between them that is left after the time.
+
+    Example:
+        >>> lagged((600.0,) * 4, (700.0,) * 4, 0.5)[0]
+        650.0
+    """
     a, b, c, d = speeds
     i, j, k, n = commands
     return (i + (a - i) * left, j + (b - j) * left, k + (c - k) * left, n + (d - n) * left)

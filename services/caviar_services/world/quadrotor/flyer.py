@@ -70,6 +70,7 @@ class Quadrotor:
         on_collision: What it does when it touches something.
         restitution: Of a bounce.
         height: Of the body [m]: it stands half of it above the ground.
+        plant: What moves the body; None: `Plant` of the airframe.
 
     Example:
         >>> limits = Limits(speed=5.0, acceleration=2.0, clearance=1.0, low=(-9.0,) * 3, high=(9.0,) * 3)
@@ -91,6 +92,7 @@ class Quadrotor:
         on_collision: OnCollision = "stop",
         restitution: float = 0.5,
         height: float = 0.25,
+        plant: Plant | None = None,
     ) -> None:
         self.limits = limits
         self.on_collision: OnCollision = on_collision
@@ -99,7 +101,7 @@ class Quadrotor:
         self._restitution = restitution
         self._hover: Rotors = (airframe.hover_speed,) * 4
         self._mass = airframe.mass_kg
-        self._plant = Plant(airframe)
+        self._plant = plant or Plant(airframe)
         self._pilot = Autopilot(airframe, controller, limits.acceleration)
         self._controller = controller
         self._battery = battery
