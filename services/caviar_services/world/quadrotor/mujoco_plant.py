@@ -21,8 +21,8 @@ from caviar_services.world.quadrotor.airframe import (
 class MujocoPlant(Plant):
     """Moves the body by MuJoCo, as `Plant` does itself.
 
-    Forces and moments of the rotors are those of the middle of the step, held over it: errors are of the second
-    order in its length.
+    Forces and moments of the rotors are those of the middle of the step, held over it: errors are of the
+    second order in its length.
 
     Args:
         airframe: What the quadrotor is made of.
