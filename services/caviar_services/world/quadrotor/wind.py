@@ -83,7 +83,7 @@ def scales(height_m: float, speed_6m: float) -> tuple[float, float, float, float
 
     Example:
         >>> [round(value, 2) for value in scales(30.48, 15.4)]  # 100 ft
-        [142.97, 30.48, 2.58, 1.54]
+        [153.98, 30.48, 2.64, 1.54]
     """
     h = min(max(height_m / _FOOT, _LOW), _HIGH)
     base = 0.177 + 0.000823 * h
