@@ -202,7 +202,7 @@ def test_a_ground_station_flies_a_quadrotor(peer: Peer, pilot: MavlinkAgent) -> 
     world.reset(0, 1, 0)
     peer.send(peer.position_target(POSITION_ONLY, 12.0, -6.0, -20.0))
     action: Any = None
-    telemetry = {}
+    telemetry: dict[str, Any] = {}
     for number in range(130):
         entry = GrantInput(topic="action", source="pilot", status=Status.FRESH, frame=number - 1)
         inputs = (FrameInput(entry, payload=action),) if action else ()

@@ -89,7 +89,8 @@ def scene_of(result: StepResult) -> Scene:
 
 def position(result: StepResult, name: str = "uav") -> np.ndarray:
     scene = scene_of(result)
-    return scene.position[scene.names.index(name)]
+    place: np.ndarray = scene.position[scene.names.index(name)]
+    return place
 
 
 def counted(results: Sequence[StepResult]) -> Counter[str]:
@@ -334,7 +335,9 @@ def test_another_process_flies_on_bit_by_bit(tmp_path: Path, period_ms: int) -> 
             command = VelocityCommand(object="uav", velocity=(6.0, 0.0, 0.0))
         return frame(number, command, t_ns=number * period_ms * 1_000_000)
 
-    made = lambda: world(flown(battery=Battery(capacity_wh=10.0)), wind=GUSTY, scenery=file)  # noqa: E731
+    def made() -> FlightWorld:
+        return world(flown(battery=Battery(capacity_wh=10.0)), wind=GUSTY, scenery=file)
+
     original = made()
     results, kept = [], []
     for number in range(1, 50):
