@@ -15,6 +15,8 @@ from caviar_protocol.space.coordinates import Vector, quaternion_from_euler, rot
 from caviar_services.world.quadrotor.airframe import AIR_DENSITY, GRAVITY, Airframe, Body, Plant, Rotors
 from caviar_services.world.quadrotor.control import Attitude, Autopilot, Controller
 
+pytestmark = pytest.mark.slow
+
 STILL: Vector = (0.0, 0.0, 0.0)
 OFF: Rotors = (0.0, 0.0, 0.0, 0.0)
 STEP = 0.002

@@ -14,6 +14,8 @@ from caviar_protocol.errors import SetupError
 from caviar_services.world.quadrotor.airframe import Airframe, Body
 from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
 
+pytestmark = pytest.mark.slow
+
 HAS_MUJOCO = importlib.util.find_spec("mujoco") is not None
 with_mujoco = pytest.mark.skipif(not HAS_MUJOCO, reason="needs MuJoCo, the extra mujoco")
 

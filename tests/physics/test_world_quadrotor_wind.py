@@ -14,6 +14,8 @@ from caviar_services.world.quadrotor.flyer import Quadrotor
 from caviar_services.world.quadrotor.state import Battery
 from caviar_services.world.quadrotor.wind import NOISES, Gusts, Wind, scales
 
+pytestmark = pytest.mark.slow
+
 LIMITS = Limits(speed=12.0, acceleration=4.0, clearance=1.0, low=(-99.0, -99.0, 0.125), high=(99.0,) * 3)
 HEIGHT = 30.0
 PLACE = (0.0, 0.0, HEIGHT)

@@ -34,6 +34,8 @@ from caviar_services.world.quadrotor.state import Battery
 from caviar_services.world.quadrotor.wind import Wind
 from caviar_services.world.trajectory import MovingObject
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 100_000_000
 START = (0.0, 0.0, 30.0)
 RADIUS = math.hypot(0.6, 0.6, 0.25) / 2

@@ -16,7 +16,7 @@ from itertools import accumulate, pairwise
 from caviar_protocol.space.coordinates import Vector, euler_from_quaternion, quaternion_from_euler
 from caviar_services.world.flight_dynamics import LIMITED_SPEED, STOPPED_BY_GEOFENCE, Limits
 from caviar_services.world.quadrotor.airframe import Airframe, Body, Plant, Rotors
-from caviar_services.world.quadrotor.contacts import GROUND, Contact, OnCollision, answered
+from caviar_services.world.quadrotor.contacts import GROUND, SCENERY, Contact, OnCollision, answered
 from caviar_services.world.quadrotor.control import Attitude, Autopilot, Controller, braking_speed
 from caviar_services.world.quadrotor.state import (
     BATTERY_EMPTY,
@@ -214,7 +214,9 @@ class Quadrotor:
         )
         if first:  # what the controller had gathered belongs to another motion
             state.reference, state.integral = state.body.velocity, _REST
-        if state.mode in ("landing", "falling") and contact.normal[2] > _BEARS:
+        # On what moves it does not lie: that may drive on.
+        bears = contact.what == SCENERY and contact.normal[2] > _BEARS
+        if state.mode in ("landing", "falling") and bears:
             self._land(state)
 
     def _stand(self, state: QuadrotorState, depth: float) -> None:
