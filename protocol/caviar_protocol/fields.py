@@ -275,6 +275,8 @@ SINCE: dict[str, str] = {
     "Link.throughput": "1.5",
     "Link.blocks": "1.5",
     "Link.block_errors": "1.5",
+    "PathCommand": "1.6",
+    "AttitudeCommand": "1.6",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

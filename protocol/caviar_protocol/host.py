@@ -146,6 +146,8 @@ _MODULES = {
     "datasets": "distributed",
     "learning": "stable_baselines3",
     "plot": "matplotlib",
+    "mavlink": "pymavlink",
+    "mujoco": "mujoco",
     "system": "sionna.sys",
 }
 
@@ -154,8 +156,8 @@ def has_extra(extra: str) -> bool:
     """Whether the libraries of an extra can be imported; they are not imported for that.
 
     Args:
-        extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``datasets``, ``learning``, ``plot`` or
-            ``system``.
+        extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``datasets``, ``learning``, ``plot``,
+            ``mavlink``, ``mujoco`` or ``system``.
     """
     package, _, inner = _MODULES[extra].partition(".")
     spec = importlib.util.find_spec(package)

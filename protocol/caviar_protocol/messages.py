@@ -46,7 +46,7 @@ from caviar_protocol.fields import Report as Report
 from caviar_protocol.fields import Role as Role
 from caviar_protocol.fields import Status as Status
 
-PROTOCOL_VERSION = (1, 5)
+PROTOCOL_VERSION = (1, 6)
 """Major and minor version of the protocol that this package speaks."""
 
 CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
@@ -67,7 +67,7 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     Example:
         >>> hello = Hello(version=PROTOCOL_VERSION, name="agent", role="agent", outputs=("action",))
         >>> msgspec.to_builtins(hello)  # the map on the wire
-        {'type': 'HELLO', 'version': (1, 5), 'name': 'agent', 'role': 'agent', 'outputs': ('action',)}
+        {'type': 'HELLO', 'version': (1, 6), 'name': 'agent', 'role': 'agent', 'outputs': ('action',)}
     """
 
     version: Version

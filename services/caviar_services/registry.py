@@ -53,6 +53,7 @@ BUILT_IN: dict[str, str] = {
     "agent:out-of-band": "caviar_services.agent.out_of_band:OutOfBandAgent",
     "agent:ucb": "caviar_services.agent.bandits:UcbAgent",
     "agent:thompson": "caviar_services.agent.bandits:ThompsonAgent",
+    "agent:mavlink": "caviar_services.agent.mavlink:MavlinkAgent",
     "agent:learner": "caviar_services.agent.learner:LearnerAgent",
     "agent:policy": "caviar_services.agent.policy:PolicyAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",

@@ -29,6 +29,7 @@ EXTRAS = {
     "channel:sionna-rt": "sionna",
     "sensors:lidar": "mitsuba",
     "agent:policy": "onnx",
+    "agent:mavlink": "pymavlink",
 }
 """Package without which an implementation cannot run; a base install skips it."""
 
@@ -103,6 +104,8 @@ def _tests_of(key: str) -> type[ServiceConformance]:
         members["settings"] = {"file": f"file:{_first_beams()}", "observe": ["aod"]}
     if key == "agent:fingerprint":
         members["settings"] = {"file": f"file:{_recorded_street()}"}
+    if key == "agent:mavlink":
+        members["settings"] = {"object": "car.a", "listen": "127.0.0.1:0"}
     if key == "agent:out-of-band":  # the street's channel has one carrier, of which it takes the spectrum
         members["settings"] = {"aid": samples.CARRIERS[0].name}
         higher = replace(samples.CARRIERS[0], name="higher", frequency_hz=60e9)

@@ -54,6 +54,15 @@ def test_vector_of_environments(tmp_path: Path) -> None:
     assert re.search(r"of 64 together: \d+ times as many\nmean \|y\| by azimuth alone: \d", printed)
 
 
+def test_tilted_beams(tmp_path: Path) -> None:
+    """The UAV leans by more than the width of a beam as soon as it flies off."""
+    printed = started(tmp_path, "tilted_beams.py", "--frames", "30")
+    assert re.search(r"^pitch -?\d\S*° to [23]\d\.\d°: [4-9] of 16 beams", printed, re.MULTILINE)
+    lost = re.search(r"without knowing the tilt: ([\d.]+) dB lost in the mean", printed)
+    assert lost is not None
+    assert float(lost[1]) > 5
+
+
 def test_two_agents_deliver(tmp_path: Path) -> None:
     pytest.importorskip("pettingzoo", reason="PettingZoo is not installed")
     printed = started(tmp_path, "two_agents.py", "--seeds", "1")

@@ -24,9 +24,8 @@ from caviar_protocol.topics import (
     Lidar,
     Scene,
     Segmentation,
-    VelocityCommand,
-    WaypointCommand,
 )
+from caviar_protocol.topics.link import MotionCommand
 from caviar_protocol.topics.scene import Device
 from caviar_protocol.topics.sensors import CameraImage, DepthImage
 
@@ -209,8 +208,8 @@ class DeviceArrays(NamedArrays[Scene]):
 _NO_VECTOR = (np.nan, np.nan, np.nan)
 
 
-def _motions(action: Action) -> list[WaypointCommand | VelocityCommand]:
-    return [c for c in action.commands if isinstance(c, WaypointCommand | VelocityCommand)]
+def _motions(action: Action) -> list[MotionCommand]:
+    return [c for c in action.commands if isinstance(c, MotionCommand)]
 
 
 def _each_motion(field: str, missing: Any) -> Callable[[Any, Action], Rows]:
@@ -227,7 +226,10 @@ class MotionArrays(NamedArrays[Action]):
         np.float64, 3, unit="m", doc="where to; NaN: not commanded", rows=_each_motion("position", _NO_VECTOR)
     )
     speed = Column(
-        np.float64, unit="m/s", doc="at most, towards the waypoint", rows=_each_motion("speed", np.nan)
+        np.float64,
+        unit="m/s",
+        doc="at most, towards the waypoint or along the path",
+        rows=_each_motion("speed", np.nan),
     )
     velocity = Column(
         np.float64,
@@ -235,6 +237,18 @@ class MotionArrays(NamedArrays[Action]):
         unit="m/s",
         doc="in world axes; NaN: not commanded",
         rows=_each_motion("velocity", _NO_VECTOR),
+    )
+    orientation = Column(
+        np.float64,
+        4,
+        doc="attitude, w, x, y, z; NaN: not commanded",
+        rows=_each_motion("orientation", (np.nan, *_NO_VECTOR)),
+    )
+    thrust = Column(
+        np.float64,
+        unit="m/s2",
+        doc="over the mass, with an attitude; NaN: not commanded",
+        rows=_each_motion("thrust", np.nan),
     )
 
     def keys_of(self, payload: Action) -> Sequence[str]:

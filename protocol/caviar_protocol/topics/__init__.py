@@ -20,8 +20,10 @@ from caviar_protocol.topics.channel import (
 )
 from caviar_protocol.topics.link import (
     Action,
+    AttitudeCommand,
     BeamChoice,
     Link,
+    PathCommand,
     UserSchedule,
     VelocityCommand,
     WaypointCommand,

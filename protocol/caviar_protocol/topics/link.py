@@ -12,6 +12,7 @@ from caviar_protocol.arrays import (
     Int32Array,
     Int64Array,
     Payload,
+    Quaternion,
     Vector3,
     array,
     quantity,
@@ -89,7 +90,47 @@ class UserSchedule(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Device that it serves."""
 
 
-Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule
+class PathCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="path"):
+    """Fly an object along straight lines between points, without a stop between them. The actuator is
+    ``motion:<object>``.
+
+    The same command again, in the frames after, continues on the way. Worlds need not know it.
+
+    Example:
+        >>> square = ((0.0, 0.0, 9.0), (9.0, 0.0, 9.0), (9.0, 9.0, 9.0))
+        >>> len(PathCommand(object="uav", points=square, speed=5.0).points)
+        3
+    """
+
+    object: str
+    """Object to be moved."""
+    points: tuple[Vector3, ...]
+    """Corners in the order of flight; it hovers at the last one, and where there is none."""
+    speed: Annotated[float, quantity("m/s", "at most", gt=0)]
+
+
+class AttitudeCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="attitude"):
+    """Give an object that flies by rotors an attitude and a thrust. The actuator is ``motion:<object>``.
+
+    Worlds need not know it.
+
+    Example:
+        >>> level = (1.0, 0.0, 0.0, 0.0)
+        >>> AttitudeCommand(object="uav", orientation=level, thrust=9.80665).thrust  # it hovers
+        9.80665
+    """
+
+    object: str
+    """Object to be moved."""
+    orientation: Quaternion
+    """Of the body: body axes to world axes."""
+    thrust: Annotated[float, quantity("m/s2", "over the mass, along the body's z", ge=0)]
+
+
+MotionCommand = WaypointCommand | VelocityCommand | PathCommand | AttitudeCommand
+"""Commands of which the actuator is ``motion:<object>``."""
+
+Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule | PathCommand | AttitudeCommand
 
 
 class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -52,6 +52,8 @@ class ObjectState(NamedTuple):
     """Length (x), width (y), height (z) [m]."""
     yaw_rate: float = 0.0
     """[rad/s] about the vertical through its position, counter-clockwise; 0 also where it is not known."""
+    tilt_rate: tuple[float, float] = (0.0, 0.0)
+    """[rad/s] about the world's x and y through its position, right-handed."""
 
 
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -287,12 +289,10 @@ def _may_begin(on: str, prefix: str) -> bool:
 
 def _turning(states: Sequence[ObjectState]) -> Float64Array | None:
     """Angular velocities, Shape ``[N, 3]``; None where nothing turns, so that such scenes stay as short."""
-    rates = [state.yaw_rate for state in states]
-    if not any(rates):
+    rates = [(*state.tilt_rate, state.yaw_rate) for state in states]
+    if not any(map(any, rates)):
         return None
-    turning = np.zeros((len(states), 3))
-    turning[:, 2] = rates
-    return turning + 0.0  # as in `_tables`
+    return np.array(rates) + 0.0  # as in `_tables`
 
 
 def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:

@@ -1,6 +1,8 @@
 """World ``flight``: objects that agents fly, a UAV for instance, beside scripted ones.
 
-A flown object obeys one motion command per frame; without one it brakes and hovers.
+A flown object obeys one motion command per frame; without one it brakes and hovers. As a point it has
+bounded speed and acceleration and keeps clear of obstacles (`flight_dynamics`); as a quadrotor it is a rigid
+body with rotors in wind (`quadrotor`), which may touch what is in its way.
 """
 
 from __future__ import annotations
@@ -8,7 +10,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, ClassVar
+from itertools import chain
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -16,12 +19,22 @@ from msgspec.structs import replace
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
-from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
-from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scene_validation import UNIT_TOLERANCE
+from caviar_protocol.space.coordinates import Vector, quaternion_from_euler, rotated
+from caviar_protocol.topics import Action, AttitudeCommand, PathCommand, VelocityCommand, WaypointCommand
+from caviar_protocol.topics.link import MotionCommand
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
-from caviar_services.world.base import ObjectState
+from caviar_services.world.base import ObjectState, turning
 from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits, Motion
+from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, Plant
+from caviar_services.world.quadrotor.contacts import OnCollision
+from caviar_services.world.quadrotor.control import Controller
+from caviar_services.world.quadrotor.fleet import Fleet
+from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
+from caviar_services.world.quadrotor.state import Battery, Order, QuadrotorState
+from caviar_services.world.quadrotor.wind import Wind
 from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 from caviar_services.world.trajectory import (
     MovingObject,
@@ -30,6 +43,12 @@ from caviar_services.world.trajectory import (
     TrajectoryWorld,
     unique_name,
 )
+
+# Triangles at most this high above the ground [m] are the ground.
+_FLAT = 1e-3
+
+# Greatest thrust over the weight of a quadrotor that can be controlled.
+_LEAST_RATIO = 1.2
 
 
 class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,6 +66,31 @@ class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=
     that lie at this height or lower are no obstacles."""
     maximum_m: tuple[float, float, float] | None = None
     """Greatest x, y and z of the centre; unset: no bounds."""
+    dynamics: Literal["point", "quadrotor"] = "point"
+    """``point``: bounded speed and acceleration, upright, clear of scenery. ``quadrotor``: a rigid body with
+    four rotors, which tilts, is moved by the wind, and may collide; ``clearance_m`` is asked for at its start
+    alone, and ``max_acceleration_m_s2`` bounds what its controller strives for."""
+    airframe: Airframe | None = None
+    """Of a quadrotor; unset: the defaults."""
+    controller: Controller | None = None
+    """Of a quadrotor; unset: the defaults."""
+    battery: Battery | None = None
+    """Of a quadrotor; unset: the defaults."""
+    engine: Literal["caviar", "mujoco"] | None = None
+    """What integrates the rigid body of a quadrotor: ``caviar``, or ``mujoco``, which the extra of that name
+    brings; unset: ``caviar``."""
+    on_collision: OnCollision | None = None
+    """What a quadrotor does that touches scenery, an object of this world, or the ground at more than 2 m/s.
+    ``stop``: it comes to rest there, and flies on where the way is free. ``bounce``: it rebounds. ``land``:
+    it goes down with 1 m/s and stays there. ``fall``: its rotors stop. ``ignore``: it passes through, but for
+    the ground. Unset: ``stop``. Each collision is counted."""
+    restitution: (
+        Annotated[float, quantity("1", "speed after a bounce over that before", ge=0, le=1)] | None
+    ) = None
+    """Of a quadrotor that bounces; unset: 0.5."""
+
+
+_QUADROTOR_KEYS = ("airframe", "controller", "battery", "engine", "on_collision", "restitution")
 
 
 class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -56,16 +100,19 @@ class FlightSettings(TrajectorySettings, frozen=True, kw_only=True, forbid_unkno
     """Scripted objects, as in the world ``trajectory``."""
     flown: tuple[FlownObject, ...]
     """Objects that agents fly."""
+    wind: Wind = Wind()
+    """The air, which moves quadrotors."""
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     elapsed_ns: Annotated[int, msgspec.Meta(ge=0)]
     """Since the beginning of the episode."""
     flyers: dict[str, FlyerState]
+    quadrotors: dict[str, QuadrotorState] = {}
 
 
 class FlightWorld(TrajectoryWorld):
-    """Objects that agents fly, with limited speed and acceleration, clear of the scenery.
+    """Objects that agents fly, as points clear of the scenery or as quadrotors.
 
     Beside other worlds of a run, commands for objects of no name of its own are left to them.
 
@@ -74,7 +121,8 @@ class FlightWorld(TrajectoryWorld):
         run: What the world knows about the run.
 
     Raises:
-        ScenarioError: Two objects have one name, or limits contradict each other; names the key.
+        ScenarioError: Two objects have one name, limits contradict each other, or a quadrotor cannot fly as
+            they say; names the key.
 
     Example:
         >>> uav = FlownObject(name="uav", start_m=(0, 0, 30), max_speed_m_s=10, max_acceleration_m_s2=2)
@@ -93,11 +141,31 @@ class FlightWorld(TrajectoryWorld):
         self._elapsed_ns = 0
         self._begun = False
         self._alone = True
+        quadrotors: dict[str, Quadrotor] = {}
         for index, thing in enumerate(settings.flown):
             key = f"services.{run.name}.settings.flown[{index}]"
             name = unique_name(settings, thing, {*self._flown, *self._tracks}, key)
             self._flown[name] = thing
-            self._flyers[name] = Flyer(_limits(thing, key))
+            if thing.dynamics == "point":
+                self._flyers[name] = Flyer(_limits(thing, key))
+            else:
+                quadrotors[name] = _quadrotor(thing, settings.wind, key)
+        radii = {name: math.hypot(*self._flown[name].dimensions_m) / 2 for name in quadrotors}
+        self._fleet = Fleet(quadrotors, radii, super().objects_at, run.name)
+
+    @classmethod
+    def check_settings(cls, settings: TrajectorySettings, place: Place) -> None:
+        """Raise `ScenarioError` for what a point does not have."""
+        super().check_settings(settings, place)
+        if not isinstance(settings, FlightSettings):
+            return
+        for index, thing in enumerate(settings.flown):
+            where = place.at("flown").at(index)
+            given = [key for key in _QUADROTOR_KEYS if getattr(thing, key) is not None]
+            if thing.dynamics == "point" and given:
+                raise where.at(given[0]).error('is for quadrotors; write dynamics = "quadrotor" beside it')
+        if settings.wind != Wind() and all(thing.dynamics == "point" for thing in settings.flown):
+            raise place.at("wind").error('moves quadrotors alone; write dynamics = "quadrotor" in [[flown]]')
 
     @classmethod
     def placements(cls, settings: TrajectorySettings) -> Iterable[tuple[str, str, Sequence[Vector]]]:
@@ -123,15 +191,24 @@ class FlightWorld(TrajectoryWorld):
         """
         self._alone = len(preparation.producers.get("scene", ())) <= 1
         triangles = scenery_triangles(scenery_assets(self.settings.scenery))
-        for index, (name, flyer) in enumerate(self._flyers.items()):
-            thing = self._flown[name]
+        tops = triangles[..., 2].max(axis=1)
+        for index, (name, thing) in enumerate(self._flown.items()):
             # The ground below the bounds cannot be reached: most triangles of a flat street are left out so.
-            flyer.obstacles = Obstacles(triangles[triangles[..., 2].max(axis=1) > flyer.limits.low[2]])
-            distance = flyer.obstacles.distance(thing.start_m, flyer.limits.kept)
-            if distance < flyer.limits.kept:
+            if name in self._flyers:
+                limits, floor = self._flyers[name].limits, self._flyers[name].limits.low[2]
+            else:
+                uav = self._fleet.quadrotors[name]
+                limits, floor = uav.limits, uav.floor - thing.dimensions_m[2] / 2 + _FLAT
+            obstacles = Obstacles(triangles[tops > floor])
+            if name in self._flyers:
+                self._flyers[name].obstacles = obstacles
+            else:
+                self._fleet.obstacles[name] = obstacles
+            distance = obstacles.distance(thing.start_m, limits.kept)
+            if distance < limits.kept:
                 raise ScenarioError(
                     f"{list(thing.start_m)} is {distance:.3f} m from the scenery, and {name!r} keeps "
-                    f"{flyer.limits.kept:.3f} m; start farther away",
+                    f"{limits.kept:.3f} m; start farther away",
                     key=f"services.{self.run.name}.settings.flown[{index}].start_m",
                 )
         return super().prepare(preparation)
@@ -139,15 +216,19 @@ class FlightWorld(TrajectoryWorld):
     def begin(self, episode: int, seed: int) -> None:
         """Every episode starts at the same place; then commands decide."""
         self._elapsed_ns, self._begun = 0, False
-        for name, thing in self._flown.items():
-            self._flyers[name].reset(thing.start_m, math.radians(thing.start_yaw_deg))
+        starts = {
+            name: (thing.start_m, math.radians(thing.start_yaw_deg)) for name, thing in self._flown.items()
+        }
+        for name, flyer in self._flyers.items():
+            flyer.reset(*starts[name])
+        self._fleet.begin(episode, seed, starts)
 
     def step(self, frame: Frame) -> StepResult:
         """The scene at the frame's instant, the commands having acted since the one before.
 
         Raises:
             PayloadError: A command is for no object of this world, is not finite, is one of two for an
-                object, or puts an object where it cannot be.
+                object, is none that the object can obey, or puts an object where it cannot be.
             RunError: The process before this one took the state of the flight with it.
         """
         if frame.number > 0 and not self._begun:
@@ -158,35 +239,44 @@ class FlightWorld(TrajectoryWorld):
             )
         # `restore` sets it too: where states are saved, a world that is started again is not lost.
         self._begun = True
-        motions = self._motions(frame)
-        self._place(motions)
+        commands = self._commands(frame)
+        motions = {name: _motion(*commands[name]) for name in self._flyers if name in commands}
+        orders = {name: _order(*commands[name]) for name in self._fleet.quadrotors if name in commands}
+        self._place(commands)
         counts: Counter[str] = Counter()
         elapsed_ns = frame.t_ns - self._t0_ns
         length_ns = elapsed_ns - self._elapsed_ns
         for name, flyer in self._flyers.items():
             counts.update(flyer.fly(motions.get(name), length_ns))
+        counts.update(self._fleet.fly(orders, elapsed_ns))
         self._elapsed_ns = elapsed_ns
         made = super().step(frame)
         return replace(made, counts={**made.counts, **counts})
 
-    def _place(self, motions: Mapping[str, Motion]) -> None:
+    def _place(self, commands: Mapping[str, tuple[str, MotionCommand]]) -> None:
         """Put the objects where they are to be at once; they hover there."""
-        for name, motion in motions.items():
-            if motion.at_once and motion.target is not None:
-                flyer = self._flyers[name]
-                limits, target = flyer.limits, motion.target
+        for name, (_, command) in commands.items():
+            if isinstance(command, WaypointCommand) and command.at_once:
+                flyer, uav = self._flyers.get(name), self._fleet.quadrotors.get(name)
+                limits = flyer.limits if flyer else self._fleet.quadrotors[name].limits
+                obstacles = flyer.obstacles if flyer else self._fleet.obstacles[name]
+                target = command.position
                 inside = all(a <= x <= b for a, x, b in zip(limits.low, target, limits.high, strict=True))
-                if not inside or flyer.obstacles.distance(target, limits.kept) < limits.kept:
+                if not inside or obstacles.distance(target, limits.kept) < limits.kept:
                     raise PayloadError(
                         f"{name!r} cannot be at {list(target)}: it keeps within {list(limits.low)} and "
                         f"{list(limits.high)}, and {limits.kept:.3f} m clear of scenery; choose another point"
                     )
-                flyer.reset(target, flyer.state.yaw)
+                if flyer:
+                    flyer.reset(target, flyer.state.yaw)
+                elif uav:
+                    uav.place(target)
 
     def checkpoint(self) -> bytes:
         """The motion of each flown object: it follows from all commands since the episode began."""
         flyers = {name: flyer.state for name, flyer in self._flyers.items()}
-        return saved(self, 1, _State(elapsed_ns=self._elapsed_ns, flyers=flyers))
+        quadrotors = {name: uav.state for name, uav in self._fleet.quadrotors.items()}
+        return saved(self, 1, _State(elapsed_ns=self._elapsed_ns, flyers=flyers, quadrotors=quadrotors))
 
     def restore(self, state: bytes) -> None:
         """See `checkpoint`."""
@@ -194,20 +284,21 @@ class FlightWorld(TrajectoryWorld):
         self._elapsed_ns, self._begun = was.elapsed_ns, True
         for name, flyer in self._flyers.items():
             flyer.state = was.flyers[name]
+        self._fleet.resume(was.quadrotors, was.elapsed_ns)
 
-    def _motions(self, frame: Frame) -> dict[str, Motion]:
-        """Commands for each flown object; beams and schedules are not for worlds."""
-        found: dict[str, tuple[str, Motion]] = {}
+    def _commands(self, frame: Frame) -> dict[str, tuple[str, MotionCommand]]:
+        """Agent and command for each flown object; beams and schedules are not for worlds."""
+        found: dict[str, tuple[str, MotionCommand]] = {}
         for agent, action in frame.payloads("action", Action).items():
             for command in action.commands:
-                if not isinstance(command, VelocityCommand | WaypointCommand):
+                if not isinstance(command, MotionCommand):
                     continue
                 name = command.object
-                if name not in self._flyers:
+                if name not in self._flown:
                     # It may be meant for another world of the run; alone, no other can fly it.
                     if not self._alone and not name.startswith(self.prefixes()):
                         continue
-                    known = ", ".join(map(repr, self._flyers)) or "none"
+                    known = ", ".join(map(repr, self._flown)) or "none"
                     raise PayloadError(
                         f"agent {agent!r} commands the motion of {name!r}, which world {self.run.name!r} "
                         f"does not fly; it flies {known}"
@@ -217,8 +308,8 @@ class FlightWorld(TrajectoryWorld):
                         f"agents {found[name][0]!r} and {agent!r} both command the motion of {name!r}; "
                         f"let one of them own 'motion:{name}'"
                     )
-                found[name] = agent, _motion(command, agent)
-        return {name: motion for name, (_, motion) in found.items()}
+                found[name] = agent, command
+        return found
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """The scripted objects, and the flown ones where they are now."""
@@ -234,18 +325,112 @@ class FlightWorld(TrajectoryWorld):
                 dimensions=thing.dimensions_m,
                 yaw_rate=flyer.state.yaw_rate,
             )
+        for name, seen in self._fleet.seen.items():
+            body = seen.body
+            x, y, z = rotated(body.orientation, body.rates)
+            yield ObjectState(
+                name=name,
+                kind=self._flown[name].kind,
+                position=body.position,
+                orientation=body.orientation,
+                velocity=body.velocity,
+                dimensions=self._flown[name].dimensions_m,
+                yaw_rate=turning(z),
+                tilt_rate=(turning(x), turning(y)),
+            )
 
 
-def _motion(command: VelocityCommand | WaypointCommand, agent: str) -> Motion:
+def _motion(agent: str, command: MotionCommand) -> Motion:
+    """What a point is commanded."""
+    _check_finite(agent, command)
     if isinstance(command, WaypointCommand):
-        motion = Motion(target=command.position, speed=command.speed, at_once=command.at_once)
-        values: tuple[float, ...] = (*command.position, command.speed)
-    else:
-        motion = Motion(velocity=command.velocity)
+        return Motion(target=command.position, speed=command.speed, at_once=command.at_once)
+    if isinstance(command, VelocityCommand):
+        return Motion(velocity=command.velocity)
+    raise PayloadError(
+        f"agent {agent!r} sends {type(command).__name__} to {command.object!r}, which flies as a point; "
+        'write dynamics = "quadrotor" for it, or send waypoints or velocities'
+    )
+
+
+def _order(agent: str, command: MotionCommand) -> Order:
+    """What a quadrotor is commanded."""
+    _check_finite(agent, command)
+    if isinstance(command, WaypointCommand):
+        return Order(target=command.position, speed=command.speed)
+    if isinstance(command, VelocityCommand):
+        return Order(velocity=command.velocity)
+    if isinstance(command, PathCommand):
+        return Order(points=command.points, speed=command.speed)
+    norm = math.hypot(*command.orientation)
+    if abs(norm - 1.0) > UNIT_TOLERANCE:
+        raise PayloadError(
+            f"agent {agent!r} commands {command}, whose orientation has norm {norm:.6g}; command a unit "
+            "quaternion (w, x, y, z)"
+        )
+    w, x, y, z = command.orientation
+    return Order(orientation=(w / norm, x / norm, y / norm, z / norm), thrust=command.thrust)
+
+
+def _check_finite(agent: str, command: MotionCommand) -> None:
+    values: tuple[float, ...]
+    if isinstance(command, VelocityCommand):
         values = command.velocity
+    elif isinstance(command, AttitudeCommand):
+        values = (*command.orientation, command.thrust)
+    elif isinstance(command, PathCommand):
+        values = (*chain.from_iterable(command.points), command.speed)
+    else:
+        values = (*command.position, command.speed)
     if not all(map(math.isfinite, values)):
         raise PayloadError(f"agent {agent!r} commands {command}, which is not finite; command numbers")
-    return motion
+
+
+def _quadrotor(thing: FlownObject, wind: Wind, key: str) -> Quadrotor:
+    airframe, controller = thing.airframe or Airframe(), thing.controller or Controller()
+    limits = _limits(thing, key)
+    if airframe.thrust_ratio <= _LEAST_RATIO:
+        raise ScenarioError(
+            f"four rotors at {airframe.max_rotor_rad_s:g} rad/s lift {airframe.thrust_ratio:.2f} of the "
+            f"weight, and control needs {_LEAST_RATIO}; raise max_rotor_rad_s or thrust_n_s2, or lower "
+            "mass_kg",
+            key=f"{key}.airframe.max_rotor_rad_s",
+        )
+    steepest = GRAVITY * math.tan(math.radians(controller.max_tilt_deg))
+    if limits.acceleration > steepest:
+        raise ScenarioError(
+            f"{limits.acceleration:g} m/s² is more than a tilt of {controller.max_tilt_deg:g}° gives; write "
+            f"at most {math.floor(steepest * 100) / 100}, or raise controller.max_tilt_deg",
+            key=f"{key}.max_acceleration_m_s2",
+        )
+    radius = math.hypot(*thing.dimensions_m) / 2
+    # Contacts are looked for once a slice: in it the centre must not get past the middle of a wall's surface.
+    fastest = radius / (SLICE_NS * 1e-9)
+    if limits.speed > fastest:
+        raise ScenarioError(
+            f"{limits.speed:g} m/s would pass through a wall between two looks; write at most {fastest:.0f}",
+            key=f"{key}.max_speed_m_s",
+        )
+    return Quadrotor(
+        airframe,
+        controller,
+        thing.battery or Battery(),
+        limits,
+        wind,
+        thing.on_collision or "stop",
+        0.5 if thing.restitution is None else thing.restitution,
+        thing.dimensions_m[2],
+        _plant(thing.engine, airframe),
+    )
+
+
+def _plant(engine: str | None, airframe: Airframe) -> Plant:
+    if engine != "mujoco":
+        return Plant(airframe)
+    # Only here: a world without such a quadrotor needs no MuJoCo.
+    from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
+
+    return MujocoPlant(airframe)
 
 
 def _limits(thing: FlownObject, key: str) -> Limits:

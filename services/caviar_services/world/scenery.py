@@ -237,6 +237,9 @@ class Obstacles:
         # Where distances and gaps were measured last, and what they were: a step tries several ways.
         self._seen_from: Vector | None = None
         self._seen: tuple[Float64Array, Float64Array]
+        # Where the distance of the nearest triangle was measured last, and the distance.
+        self._free_at: Vector = _REST
+        self._free = 0.0
 
     @classmethod
     def none(cls) -> Obstacles:
@@ -294,6 +297,37 @@ class Obstacles:
             return None
         x, y, z = normals[worst].tolist()
         return (x, y, z)
+
+    def touched(self, point: Vector, radius: float) -> tuple[float, Vector] | None:
+        """Find the triangle nearest to a ball that touches one.
+
+        Args:
+            point: Centre of the ball [m].
+            radius: Radius of the ball [m].
+
+        Returns:
+            Distance [m] of the triangle and unit vector away from it; None where the ball touches none.
+
+        Example:
+            >>> wall = np.array([[[5.0, -9.0, 0.0], [5.0, 9.0, 0.0], [5.0, 0.0, 9.0]]])
+            >>> Obstacles(wall).touched((4.75, 0.0, 1.0), 0.5)
+            (0.25, (-1.0, 0.0, 0.0))
+        """
+        # As far as it was from touching anything it may go without another look.
+        if math.dist(point, self._free_at) + radius < self._free:
+            return None
+        if self._reach - math.dist(point, self._centre) < radius:
+            self._look_around(point, radius)
+        if self._around is None:
+            return None
+        distances, gaps = self._around.gaps(point)
+        nearest = int(distances.argmin())
+        distance = float(distances[nearest])
+        self._free_at, self._free = point, distance
+        if distance >= radius:
+            return None
+        x, y, z = (gaps[nearest] / max(distance, _ROUNDING)).tolist()
+        return distance, (x + 0.0, y + 0.0, z + 0.0)
 
     def _look_around(self, centre: Vector, need: float) -> None:
         """Keep the triangles that steps from places around this one can come near."""

@@ -1,0 +1,1 @@
+"""Flight dynamics of a quadrotor: rigid body, rotors, wind, controller, contacts."""
