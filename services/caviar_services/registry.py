@@ -45,6 +45,7 @@ BUILT_IN: dict[str, str] = {
     "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
     "agent:random": "caviar_services.agent.baselines:RandomAgent",
     "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
+    "agent:airsim": "caviar_services.agent.airsim:AirSimAgent",
     "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
     "agent:exhaustive-sweep": "caviar_services.agent.sweeps:ExhaustiveSweepAgent",
     "agent:hierarchical-sweep": "caviar_services.agent.sweeps:HierarchicalSweepAgent",
