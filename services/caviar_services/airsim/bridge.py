@@ -252,6 +252,8 @@ class Bridge:
 
     def begin_episode(self) -> None:
         """Forget what belongs to the episode before."""
+        if self._snapshot is None:  # before the first one: a script may have taken over a vehicle already
+            return
         self._snapshot, self.ending = None, False
         for vehicle in self.vehicles.values():
             vehicle.reset()

@@ -18,7 +18,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import CameraDevice, LidarDevice, LidarScan
 from caviar_services.airsim.bridge import Bridge, Snapshot, Vehicle, boxes_overlap
 from caviar_services.airsim.images import image_response
-from caviar_services.airsim.rpc import CallError, Params
+from caviar_services.airsim.rpc import CallError, Compact, Params
 from caviar_services.airsim.wire import (
     NOWHERE,
     Map,
@@ -210,14 +210,15 @@ class StateCalls:
     ) -> bytes:
         """One picture as PNG."""
         request = {"camera_name": camera_name, "image_type": image_type, "compress": True}
-        (found,) = await self.images([request], vehicle_name, external)
+        (found,) = await self._images([request], vehicle_name, external)
         data: bytes = found["image_data_uint8"]
         return data
 
-    async def images(
-        self, requests: object, vehicle_name: object = "", external: object = False
-    ) -> list[Map]:
+    async def images(self, requests: object, vehicle_name: object = "", external: object = False) -> Compact:
         """AirSim's ``ImageResponse`` for each ``ImageRequest``, all of one frame."""
+        return Compact(await self._images(requests, vehicle_name, external))
+
+    async def _images(self, requests: object, vehicle_name: object, external: object) -> list[Map]:
         vehicle = self._bridge.vehicle(text(vehicle_name, "vehicle_name"))
         if not isinstance(requests, list) or len(requests) > MOST_IMAGES:
             raise CallError(f"requests is no list of at most {MOST_IMAGES} ImageRequest")
@@ -246,7 +247,7 @@ class StateCalls:
         # A thread, as a PNG takes milliseconds in which frames and other clients would wait.
         return await asyncio.to_thread(made)
 
-    async def lidar(self, lidar_name: object = "", vehicle_name: object = "") -> Map:
+    async def lidar(self, lidar_name: object = "", vehicle_name: object = "") -> Compact:
         """AirSim's ``LidarData``: the scan of the newest frame."""
         vehicle = self._bridge.vehicle(text(vehicle_name, "vehicle_name"))
         now, ned = await self._bridge.newest(), await self._bridge.ned()
@@ -259,7 +260,7 @@ class StateCalls:
         scan = next((scan for lidar in now.lidars for scan in lidar.scans if scan.sensor == device), None)
         if scan is None:
             raise CallError(f"LIDAR {device!r} made no scan in this frame")
-        return await asyncio.to_thread(self._lidar_data, now, ned, scan)
+        return Compact(await asyncio.to_thread(self._lidar_data, now, ned, scan))
 
     def _lidar_data(self, now: Snapshot, ned: NedFrame, scan: LidarScan) -> Map:
         points = sensor_points(scan.points) if self._lidar_in_sensor_axes else ned.points(scan.in_world())

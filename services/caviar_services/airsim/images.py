@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -143,15 +142,13 @@ def _image(products: Products, device: str, kind: int) -> tuple[Image, tuple[str
 
 def _size(image: Image) -> tuple[int, int]:
     """Height and width [px]."""
-    pixels: np.ndarray[Any, Any]
     match image:
         case CameraImage():
-            pixels = image.rgb
+            height, width, _ = image.rgb.shape
         case DepthImage():
-            pixels = image.depth
+            height, width = image.depth.shape
         case SegmentationImage():
-            pixels = image.object
-    height, width = pixels.shape[:2]
+            height, width = image.object.shape
     return height, width
 
 
@@ -167,13 +164,14 @@ def _depth(image: DepthImage, kind: int) -> Float32Array:
     return np.where(image.depth > 0.0, depth, np.float32(NO_HIT_M)).astype(np.float32)
 
 
-def _numbers(image: Image, kind: int) -> np.ndarray[Any, Any]:
+def _numbers(image: Image, kind: int) -> Float32Array:
     """A number for each pixel, or three of a picture in colour."""
     match image:
         case CameraImage():
             return image.rgb.astype(np.float32)
         case DepthImage() if kind == DEPTH_VIS:
-            return np.clip(_depth(image, kind) / WHITE_M, 0.0, 1.0)
+            shade: Float32Array = np.clip(_depth(image, kind) / WHITE_M, 0.0, 1.0).astype(np.float32)
+            return shade
         case DepthImage():
             return _depth(image, kind)
         case SegmentationImage():
@@ -191,5 +189,5 @@ def _rgb(image: Image, kind: int, names: Sequence[str]) -> UInt8Array:
         case SegmentationImage():
             # Row −1 is the last one: black, where nothing is hit.
             palette = np.array([*(colour_of(name) for name in names), (0, 0, 0)], np.uint8)
-            found: UInt8Array = palette[image.object]
-            return found
+            coloured: UInt8Array = palette[image.object]
+            return coloured

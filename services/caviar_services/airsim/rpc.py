@@ -12,7 +12,7 @@ import logging
 import socket
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgpack  # type: ignore[import-untyped]
 
@@ -45,6 +45,12 @@ class CallError(Exception):
     """What a call asks for cannot be done; the client raises an error with this text."""
 
 
+class Compact(NamedTuple):
+    """A result with thousands of numbers, which travel in single precision, as AirSim sends them."""
+
+    result: object
+
+
 def new_unpacker() -> msgpack.Unpacker:
     """Make an unpacker that holds a message of `MAX_MESSAGE` at most."""
     # Clients of that age pack texts as raw bytes, which is how they arrive as texts here.
@@ -63,7 +69,9 @@ def response(call: int, error: str | None, result: object) -> bytes:
         >>> msgpack.unpackb(response(7, None, [1.5, "uav"]))
         [1, 7, None, [1.5, 'uav']]
     """
-    packed: bytes = msgpack.packb([_RESPONSE, call, error, result])
+    single = isinstance(result, Compact)
+    content = result.result if isinstance(result, Compact) else result
+    packed: bytes = msgpack.packb([_RESPONSE, call, error, content], use_single_float=single)
     return packed
 
 
