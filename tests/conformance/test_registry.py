@@ -33,6 +33,7 @@ EXTRAS = {
 """Package without which an implementation cannot run; a base install skips it."""
 
 OVERRIDES: dict[str, dict[str, object]] = {
+    "agent:airsim": {"listen": "127.0.0.1:0"},  # tests run side by side
     "channel:adaptive": {
         "ladder": [
             {"label": label, "settings": {"samples": samples}}
