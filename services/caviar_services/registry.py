@@ -34,6 +34,7 @@ BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
+    "world:airsim": "caviar_services.world.airsim:AirSimWorld",
     "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
     "channel:free-space": "caviar_services.channel.statistical.free_space:FreeSpaceChannel",
     "channel:geometric": "caviar_services.channel.statistical.geometric:GeometricChannel",

@@ -84,7 +84,8 @@ class Flight:
 
     Args:
         bodies: What is flown; each is the vehicle of its name.
-        cars: Positions of parked cars, by name.
+        cars: Positions of cars in frame 0, by name.
+        drives: Their velocity [m/s].
         products: Further fields of each snapshot.
     """
 
@@ -93,6 +94,7 @@ class Flight:
         *bodies: Body,
         cars: Mapping[str, Vector] | None = None,
         paused: bool = False,
+        drives: Vector = (0.0, 0.0, 0.0),
         **products: Any,
     ) -> None:
         self.bodies = bodies or (Body(),)
@@ -102,7 +104,7 @@ class Flight:
             MotionCalls(self.bridge, Habits()),
         )
         self.offer = Offer({**state.offered(), **motion.offered()})
-        self.cars, self.products = cars, products
+        self.cars, self.drives, self.products = cars or {}, drives, products
         self.frame, self.ended = 0, False
         self.log: list[Sequence[object]] = []
 
@@ -112,7 +114,10 @@ class Flight:
 
     async def step(self) -> None:
         """One frame."""
-        seen = scene(*self.bodies, cars=self.cars)
+        seconds = self.frame * PERIOD_NS / 1e9
+        shift = [seconds * speed for speed in self.drives]
+        cars = {name: (x + shift[0], y + shift[1], z + shift[2]) for name, (x, y, z) in self.cars.items()}
+        seen = scene(*self.bodies, cars=cars)
         shot = Snapshot(self.frame, self.frame * PERIOD_NS, seen, **self.products)
         commands, self.ended = await self.bridge.decide(shot)
         self.log.append(commands)

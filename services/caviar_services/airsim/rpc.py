@@ -291,9 +291,8 @@ class RpcClient:
         Raises:
             RunError: It answers with an error, not in time, or hangs up.
         """
-        self._number += 1
+        self.begin(method, *params)
         try:
-            self._socket.sendall(msgpack.packb([_REQUEST, self._number, method, list(params)]))
             while True:
                 for message in self._unpacker:
                     kind, number, error, result = message
@@ -309,6 +308,22 @@ class RpcClient:
                 f"AirSim at {self._where} did not answer {method} within {self._timeout_s:g} s"
             ) from error
         except (OSError, *_NO_MESSAGE) as error:
+            raise RunError(f"the connection to AirSim at {self._where} broke in {method}: {error}") from error
+
+    def begin(self, method: str, *params: object) -> None:
+        """Call a method without waiting for its result, which is dropped when it comes.
+
+        Args:
+            method: Its name.
+            params: As for `call`.
+
+        Raises:
+            RunError: The server hung up.
+        """
+        self._number += 1
+        try:
+            self._socket.sendall(msgpack.packb([_REQUEST, self._number, method, list(params)]))
+        except OSError as error:
             raise RunError(f"the connection to AirSim at {self._where} broke in {method}: {error}") from error
 
     def close(self) -> None:

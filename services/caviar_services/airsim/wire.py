@@ -166,6 +166,10 @@ class NedFrame:
         """A velocity in ENU [m/s] of one in NED."""
         return NED.motion_to_enu(Motion(velocity)).velocity
 
+    def point(self, point: Vector) -> Vector:
+        """A point in NED [m] of one in ENU."""
+        return NED.from_enu(Pose(self._from_origin(point), LEVEL)).position
+
     def velocity(self, velocity: Vector) -> Vector:
         """A velocity, or a direction, in NED of one in ENU."""
         return NED.motion_from_enu(Motion(velocity)).velocity
