@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scenarios_support import HERE, ROOT, eventually, marked, pid_of, running, scenario_file
+from scenarios_support import HERE, ROOT, blocks, eventually, marked, pid_of, running, scenario_file
 
 pytestmark = pytest.mark.slow
 
@@ -147,6 +148,18 @@ def test_it_flies_a_square_and_all_else_that_it_is_asked_for(session: Session) -
     assert found["before"] == pytest.approx([5.0, 2.5, -4.0], abs=1.0)  # where the velocity ended
     assert found["home"] == pytest.approx([0.0, 0.0, 0.0], abs=0.6)
     assert found["landed"]
+
+
+def test_the_script_of_the_page_runs_as_it_is_printed(session: Session, tmp_path: Path) -> None:
+    """But for the port, of which the tests have one of their own."""
+    ((_, script),) = [block for block in blocks(ROOT / "docs/howto/airsim.md") if block[0] == "python"]
+    assert script.count("MultirotorClient()") == 1
+    program = tmp_path / "script.py"
+    program.write_text(script.replace("MultirotorClient()", f"MultirotorClient(port={session.port})"))
+    done = subprocess.run([session.python, program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    x, y, z = (float(value) for value in re.findall(r"_val': (\S+?)[,}]", done.stdout))
+    assert (x, y, z) == pytest.approx((0.0, 0.0, -6.0), abs=1.0)
 
 
 def test_it_takes_pictures_and_scans_of_one_frame(session: Session) -> None:
