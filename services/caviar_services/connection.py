@@ -14,6 +14,7 @@ import struct
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -134,6 +135,8 @@ class Connection:
         self._rejoin_s = 0.0
         # Calls off the end of the process that the broker's silence brings about.
         self._end: threading.Event | None = None
+        # What came while a step waited for something outside of the run.
+        self._kept: deque[tuple[m.Message, Sequence[zmq.Frame]]] = deque()
         self._handshake = Handshake(self._context, self._socket, endpoint, credentials is not None)
         try:
             dress(self._socket, endpoint, credentials)
@@ -208,18 +211,36 @@ class Connection:
         while True:
             if self._termination.requested:
                 raise Terminated
-            received = self._next()
+            received = self._kept.popleft() if self._kept else self._next()
             if received is not None:
                 return received
-            self._handshake.check()
-            silence = self._heartbeat.broker_silence if self._heartbeat else None
-            if silence is not None:
-                raise Disconnected(self._silence(silence))
+            self._check_broker()
             if until is not None and time.monotonic() > until:
                 raise UnansweredError(
                     f"no answer from a broker at {self.endpoint} within {timeout_s:g} s; "
                     "is `caviar broker` running there?"
                 )
+
+    def attend(self) -> None:
+        """Look for orders in the middle of a step; other messages are kept for `receive`.
+
+        Raises:
+            Terminated, RunOver, Disconnected: As for `receive`.
+        """
+        if self._termination.requested:
+            raise Terminated
+        while self._socket.poll(0):
+            received = self._next()
+            if received is not None:
+                self._kept.append(received)
+        self._check_broker()
+
+    def _check_broker(self) -> None:
+        """Raise `Disconnected` where the broker is silent for longer than its liveness."""
+        self._handshake.check()
+        silence = self._heartbeat.broker_silence if self._heartbeat else None
+        if silence is not None:
+            raise Disconnected(self._silence(silence))
 
     def abandon(self) -> None:
         """Close both connections, which are lost, at once."""

@@ -11,7 +11,7 @@ import logging
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -33,6 +33,7 @@ from caviar_services.service import (
     RunInfo,
     Service,
     StepResult,
+    no_orders,
 )
 
 _log = logging.getLogger("caviar.service")
@@ -50,13 +51,16 @@ KEPT_BYTES = 64 << 20
 Answer: TypeAlias = tuple[m.Done | m.Fault, Sequence[Any]]
 
 
-def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
+def run_info(
+    name: str, welcome: m.Welcome, progress: Progress, attend: Callable[[], None] = no_orders
+) -> RunInfo:
     """Read what WELCOME says about the run.
 
     Args:
         name: Name of the service.
         welcome: The message.
         progress: Where the service reports what it does.
+        attend: What a step that waits calls, to be left when the run is over.
 
     Example:
         >>> times = {"heartbeat_ns": 100_000_000, "liveness_ns": 1_500_000_000}
@@ -77,6 +81,7 @@ def run_info(name: str, welcome: m.Welcome, progress: Progress) -> RunInfo:
         scenario=scenario.get("resolved", {}),
         directory=Path(str(scenario.get("directory", "."))),
         progress=progress,
+        attend=attend,
     )
 
 

@@ -168,6 +168,7 @@ class Runner:
             self._send,
             self._store,
             progress=self._progress,
+            attend=lambda: self._broker.attend(),  # whichever connection there is by then
             tunes_memory=self._own_process,
             fetch_timeout_s=self._timeout_s,
         )

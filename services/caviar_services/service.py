@@ -37,6 +37,7 @@ __all__ = [
     "RunInfo",
     "Service",
     "StepResult",
+    "no_orders",
     "no_progress",
 ]
 
@@ -57,6 +58,10 @@ def no_progress(phase: str, grace_s: float = 0.0) -> None:
         phase: What is being done.
         grace_s: How long it may stay silent [s].
     """
+
+
+def no_orders() -> None:
+    """Look for no orders: no broker gives any to this service."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +94,9 @@ class RunInfo:
     directory: Path = Path()
     """Where the recorder writes."""
     progress: Progress = no_progress
+    attend: Callable[[], None] = no_orders
+    """Looks for orders of the broker. A step that waits for something outside of the run calls it a few times
+    a second, and lets through what it raises (no `Exception`): the run is over, or the broker is gone."""
     again: bool = False
     """Whether another process of this name was in the run before, or may have been."""
     settings_key: str = ""

@@ -38,7 +38,15 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
-from caviar_services.service import Frame, Preparation, Progress, Service, StepResult, no_progress
+from caviar_services.service import (
+    Frame,
+    Preparation,
+    Progress,
+    Service,
+    StepResult,
+    no_orders,
+    no_progress,
+)
 
 TRIM_EVERY = 10
 """Frames after which a service releases what it does not need."""
@@ -63,6 +71,7 @@ class ServiceSession:
         send: Takes the answers. An exception of it that is an `Exception` counts as the service's fault.
         store: Where the files of scenery are.
         progress: Called with what the service does. No progress is reported by default.
+        attend: Looks for orders of the broker in the middle of a step (`RunInfo.attend`).
         check: Check of products that all services of one process share: it looks at each product once, and a
             frame that is granted twice is computed twice. None: the service has a process of its own.
         encodes: Whether products travel as bytes, with digests; else parts of GRANT and DONE are payloads.
@@ -94,13 +103,14 @@ class ServiceSession:
         store: AssetStore,
         *,
         progress: Progress = no_progress,
+        attend: Callable[[], None] = no_orders,
         check: ContentCheck | None = None,
         encodes: bool = True,
         tunes_memory: bool = False,
         fetch_timeout_s: float = FETCH_TIMEOUT_S,
     ) -> None:
         self.name, self.use, self.cls = name, use, cls
-        self._send, self._store, self._progress = send, store, progress
+        self._send, self._store, self._progress, self._attend = send, store, progress, attend
         self._encodes, self._tunes_memory = encodes, tunes_memory
         self._check = check or ContentCheck()
         # A frame clock in the same process repeats no GRANT: answers would be kept for nothing.
@@ -224,7 +234,8 @@ class ServiceSession:
         # A FAULT, not an exception: the broker ends the run and names the key, whatever machine this is.
         with self._reporting("settings"):
             settings = convert_settings(self.cls.Settings, welcome.settings)
-            self._service = self.cls(settings, run_info(self.name, welcome, self._progress))
+            run = run_info(self.name, welcome, self._progress, self._attend)
+            self._service = self.cls(settings, run)
 
     def _prepare(self, order: m.Prepare, _: Sequence[Any], now: float) -> None:
         with self._reporting("prepare"):

@@ -137,6 +137,16 @@ class WaitsForever(_Stuck):
         threading.Event().wait()
 
 
+class Attends(_Stuck):
+    """In a wait for something outside of the run, in which it looks for orders."""
+
+    def never_return(self) -> None:
+        while not self.run.directory.joinpath("go").exists():
+            self.run.progress("waiting", 0.0)
+            self.run.attend()
+            time.sleep(0.02)
+
+
 class SleepsInC(_Stuck):
     """In a compiled call that has released the interpreter, and that signals do not end."""
 

@@ -30,6 +30,7 @@ ELSEWHERE = {
         "tests/scenarios/test_tutorials.py",
     ),
     "README.md": "tests/scenarios/test_readme.py",
+    "docs/howto/airsim.md": "tests/scenarios/test_airsim.py",
     "docs/howto/beam-agents.md": "tests/scenarios/test_learning_agents.py",
     "protocol/SPEC.md": "tests/unit/test_protocol_spec.py",
 }

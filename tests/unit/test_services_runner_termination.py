@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from runner_harness import Broker, ends, hears, played_broker, service
@@ -50,6 +51,40 @@ def test_sigterm_ends_a_service_that_is_stuck_in_a_frame(broker: Broker, name: s
         broker.grant(0)
         hears(process, "stuck")
         terminated(process)
+
+
+def test_a_service_that_looks_for_orders_leaves_a_frame_that_waits(broker: Broker) -> None:
+    """SHUTDOWN and SIGTERM, as elsewhere between frames: BYE, and everything closed."""
+    for order in ("SHUTDOWN", "SIGTERM"):
+        with service(broker.endpoint, "sensors:Attends") as process:
+            broker.start()
+            broker.grant(0)
+            hears(process, "stuck")
+            if order == "SHUTDOWN":
+                broker.shutdown()
+                assert "closed" in ends(process, 0, within_s=2.0)
+            else:
+                process.send_signal(signal.SIGTERM)
+                assert broker.expect(m.Bye).reason == "SIGTERM"
+                assert "closed" in ends(process, 143, within_s=2.0)
+
+
+def test_what_comes_while_a_frame_waits_is_handled_after_it(broker: Broker, tmp_path: Path) -> None:
+    """A repeated GRANT, and one too early; progress goes on, so that the wait is no stall."""
+    with service(broker.endpoint, "sensors:Attends") as process:
+        broker.start(scenario={"directory": str(tmp_path)})
+        broker.grant(0)
+        hears(process, "stuck")
+        broker.grant(0)
+        broker.grant(1)
+        first = len(broker.beats)
+        broker.until(lambda: len(broker.beats) >= first + 4)
+        assert broker.beats[-1].phase == "waiting"
+        assert broker.beats[-1].progress > broker.beats[first].progress
+        (tmp_path / "go").touch()
+        assert [broker.expect(m.Done).frame for _ in range(3)] == [0, 0, 1]
+        broker.shutdown()
+        ends(process, 0)
 
 
 def test_sigterm_ends_a_service_that_is_stuck_in_prepare(broker: Broker) -> None:

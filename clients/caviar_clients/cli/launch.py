@@ -62,6 +62,7 @@ class Launcher:
         http: ``HOST:PORT`` at which the broker has HTTP served; empty: nowhere.
         resume: Whether the run in the directory is resumed, whatever path, frames, seed and pace are.
         force: Whether it is, though code, libraries or files have changed.
+        airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
     """
 
     scenario: Scenario
@@ -75,6 +76,7 @@ class Launcher:
     resume: bool = False
     force: bool = False
     pace: str | None = None
+    airsim: str = ""
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
     refused: bool = False
@@ -202,6 +204,8 @@ class Launcher:
             arguments += ["--seed", str(self.seed)]
         if self.pace is not None:
             arguments += ["--pace", self.pace]
+        if self.airsim:
+            arguments += ["--airsim", self.airsim]
         return arguments
 
     def _start_broker(self) -> None:

@@ -22,6 +22,7 @@ from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
 from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
+    AirSim,
     Embedded,
     FiguresFile,
     Force,
@@ -78,7 +79,9 @@ def caviar(
 def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -> Path:
     """The scenario of a run that is started anew; refuses what does not go together with ``--resume``."""
     if resume is not None and any(value is not None for value in (scenario, *others)):
-        raise RunError("a run goes on as it began: --resume takes no scenario, frames, seed or --embedded")
+        raise RunError(
+            "a run goes on as it began: --resume takes no scenario, frames, seed, --embedded or --airsim"
+        )
     if resume is None and scenario is None:
         raise RunError(
             "give a scenario, by name (caviar scenarios) or file, or --resume with the directory of a run"
@@ -101,17 +104,20 @@ def run(
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
+    airsim: AirSim = "",
     resume: Resume = None,
     force: Force = False,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import resume_run, run_scenario
 
-    source = _started_anew(resume, scenario, frames, seed, embedded or None, pace)
+    source = _started_anew(resume, scenario, frames, seed, embedded or None, pace, airsim or None)
     if resume is not None:
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
-        ended = run_scenario(source, out, _console, frames, seed, json, bind, embedded, keys, http, pace)
+        ended = run_scenario(
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim
+        )
     raise typer.Exit(ended.status)
 
 

@@ -201,6 +201,7 @@ def run_scenario(
     keys: Path | None = None,
     http: str = "",
     pace: str | None = None,
+    airsim: str = "",
 ) -> RunOutcome:
     """Run a scenario to its end, with progress and summary on the screen.
 
@@ -214,13 +215,14 @@ def run_scenario(
         embedded: Whether all services run in this process.
         keys: Keys directory; None: a run without keys.
         http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
+        airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
 
     Raises:
         ScenarioError: A key or value of the scenario is wrong.
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace)
+    scenario = checked_scenario(path, frames, seed, pace, airsim)
     if bind:
         check_bind(bind, keys=keys is not None)
     require_extras(scenario)
@@ -246,7 +248,16 @@ def run_scenario(
         launcher = EmbeddedLauncher(scenario, directory)
     else:
         launcher = Launcher(
-            scenario, find_scenario(path).resolve(), directory, frames, seed, bind, keys, http, pace=pace
+            scenario,
+            find_scenario(path).resolve(),
+            directory,
+            frames,
+            seed,
+            bind,
+            keys,
+            http,
+            pace=pace,
+            airsim=airsim,
         )
     return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
 

@@ -107,6 +107,9 @@ Keys = Annotated[
     Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
 ]
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
+AirSim = Annotated[
+    str, typer.Option(help="HOST:PORT, as 127.0.0.1:41451: scripts for AirSim connect there and fly")
+]
 Resume = Annotated[Path | None, typer.Option(help="resume the run in this directory, whose broker died")]
 Force = Annotated[
     bool, typer.Option("--force", help="with --resume: though code, libraries or files have changed")

@@ -15,6 +15,7 @@ from caviar_broker.core.graph import build_graph
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import PROTOCOL_VERSION, Hello
 from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, load_scenario
+from caviar_protocol.scenario.airsim import with_airsim
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
@@ -35,13 +36,18 @@ TOPICS_OF: Mapping[str, tuple[str, ...]] = {
 
 
 def checked_scenario(
-    path: str | Path, frames: int | None = None, seed: int | None = None, pace: str | None = None
+    path: str | Path,
+    frames: int | None = None,
+    seed: int | None = None,
+    pace: str | None = None,
+    airsim: str = "",
 ) -> Scenario:
     """Load a scenario and check it against the implementations that it uses.
 
     Args:
         path: The scenario's file, or the name of one that ships.
         frames, seed, pace: What replaces the scenario's; None: nothing.
+        airsim: ``HOST:PORT`` at which scripts written for AirSim fly its objects; empty: its agents do.
 
     Raises:
         ScenarioError: An implementation or a setting does not exist, or no implementation produces a topic to
@@ -51,7 +57,8 @@ def checked_scenario(
         >>> checked_scenario("smoke", frames=3).run.frames
         3
     """
-    return check_implementations(with_overrides(load_scenario(Path(path)), frames, seed, pace))
+    scenario = with_overrides(load_scenario(Path(path)), frames, seed, pace)
+    return check_implementations(with_airsim(scenario, airsim))
 
 
 def module_folders(scenario: Scenario) -> tuple[Path, ...]:
