@@ -17,19 +17,20 @@
 //
 //     g++ -std=c++17 street.cpp -lzmq -pthread
 //
-// The library speaks the protocol of protocol/SPEC.md: it says HELLO, sends heartbeats from a thread of its own,
-// offers and serves scenery, mounts the devices of the scenario on objects, answers each GRANT once and repeats
-// the answer when asked again, saves and restores state, refuses what is no message, and comes back where its
-// connections were lost. Exceptions and RTTI are not used, so that it compiles in game engines as it is; the only
-// library is libzmq. An engine with a loop of its own calls `connect` once and `poll` in every tick.
+// The library speaks the protocol of protocol/SPEC.md: it says HELLO, sends heartbeats from a thread of its
+// own, offers and serves scenery, mounts the devices of the scenario on objects, answers each GRANT once and
+// repeats the answer when asked again, saves and restores state, refuses what is no message, and comes back
+// where its connections were lost. Exceptions and RTTI are not used, so that it compiles in game engines as
+// it is; the only library is libzmq. An engine with a loop of its own calls `connect` once and `poll` in
+// every tick.
 //
 // Units and axes: metres, seconds, radians; x east, y north, z up; bodies have x forward, y left, z up;
 // quaternions are (w, x, y, z) and take body axes to world axes. `unreal()`, `unity()`, `godot()` and `ned()`
 // convert from other axes. Text is UTF-8. The host has to be little-endian.
 //
-// Contents: 1 bytes and SHA-256 · 2 values and MessagePack · 3 types of messages and payloads · 4 decoding and
-// canonical encoding · 5 axes · 6 objects and devices · 7 meshes and scenery · 8 commands, link, channel ·
-// 9 heartbeats · 10 the world
+// Contents: 1 bytes and SHA-256 · 2 values and MessagePack · 3 types of messages and payloads · 4 decoding
+// and canonical encoding · 5 axes · 6 objects and devices · 7 meshes and scenery · 8 commands, link, channel
+// · 9 heartbeats · 10 the world
 #ifndef CAVIAR_HPP
 #define CAVIAR_HPP
 
@@ -83,7 +84,8 @@ struct Problem {
 
 inline Problem malformed(std::string message) { return {"malformed", std::move(message)}; }
 
-// --- 1 bytes and SHA-256 -------------------------------------------------------------------------------------
+// --- 1 bytes and SHA-256
+// -------------------------------------------------------------------------------------
 
 // FIPS 180-4, over any number of pieces.
 class Sha256 {
@@ -125,14 +127,17 @@ class Sha256 {
         0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
     std::uint32_t w[64];
     for (std::size_t i = 0; i < 16; ++i)
-      w[i] = static_cast<std::uint32_t>(block_[4 * i]) << 24 | static_cast<std::uint32_t>(block_[4 * i + 1]) << 16 |
-             static_cast<std::uint32_t>(block_[4 * i + 2]) << 8 | static_cast<std::uint32_t>(block_[4 * i + 3]);
+      w[i] = static_cast<std::uint32_t>(block_[4 * i]) << 24 |
+             static_cast<std::uint32_t>(block_[4 * i + 1]) << 16 |
+             static_cast<std::uint32_t>(block_[4 * i + 2]) << 8 |
+             static_cast<std::uint32_t>(block_[4 * i + 3]);
     for (std::size_t i = 16; i < 64; ++i)
       w[i] = w[i - 16] + w[i - 7] + (turn(w[i - 15], 7) ^ turn(w[i - 15], 18) ^ (w[i - 15] >> 3)) +
              (turn(w[i - 2], 17) ^ turn(w[i - 2], 19) ^ (w[i - 2] >> 10));
     auto [a, b, c, d, e, f, g, h] = state_;
     for (std::size_t i = 0; i < 64; ++i) {
-      const std::uint32_t t1 = h + (turn(e, 6) ^ turn(e, 11) ^ turn(e, 25)) + ((e & f) ^ (~e & g)) + K[i] + w[i];
+      const std::uint32_t t1 =
+          h + (turn(e, 6) ^ turn(e, 11) ^ turn(e, 25)) + ((e & f) ^ (~e & g)) + K[i] + w[i];
       const std::uint32_t t2 = (turn(a, 2) ^ turn(a, 13) ^ turn(a, 22)) + ((a & b) ^ (a & c) ^ (b & c));
       h = g, g = f, f = e, e = d + t1, d = c, c = b, b = a, a = t1 + t2;
     }
@@ -178,18 +183,20 @@ inline std::optional<std::size_t> characters(std::string_view text) {
   return count;
 }
 
-// --- 2 values and MessagePack --------------------------------------------------------------------------------
+// --- 2 values and MessagePack
+// --------------------------------------------------------------------------------
 
 // Element types of arrays, and their sizes [B].
 struct ElementType {
   const char* code;
   std::size_t size;
 };
-inline constexpr ElementType ELEMENT_TYPES[] = {{"|b1", 1}, {"|u1", 1}, {"|i1", 1}, {"<u2", 2},
-                                                {"<i4", 4}, {"<i8", 8}, {"<u8", 8}, {"<f4", 4},
+inline constexpr ElementType ELEMENT_TYPES[] = {{"|b1", 1}, {"|u1", 1}, {"|i1", 1},  {"<u2", 2},
+                                                {"<i4", 4}, {"<i8", 8}, {"<u8", 8},  {"<f4", 4},
                                                 {"<f8", 8}, {"<c8", 8}, {"<c16", 16}};
 
-// A plain value: what a header holds. Reading a key that is missing, or another kind, gives nil or the fallback.
+// A plain value: what a header holds. Reading a key that is missing, or another kind, gives nil or the
+// fallback.
 class Value {
  public:
   enum class Kind : std::uint8_t { nil, boolean, integer, number, text, list, map, array };
@@ -306,7 +313,7 @@ class Value {
   Kind kind_ = Kind::nil;
   std::int64_t integer_ = 0;  // also a boolean, or the index of an array's element type
   double number_ = 0.0;
-  std::string text_;          // also the elements of an array
+  std::string text_;  // also the elements of an array
   std::vector<Value> items_;
 };
 
@@ -321,14 +328,16 @@ inline Value Value::map(std::initializer_list<Entry> entries) {
   return value;
 }
 
-// Canonical MessagePack: everything in its shortest form, floats in nine bytes, keys of maps in ascending order.
+// Canonical MessagePack: everything in its shortest form, floats in nine bytes, keys of maps in ascending
+// order.
 class Packer {
  public:
   explicit Packer(Bytes* body = nullptr) : body_(body) {}
 
   Bytes out;
 
-  void head(std::uint8_t small, std::size_t below, int first, std::size_t count) {  // of text, a list or a map
+  void head(std::uint8_t small, std::size_t below, int first,
+            std::size_t count) {  // of text, a list or a map
     if (count < below) {
       byte(small + count);
     } else if (small == 0xa0 && count < 0x100) {
@@ -367,17 +376,24 @@ class Packer {
 
   void value(const Value& value) {
     switch (value.kind()) {
-      case Value::Kind::nil: return byte(0xc0);
-      case Value::Kind::boolean: return boolean(value.boolean());
-      case Value::Kind::integer: return integer(value.integer());
-      case Value::Kind::number: return number(value.number());
-      case Value::Kind::text: return text(value.text());
-      case Value::Kind::array: return array(value);
+      case Value::Kind::nil:
+        return byte(0xc0);
+      case Value::Kind::boolean:
+        return boolean(value.boolean());
+      case Value::Kind::integer:
+        return integer(value.integer());
+      case Value::Kind::number:
+        return number(value.number());
+      case Value::Kind::text:
+        return text(value.text());
+      case Value::Kind::array:
+        return array(value);
       case Value::Kind::list:
         list_head(value.size());
         for (const Value& item : value.items()) this->value(item);
         return;
-      case Value::Kind::map: return sorted(value);
+      case Value::Kind::map:
+        return sorted(value);
     }
   }
 
@@ -438,22 +454,57 @@ class Unpacker {
   void value(Value& out, int level) {
     const auto head = static_cast<std::uint8_t>(big(1));
     if (problem_) return;
-    if (head < 0x80) out = Value(static_cast<std::int64_t>(head));
-    else if (head < 0x90) map(out, head & 15, level);
-    else if (head < 0xa0) list(out, head & 15, level);
-    else if (head < 0xc0) text(out, head & 31);
-    else if (head >= 0xe0) out = Value(static_cast<std::int64_t>(head) - 256);
-    else switch (head) {
-      case 0xc0: out = Value(); break;
-      case 0xc2: case 0xc3: out = Value(head == 0xc3); break;
-      case 0xca: case 0xcb: number(out, head == 0xca); break;
-      case 0xcc: case 0xcd: case 0xce: case 0xcf: whole(out, std::size_t{1} << (head - 0xcc)); break;
-      case 0xd0: case 0xd1: case 0xd2: case 0xd3: negative(out, std::size_t{1} << (head - 0xd0)); break;
-      case 0xd9: case 0xda: case 0xdb: text(out, big(std::size_t{1} << (head - 0xd9))); break;
-      case 0xdc: case 0xdd: list(out, big(head == 0xdc ? 2 : 4), level); break;
-      case 0xde: case 0xdf: map(out, big(head == 0xde ? 2 : 4), level); break;
-      default: fail("binary and extension types have no place in a header");
-    }
+    if (head < 0x80)
+      out = Value(static_cast<std::int64_t>(head));
+    else if (head < 0x90)
+      map(out, head & 15, level);
+    else if (head < 0xa0)
+      list(out, head & 15, level);
+    else if (head < 0xc0)
+      text(out, head & 31);
+    else if (head >= 0xe0)
+      out = Value(static_cast<std::int64_t>(head) - 256);
+    else
+      switch (head) {
+        case 0xc0:
+          out = Value();
+          break;
+        case 0xc2:
+        case 0xc3:
+          out = Value(head == 0xc3);
+          break;
+        case 0xca:
+        case 0xcb:
+          number(out, head == 0xca);
+          break;
+        case 0xcc:
+        case 0xcd:
+        case 0xce:
+        case 0xcf:
+          whole(out, std::size_t{1} << (head - 0xcc));
+          break;
+        case 0xd0:
+        case 0xd1:
+        case 0xd2:
+        case 0xd3:
+          negative(out, std::size_t{1} << (head - 0xd0));
+          break;
+        case 0xd9:
+        case 0xda:
+        case 0xdb:
+          text(out, big(std::size_t{1} << (head - 0xd9)));
+          break;
+        case 0xdc:
+        case 0xdd:
+          list(out, big(head == 0xdc ? 2 : 4), level);
+          break;
+        case 0xde:
+        case 0xdf:
+          map(out, big(head == 0xde ? 2 : 4), level);
+          break;
+        default:
+          fail("binary and extension types have no place in a header");
+      }
   }
 
   void whole(Value& out, std::size_t bytes) {
@@ -516,11 +567,14 @@ class Unpacker {
   Problem problem_;
 };
 
-// --- 3 types of messages and payloads ------------------------------------------------------------------------
+// --- 3 types of messages and payloads
+// ------------------------------------------------------------------------
 
-// The tables of SPEC.md, in the order of their fields, a test compares them. `Name#TYPE field:type` and then `!`
-// where it is required, `?` where it may be left out, or `=` and its default (`@`: an object of defaults). Types:
-// `[T]` list, `{T}` map, `T*3` three of them, `A/B` objects by their `type`, `a|b` words, `<f8[N,3]` an array.
+// The tables of SPEC.md, in the order of their fields, a test compares them. `Name#TYPE field:type` and then
+// `!` where it is required, `?` where it may be left out, or `=` and its default (`@`: an object of
+// defaults). Types:
+// `[T]` list, `{T}` map, `T*3` three of them, `A/B` objects by their `type`, `a|b` words, `<f8[N,3]` an
+// array.
 inline constexpr char TYPES[] = R"(
 Hello#HELLO version:Version! name:NewName! role:world|channel|sensors|link|agent|recorder!
   inputs:[Input]<=256=[] outputs:[NewName]<=256=[] capabilities:[Word]<=256=[]
@@ -625,18 +679,18 @@ Link tx:[str]! rx:[str]! carrier:[str]! has_path:|b1[U]! los:|b1[U]! tx_beam:<i4
 
 // Topic of a product and the type of its payload.
 inline constexpr std::pair<const char*, const char*> TOPICS[] = {
-    {"scene", "Scene"}, {"channel", "Channel"}, {"lidar", "Lidar"}, {"camera", "Camera"},
+    {"scene", "Scene"}, {"channel", "Channel"},           {"lidar", "Lidar"},   {"camera", "Camera"},
     {"depth", "Depth"}, {"segmentation", "Segmentation"}, {"action", "Action"}, {"link", "Link"}};
 
 // Type of a field.
 struct Type {
   enum class Kind : std::uint8_t { plain, boolean, integer, number, text, word, list, map, object, array };
   Kind kind = Kind::plain;
-  std::string name;                      // of a text: the rule it has to keep; of an array: its element type
+  std::string name;  // of a text: the rule it has to keep; of an array: its element type
   std::int64_t least = INT64_MIN, most = INT64_MAX;  // of an integer
   double above = -HUGE_VAL, from = -HUGE_VAL;        // of a number: greater than, at least
-  std::vector<std::string> words;        // that may stand there; objects; sizes of an array
-  std::vector<Type> inner;               // of a list or map
+  std::vector<std::string> words;                    // that may stand there; objects; sizes of an array
+  std::vector<Type> inner;                           // of a list or map
   std::size_t exactly = 0, at_most = SIZE_MAX;       // items of a list
 };
 
@@ -731,11 +785,11 @@ class TypeTable {
 
   static void simple(Type& found, std::string_view text) {
     static constexpr std::pair<const char*, std::int64_t> INTEGERS[] = {
-        {"Epoch", 1}, {"Attempt", 1}, {"EpisodeIndex", 0}, {"FrameIndex", 0}, {"FrameOrNone", -1},
-        {"Age", 0}, {"Seed", 0}, {"SeedOrNone", -1}, {"Nanoseconds", INT64_MIN}, {"Duration", 0},
-        {"Period", 1}, {"Count", 0}, {"Size", 0}};
-    static constexpr const char* TEXTS[] = {"str", "Text", "Name", "NewName", "AssetName", "Word", "NamePattern",
-                                            "Digest", "DigestOrNone"};
+        {"Epoch", 1},  {"Attempt", 1}, {"EpisodeIndex", 0}, {"FrameIndex", 0},          {"FrameOrNone", -1},
+        {"Age", 0},    {"Seed", 0},    {"SeedOrNone", -1},  {"Nanoseconds", INT64_MIN}, {"Duration", 0},
+        {"Period", 1}, {"Count", 0},   {"Size", 0}};
+    static constexpr const char* TEXTS[] = {"str",  "Text",        "Name",   "NewName",     "AssetName",
+                                            "Word", "NamePattern", "Digest", "DigestOrNone"};
     const std::string word(text);
     found.name = word;
     for (const auto& [name, least] : INTEGERS)
@@ -743,10 +797,14 @@ class TypeTable {
     for (const char* name : TEXTS)
       if (word == name) found.kind = Type::Kind::text;
     if (word == "bool") found.kind = Type::Kind::boolean;
-    if (word == "Version") several(found, "int>=0", 2);
-    else if (word == "Vector3" || word == "float*3") several(found, "float", 3);
-    else if (word == "Quaternion") several(found, "float", 4);
-    else if (word.rfind("int", 0) == 0 || word.rfind("float", 0) == 0) bounded(found, word);
+    if (word == "Version")
+      several(found, "int>=0", 2);
+    else if (word == "Vector3" || word == "float*3")
+      several(found, "float", 3);
+    else if (word == "Quaternion")
+      several(found, "float", 4);
+    else if (word.rfind("int", 0) == 0 || word.rfind("float", 0) == 0)
+      bounded(found, word);
     else if (found.kind == Type::Kind::plain && word != "plain") {
       found.kind = Type::Kind::object;
       found.words = split(text, '/');
@@ -764,9 +822,12 @@ class TypeTable {
     for (std::size_t i = word.find_first_of("<>"); i < word.size(); i = word.find_first_of("<>", i + 1)) {
       const bool equal = word[i + 1] == '=';
       const long long bound = std::strtoll(word.c_str() + i + 1 + equal, nullptr, 10);
-      if (word[i] == '<') found.most = bound;
-      else if (equal) found.least = bound, found.from = static_cast<double>(bound);
-      else found.above = static_cast<double>(bound);
+      if (word[i] == '<')
+        found.most = bound;
+      else if (equal)
+        found.least = bound, found.from = static_cast<double>(bound);
+      else
+        found.above = static_cast<double>(bound);
     }
   }
 
@@ -782,12 +843,18 @@ class TypeTable {
   static Bytes standard(const Type& type, std::string text) {
     Packer packer;
     text.erase(std::remove(text.begin(), text.end(), '"'), text.end());
-    if (type.kind == Type::Kind::boolean) packer.boolean(text == "true");
-    else if (type.kind == Type::Kind::integer) packer.integer(std::strtoll(text.c_str(), nullptr, 10));
-    else if (type.kind == Type::Kind::number) packer.number(decimal(text));
-    else if (type.kind == Type::Kind::text || type.kind == Type::Kind::word) packer.text(text);
-    else if (type.kind == Type::Kind::map || text == "@") packer.map_head(0);
-    else if (text == "[]") packer.list_head(0);
+    if (type.kind == Type::Kind::boolean)
+      packer.boolean(text == "true");
+    else if (type.kind == Type::Kind::integer)
+      packer.integer(std::strtoll(text.c_str(), nullptr, 10));
+    else if (type.kind == Type::Kind::number)
+      packer.number(decimal(text));
+    else if (type.kind == Type::Kind::text || type.kind == Type::Kind::word)
+      packer.text(text);
+    else if (type.kind == Type::Kind::map || text == "@")
+      packer.map_head(0);
+    else if (text == "[]")
+      packer.list_head(0);
     else {
       const std::vector<std::string> numbers = split(std::string_view(text).substr(1, text.size() - 2), ',');
       packer.list_head(numbers.size());
@@ -808,7 +875,8 @@ class TypeTable {
   std::vector<ObjectType> objects_;
 };
 
-// --- 4 decoding and canonical encoding -----------------------------------------------------------------------
+// --- 4 decoding and canonical encoding
+// -----------------------------------------------------------------------
 
 // Rules for the text of a field, by the name of its type.
 inline bool keeps_rule(const std::string& rule, std::string_view text) {
@@ -832,8 +900,8 @@ inline bool keeps_rule(const std::string& rule, std::string_view text) {
   return true;
 }
 
-// Checks a value that was read against its type. Objects keep the fields that are known, in the order of their
-// table; integers where floats belong become floats; references become arrays with their elements.
+// Checks a value that was read against its type. Objects keep the fields that are known, in the order of
+// their table; integers where floats belong become floats; references become arrays with their elements.
 class Checker {
  public:
   explicit Checker(std::string_view body) : body_(body) {}
@@ -859,7 +927,8 @@ class Checker {
     Value found = Value::map();
     if (!type.tag.empty()) found.items() = {Value("type"), Value(type.tag)};
     for (std::size_t k = 0; k < type.fields.size() && !problem; ++k) {
-      if (!there[k] && type.fields[k].required) problem = malformed("." + type.fields[k].name + ": it is missing");
+      if (!there[k] && type.fields[k].required)
+        problem = malformed("." + type.fields[k].name + ": it is missing");
       if (!there[k]) continue;
       found.items().emplace_back(type.fields[k].name);
       found.items().push_back(std::move(kept[k]));
@@ -872,7 +941,8 @@ class Checker {
 
   Problem check(const Type& type, Value& value) {
     switch (type.kind) {
-      case Type::Kind::plain: return {};
+      case Type::Kind::plain:
+        return {};
       case Type::Kind::boolean:
         return value.is(Value::Kind::boolean) ? Problem{} : malformed(": true or false is expected");
       case Type::Kind::integer:
@@ -888,11 +958,16 @@ class Checker {
       case Type::Kind::text:
         if (value.is(Value::Kind::text) && keeps_rule(type.name, value.text())) return {};
         return malformed(": a text is expected that is a " + type.name);
-      case Type::Kind::word: return word(type, value);
-      case Type::Kind::list: return list(type, value);
-      case Type::Kind::map: return map(type, value);
-      case Type::Kind::object: return one_of(type, value);
-      case Type::Kind::array: return array(type, value);
+      case Type::Kind::word:
+        return word(type, value);
+      case Type::Kind::list:
+        return list(type, value);
+      case Type::Kind::map:
+        return map(type, value);
+      case Type::Kind::object:
+        return one_of(type, value);
+      case Type::Kind::array:
+        return array(type, value);
     }
     return {};
   }
@@ -919,7 +994,8 @@ class Checker {
     const std::uint64_t bytes = count * element->size, begin = static_cast<std::uint64_t>(offset.integer(-1));
     if (offset.integer(-1) < 0 || begin % 8) return malformed(": an offset is no multiple of 8");
     if (begin < taken_) return malformed(": an array begins before the end of the one before");
-    if (begin > body_.size() || bytes > body_.size() - begin) return malformed(": an array ends past the body");
+    if (begin > body_.size() || bytes > body_.size() - begin)
+      return malformed(": an array ends past the body");
     taken_ = begin + bytes;
     Bytes data(body_.substr(static_cast<std::size_t>(begin), static_cast<std::size_t>(bytes)));
     value = Value::array(element->code, sizes, std::move(data));
@@ -1007,9 +1083,9 @@ class Checker {
   // What prose says of the lengths of lists, and of path offsets.
   Problem lengths(const std::string& object, const Value& value) {
     static constexpr const char* LISTS[][3] = {
-        {"Scene", "names", "N"}, {"Scene", "classes", "N"}, {"Scene", "assets", "N"}, {"Link", "tx", "U"},
-        {"Link", "rx", "U"}, {"Link", "carrier", "U"}, {"Channel", "carriers", "C"}, {"Channel", "tx", "T"},
-        {"Channel", "rx", "R"}};
+        {"Scene", "names", "N"},      {"Scene", "classes", "N"}, {"Scene", "assets", "N"},
+        {"Link", "tx", "U"},          {"Link", "rx", "U"},       {"Link", "carrier", "U"},
+        {"Channel", "carriers", "C"}, {"Channel", "tx", "T"},    {"Channel", "rx", "R"}};
     for (const auto& [name, list, size] : LISTS)
       if (object == name && !agrees(size, static_cast<std::int64_t>(value[list].size())))
         return malformed(std::string(".") + list + ": its length is not " + size);
@@ -1110,8 +1186,8 @@ inline Problem check_parts(const Message& message) {
     const std::size_t most = asset ? MAX_ASSET_CHUNK : products && i % 2 == 0 ? MAX_HEADER : MAX_BODY;
     if (message.parts[i].size() > most) return {"limit", message.type->tag + " has a part that is too large"};
   }
-  if (asset && message.fields["offset"].integer() > message.fields["size"].integer() -
-                   static_cast<std::int64_t>(message.parts[0].size()))
+  if (asset && message.fields["offset"].integer() >
+                   message.fields["size"].integer() - static_cast<std::int64_t>(message.parts[0].size()))
     return malformed("ASSET_DATA reaches beyond the size that it states");
   return {};
 }
@@ -1126,9 +1202,10 @@ inline Problem decode_message(std::vector<Bytes> parts, Message& out) {
   if (!out.type || tag.find_first_of("abcdefghijklmnopqrstuvwxyz") != std::string::npos)
     return malformed("'" + tag + "' is no type of a message");
   const Value& major = out.fields["version"].at(0);  // can be read in every major version
-  if ((tag == "HELLO" || tag == "WELCOME") && major.is(Value::Kind::integer) && major.integer() != PROTOCOL_MAJOR)
-    return {"version", "the peer speaks version " + std::to_string(major.integer()) + " of the protocol, this " +
-                           "client version " + std::to_string(PROTOCOL_MAJOR)};
+  if ((tag == "HELLO" || tag == "WELCOME") && major.is(Value::Kind::integer) &&
+      major.integer() != PROTOCOL_MAJOR)
+    return {"version", "the peer speaks version " + std::to_string(major.integer()) +
+                           " of the protocol, this " + "client version " + std::to_string(PROTOCOL_MAJOR)};
   Problem problem = Checker({}).object(*out.type, out.fields);
   if (problem) return problem.message.insert(0, tag), problem;
   parts.erase(parts.begin());
@@ -1136,25 +1213,31 @@ inline Problem decode_message(std::vector<Bytes> parts, Message& out) {
   return check_parts(out);
 }
 
-// --- 5 axes --------------------------------------------------------------------------------------------------
+// --- 5 axes
+// --------------------------------------------------------------------------------------------------
 
 inline Quaternion multiply(const Quaternion& a, const Quaternion& b) {
-  return {a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3], a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-          a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1], a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]};
+  return {a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+          a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+          a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+          a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]};
 }
 
 inline Quaternion conjugate(const Quaternion& q) { return {q[0], -q[1], -q[2], -q[3]}; }
 
 // Yaw about z, then pitch about the new y (positive lowers the nose), then roll about the new x [rad].
 inline Quaternion from_euler(double yaw, double pitch, double roll) {
-  const double cy = std::cos(yaw / 2), sy = std::sin(yaw / 2), cp = std::cos(pitch / 2), sp = std::sin(pitch / 2);
+  const double cy = std::cos(yaw / 2), sy = std::sin(yaw / 2), cp = std::cos(pitch / 2),
+               sp = std::sin(pitch / 2);
   const double cr = std::cos(roll / 2), sr = std::sin(roll / 2);
   return {cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr, cy * sp * cr + sy * cp * sr,
           sy * cp * cr - cy * sp * sr};
 }
 
 // Faces along a velocity's horizontal course; a body that stands faces east.
-inline Quaternion facing(const Vector3& velocity) { return from_euler(std::atan2(velocity[1], velocity[0]), 0, 0); }
+inline Quaternion facing(const Vector3& velocity) {
+  return from_euler(std::atan2(velocity[1], velocity[0]), 0, 0);
+}
 
 inline double radians(double degrees) { return degrees * (PI / 180.0); }
 
@@ -1165,8 +1248,8 @@ struct Pose {
   Vector3 angular_velocity{};
 };
 
-// Axes and unit of length of an engine. Row i of `world` says which ENU axis (1 x, 2 y, 3 z, with its sign) the
-// engine's axis i is, `body` the same of forward, left, up; `unit` is the length in the engine of 1 m.
+// Axes and unit of length of an engine. Row i of `world` says which ENU axis (1 x, 2 y, 3 z, with its sign)
+// the engine's axis i is, `body` the same of forward, left, up; `unit` is the length in the engine of 1 m.
 struct Axes {
   std::array<int, 3> world, body;
   double unit;
@@ -1214,7 +1297,8 @@ struct Axes {
     return even != negative ? 1.0 : -1.0;
   }
   // W·R·Bᵀ = (W·Bᵀ)·(B·R·Bᵀ): the second factor turns about B's image of the axis, the first is fixed.
-  static Quaternion turned(const std::array<int, 3>& world, const std::array<int, 3>& body, const Quaternion& q) {
+  static Quaternion turned(const std::array<int, 3>& world, const std::array<int, 3>& body,
+                           const Quaternion& q) {
     const Vector3 v = scaled(hand(body), to(body, {q[1], q[2], q[3]}));
     const Quaternion found = multiply(between(world, inverse(body)), {q[0], v[0], v[1], v[2]});
     const double sign = found[0] < 0 ? -1.0 : 1.0;
@@ -1231,7 +1315,8 @@ struct Axes {
     }
     const auto root = [](double value) { return std::sqrt(std::max(0.0, 1.0 + value)) / 2; };
     const auto with_sign = [](double size, double sign) { return sign < 0 ? -size : size; };
-    return {root(m[0][0] + m[1][1] + m[2][2]), with_sign(root(m[0][0] - m[1][1] - m[2][2]), m[2][1] - m[1][2]),
+    return {root(m[0][0] + m[1][1] + m[2][2]),
+            with_sign(root(m[0][0] - m[1][1] - m[2][2]), m[2][1] - m[1][2]),
             with_sign(root(m[1][1] - m[0][0] - m[2][2]), m[0][2] - m[2][0]),
             with_sign(root(m[2][2] - m[0][0] - m[1][1]), m[1][0] - m[0][1])};
   }
@@ -1242,18 +1327,20 @@ inline Axes unity() { return {{-2, 3, 1}, {-2, 3, 1}, 1.0}; }     // left-handed
 inline Axes godot() { return {{-2, 3, -1}, {-2, 3, -1}, 1.0}; }   // right-handed, m: right, up, back
 inline Axes ned() { return {{2, 1, -3}, {1, -2, -3}, 1.0}; }      // right-handed, m: north, east, down
 
-// --- 6 objects and devices -----------------------------------------------------------------------------------
+// --- 6 objects and devices
+// -----------------------------------------------------------------------------------
 
 // One object at one instant.
 struct Object {
-  std::string name;   // begins with what `claim` declared; unique among objects and devices
-  std::string kind;   // its class: car, truck, bus, uav, pedestrian, …
-  std::string asset;  // what `offer_mesh` returned; empty: a box
-  Vector3 position{};                           // centre of the bounding box [m]
-  Quaternion orientation{1.0, 0.0, 0.0, 0.0};   // body to world
-  Vector3 velocity{};                           // world axes [m/s]
-  Vector3 dimensions{1.0, 1.0, 1.0};            // length, width, height [m]
-  std::optional<Vector3> angular_velocity{};    // world axes [rad/s]; none: it does not turn, or is not known to
+  std::string name;    // begins with what `claim` declared; unique among objects and devices
+  std::string kind;    // its class: car, truck, bus, uav, pedestrian, …
+  std::string asset;   // what `offer_mesh` returned; empty: a box
+  Vector3 position{};  // centre of the bounding box [m]
+  Quaternion orientation{1.0, 0.0, 0.0, 0.0};  // body to world
+  Vector3 velocity{};                          // world axes [m/s]
+  Vector3 dimensions{1.0, 1.0, 1.0};           // length, width, height [m]
+  std::optional<Vector3>
+      angular_velocity{};  // world axes [rad/s]; none: it does not turn, or is not known to
 };
 
 // Name, or pattern with `*`, `?`, `[abc]`, `[a-z]`, `[!abc]`, as `on` of a device has it.
@@ -1271,8 +1358,10 @@ class Pattern {
     Points found;
     for (const char byte : text) {
       const auto unit = static_cast<std::uint8_t>(byte);
-      if ((unit & 0xc0) != 0x80) found += unit < 0x80 ? unit : unit & (unit >= 0xf0 ? 7 : unit >= 0xe0 ? 15 : 31);
-      else if (!found.empty()) found.back() = found.back() << 6 | (unit & 0x3f);
+      if ((unit & 0xc0) != 0x80)
+        found += unit < 0x80 ? unit : unit & (unit >= 0xf0 ? 7 : unit >= 0xe0 ? 15 : 31);
+      else if (!found.empty())
+        found.back() = found.back() << 6 | (unit & 0x3f);
     }
     return found;
   }
@@ -1371,10 +1460,14 @@ class Mounts {
       if (spec["keeps_heading"].boolean()) turned = multiply(conjugate(parent->orientation), turned);
     }
     // Fields that equal their defaults are left out by the encoder.
-    Value found = Value::map({{"type", kind}, {"name", parent ? parent->name + "/" + name : name},
-                              {"parent", parent ? parent->name : ""}, {"position", position},
+    Value found = Value::map({{"type", kind},
+                              {"name", parent ? parent->name + "/" + name : name},
+                              {"parent", parent ? parent->name : ""},
+                              {"position", position},
                               {"orientation", turned}});
-    const auto angle = [&](const char* key, std::size_t index) { return radians(spec[key].at(index).number()); };
+    const auto angle = [&](const char* key, std::size_t index) {
+      return radians(spec[key].at(index).number());
+    };
     if (kind == "antenna") {
       found.set("role", spec["role"]).set("array", array(spec["array"])).set("power_dbm", spec["power_dbm"]);
     } else if (kind == "lidar") {
@@ -1403,7 +1496,8 @@ class Mounts {
 // What is wrong with the objects of a frame; nothing where consumers will accept them (SPEC.md, Content).
 inline std::string wrong_object(const Object& object, const std::vector<std::string>& prefixes,
                                 const std::map<std::string, Bytes>& files) {
-  const auto length = [](const Vector3& v) { return std::hypot(v[0], v[1], v[2]); };
+  // Not `hypot` of three: that of libstdc++ 12 ignores a NaN.
+  const auto length = [](const Vector3& v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); };
   const Quaternion& q = object.orientation;
   const double norm = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const std::string name = "object '" + object.name + "': ";
@@ -1414,7 +1508,8 @@ inline std::string wrong_object(const Object& object, const std::vector<std::str
   if (!keeps_rule("NewName", object.kind)) return name + "its kind is missing: car, uav, pedestrian, …";
   if (!object.asset.empty() && !files.count(object.asset))
     return name + "asset '" + object.asset + "' was not offered; offer_mesh() in prepare() returns its name";
-  if (!(std::fabs(norm - 1.0) <= 1e-3)) return name + "its orientation has norm " + std::to_string(norm) + ", not 1";
+  if (!(std::fabs(norm - 1.0) <= 1e-3))
+    return name + "its orientation has norm " + std::to_string(norm) + ", not 1";
   if (!(length(object.position) <= 1e9)) return name + "its position is farther than 1e9 m, or no number";
   if (!(length(object.velocity) < LIGHT_M_S)) return name + "its velocity is not below that of light";
   for (const double side : object.dimensions)
@@ -1426,7 +1521,8 @@ inline std::string wrong_object(const Object& object, const std::vector<std::str
 }
 
 // Header and body of a scene: objects sorted by name, with the devices of the frame.
-inline std::pair<Bytes, Bytes> encode_scene(std::vector<Object> objects, const std::map<std::string, Value>& devices) {
+inline std::pair<Bytes, Bytes> encode_scene(std::vector<Object> objects,
+                                            const std::map<std::string, Value>& devices) {
   std::sort(objects.begin(), objects.end(), [](const Object& a, const Object& b) { return a.name < b.name; });
   std::vector<Value> names, classes, assets, mounted;
   std::vector<double> position, orientation, velocity, dimensions, turning;
@@ -1439,17 +1535,22 @@ inline std::pair<Bytes, Bytes> encode_scene(std::vector<Object> objects, const s
     turns = turns || object.angular_velocity.has_value();
   }
   for (const auto& entry : devices) mounted.push_back(entry.second);
-  Value scene = Value::map({{"names", Value::list(names)}, {"classes", Value::list(classes)},
-                            {"assets", Value::list(assets)}, {"position", Value::rows(3, position)},
-                            {"orientation", Value::rows(4, orientation)}, {"velocity", Value::rows(3, velocity)},
-                            {"dimensions", Value::rows(3, dimensions)}, {"devices", Value::list(mounted)}});
+  Value scene = Value::map({{"names", Value::list(names)},
+                            {"classes", Value::list(classes)},
+                            {"assets", Value::list(assets)},
+                            {"position", Value::rows(3, position)},
+                            {"orientation", Value::rows(4, orientation)},
+                            {"velocity", Value::rows(3, velocity)},
+                            {"dimensions", Value::rows(3, dimensions)},
+                            {"devices", Value::list(mounted)}});
   if (turns) scene.set("angular_velocity", Value::rows(3, turning));
   std::pair<Bytes, Bytes> product;
   product.first = encode("Scene", scene, &product.second);
   return product;
 }
 
-// --- 7 meshes and scenery ------------------------------------------------------------------------------------
+// --- 7 meshes and scenery
+// ------------------------------------------------------------------------------------
 
 using Triangle = std::array<std::int32_t, 3>;  // corners, counter-clockwise seen from outside
 
@@ -1467,7 +1568,7 @@ struct Surface {
 
 struct Material {
   std::string name;
-  std::string type;          // of Recommendation ITU-R P.2040: concrete, brick, glass, metal, …
+  std::string type;  // of Recommendation ITU-R P.2040: concrete, brick, glass, metal, …
   double thickness_m = 0.1;
 };
 
@@ -1479,7 +1580,8 @@ inline Box bounds(const std::vector<Vector3>& vertices) {
   Box box;
   for (std::size_t k = 0; k < 3 && !vertices.empty(); ++k) {
     double least = vertices[0][k], most = least;
-    for (const Vector3& vertex : vertices) least = std::min(least, vertex[k]), most = std::max(most, vertex[k]);
+    for (const Vector3& vertex : vertices)
+      least = std::min(least, vertex[k]), most = std::max(most, vertex[k]);
     box.centre[k] = (least + most) / 2, box.size[k] = most - least;
   }
   return box;
@@ -1489,7 +1591,8 @@ inline Box bounds(const std::vector<Vector3>& vertices) {
 inline Mesh box_mesh(const Vector3& centre, const Vector3& size) {
   Mesh mesh;
   for (int i = 0; i < 8; ++i)
-    mesh.vertices.push_back({centre[0] + ((i & 1) ? 0.5 : -0.5) * size[0], centre[1] + ((i & 2) ? 0.5 : -0.5) * size[1],
+    mesh.vertices.push_back({centre[0] + ((i & 1) ? 0.5 : -0.5) * size[0],
+                             centre[1] + ((i & 2) ? 0.5 : -0.5) * size[1],
                              centre[2] + ((i & 4) ? 0.5 : -0.5) * size[2]});
   mesh.triangles = {{0, 2, 3}, {0, 3, 1}, {4, 5, 7}, {4, 7, 6}, {0, 1, 5}, {0, 5, 4},
                     {2, 6, 7}, {2, 7, 3}, {0, 4, 6}, {0, 6, 2}, {1, 3, 7}, {1, 7, 5}};
@@ -1504,16 +1607,20 @@ inline std::string wrong_mesh(const Mesh& mesh) {
       if (!std::isfinite(static_cast<float>(coordinate))) return "a vertex is not finite";
   for (const Triangle& triangle : mesh.triangles)
     for (const std::int32_t corner : triangle)
-      if (corner < 0 || corner >= count) return "corner " + std::to_string(corner) + " is none of its vertices";
+      if (corner < 0 || corner >= count)
+        return "corner " + std::to_string(corner) + " is none of its vertices";
   return mesh.triangles.empty() ? "it has no triangle" : "";
 }
 
 // The mesh as a binary PLY file.
 inline Bytes to_ply(const Mesh& mesh) {
-  Bytes file = "ply\nformat binary_little_endian 1.0\nelement vertex " + std::to_string(mesh.vertices.size()) +
-               "\nproperty float x\nproperty float y\nproperty float z\nelement face " +
-               std::to_string(mesh.triangles.size()) + "\nproperty list uchar int vertex_indices\nend_header\n";
-  const auto add = [&file](const void* data, std::size_t size) { file.append(static_cast<const char*>(data), size); };
+  Bytes file =
+      "ply\nformat binary_little_endian 1.0\nelement vertex " + std::to_string(mesh.vertices.size()) +
+      "\nproperty float x\nproperty float y\nproperty float z\nelement face " +
+      std::to_string(mesh.triangles.size()) + "\nproperty list uchar int vertex_indices\nend_header\n";
+  const auto add = [&file](const void* data, std::size_t size) {
+    file.append(static_cast<const char*>(data), size);
+  };
   for (const Vector3& vertex : mesh.vertices) {
     for (const double coordinate : vertex) {
       const auto narrow = static_cast<float>(coordinate + 0.0);
@@ -1531,12 +1638,14 @@ inline Bytes to_scene_xml(const std::vector<Surface>& surfaces, const std::vecto
     char thickness[32];
     std::snprintf(thickness, sizeof thickness, "%.9g", material.thickness_m);
     std::replace(thickness, thickness + std::strlen(thickness), ',', '.');  // of a locale
-    xml += "  <bsdf type=\"itu-radio-material\" id=\"mat-" + material.name + "\">\n    <string name=\"type\" value=\"" +
-           material.type + "\"/>\n    <float name=\"thickness\" value=\"" + thickness + "\"/>\n  </bsdf>\n";
+    xml += "  <bsdf type=\"itu-radio-material\" id=\"mat-" + material.name +
+           "\">\n    <string name=\"type\" value=\"" + material.type +
+           "\"/>\n    <float name=\"thickness\" value=\"" + thickness + "\"/>\n  </bsdf>\n";
   }
   for (const Surface& surface : surfaces)
-    xml += "  <shape type=\"ply\" id=\"mesh-" + surface.name + "\">\n    <string name=\"filename\" value=\"meshes/" +
-           surface.name + ".ply\"/>\n    <boolean name=\"face_normals\" value=\"true\"/>\n    <ref id=\"mat-" +
+    xml += "  <shape type=\"ply\" id=\"mesh-" + surface.name +
+           "\">\n    <string name=\"filename\" value=\"meshes/" + surface.name +
+           ".ply\"/>\n    <boolean name=\"face_normals\" value=\"true\"/>\n    <ref id=\"mat-" +
            surface.material + "\" name=\"bsdf\"/>\n  </shape>\n";
   return xml + "</scene>\n";
 }
@@ -1549,9 +1658,11 @@ inline bool plain_name(const std::string& name) {
 }
 
 // What is wrong with scenery; nothing where it can be offered.
-inline std::string wrong_scenery(const std::vector<Surface>& surfaces, const std::vector<Material>& materials) {
+inline std::string wrong_scenery(const std::vector<Surface>& surfaces,
+                                 const std::vector<Material>& materials) {
   static constexpr char TYPES_OF_P2040[] =
-      " asphalt_concrete brick carpet_tile ceiling_board chipboard clear_acrylic concrete floorboard glass marble "
+      " asphalt_concrete brick carpet_tile ceiling_board chipboard clear_acrylic concrete floorboard glass "
+      "marble "
       "metal plasterboard plywood vinyl_tile wood very_dry_ground medium_dry_ground wet_ground vacuum ";
   std::map<std::string, bool> names, kinds;
   for (const Material& material : materials) {
@@ -1559,7 +1670,8 @@ inline std::string wrong_scenery(const std::vector<Surface>& surfaces, const std
       return "material '" + material.name + "': names are unique, of letters, digits, '_', '-' and '.'";
     if (std::strstr(TYPES_OF_P2040, (" " + material.type + " ").c_str()) == nullptr)
       return "material '" + material.name + "': '" + material.type + "' is none of" + TYPES_OF_P2040;
-    if (!(material.thickness_m > 0)) return "material '" + material.name + "': its thickness is not above 0 m";
+    if (!(material.thickness_m > 0))
+      return "material '" + material.name + "': its thickness is not above 0 m";
     kinds[material.name] = true;
   }
   for (const Surface& surface : surfaces) {
@@ -1584,20 +1696,21 @@ inline std::string geometry_digest(const std::map<std::string, Bytes>& files) {
   return files.empty() ? "" : digest.hex();
 }
 
-// --- 8 commands, link, channel -------------------------------------------------------------------------------
+// --- 8 commands, link, channel
+// -------------------------------------------------------------------------------
 
 // One command of an agent's action.
 struct Command {
   enum class Kind : std::uint8_t { beam, waypoint, velocity, schedule };
   Kind kind = Kind::beam;
-  std::string source;            // the agent
-  std::string tx, rx, carrier;   // beam, schedule
+  std::string source;           // the agent
+  std::string tx, rx, carrier;  // beam, schedule
   std::int64_t tx_beam = 0, rx_beam = 0;
-  std::string object;            // waypoint, velocity
-  Vector3 position{};            // waypoint [m]
-  double speed = 0.0;            // at most [m/s]
-  bool at_once = false;          // be there in this frame, at rest
-  Vector3 velocity{};            // [m/s]
+  std::string object;    // waypoint, velocity
+  Vector3 position{};    // waypoint [m]
+  double speed = 0.0;    // at most [m/s]
+  bool at_once = false;  // be there in this frame, at rest
+  Vector3 velocity{};    // [m/s]
 };
 
 inline std::vector<Command> commands_of(const Value& action, const std::string& source) {
@@ -1605,11 +1718,13 @@ inline std::vector<Command> commands_of(const Value& action, const std::string& 
   for (const Value& value : action["commands"].items()) {
     Command command;
     const std::string type = value["type"].text();
-    command.kind = type == "beam" ? Command::Kind::beam
+    command.kind = type == "beam"       ? Command::Kind::beam
                    : type == "waypoint" ? Command::Kind::waypoint
-                   : type == "velocity" ? Command::Kind::velocity : Command::Kind::schedule;
+                   : type == "velocity" ? Command::Kind::velocity
+                                        : Command::Kind::schedule;
     command.source = source;
-    command.tx = value["tx"].text(), command.rx = value["rx"].text(), command.carrier = value["carrier"].text();
+    command.tx = value["tx"].text(), command.rx = value["rx"].text(),
+    command.carrier = value["carrier"].text();
     command.tx_beam = value["tx_beam"].integer(), command.rx_beam = value["rx_beam"].integer();
     command.object = value["object"].text(), command.position = value["position"].numbers<3>();
     command.speed = value["speed"].number(), command.at_once = value["at_once"].boolean();
@@ -1645,7 +1760,8 @@ inline std::vector<LinkUser> users_of(const Value& link) {
     user.has_path = path[i] != 0, user.los = los[i] != 0;
     user.tx_beam = tx[i], user.rx_beam = rx[i];
     if (pairs) user.best_tx_beam = top_tx[i * pairs], user.best_rx_beam = top_rx[i * pairs];
-    user.abs_y = abs_y[i], user.snr = snr[i], user.spectral_efficiency = efficiency[i], user.bit_rate = rate[i];
+    user.abs_y = abs_y[i], user.snr = snr[i], user.spectral_efficiency = efficiency[i],
+    user.bit_rate = rate[i];
   }
   return found;
 }
@@ -1653,12 +1769,12 @@ inline std::vector<LinkUser> users_of(const Value& link) {
 // One path of a channel, as a line to draw and a number for each carrier.
 struct Ray {
   std::string tx, rx;
-  std::vector<std::complex<double>> a;      // amplitude gain, for each carrier
-  double tau = 0.0;                         // delay [s]
-  std::array<double, 2> aod{}, aoa{};       // zenith, azimuth [rad]
-  std::vector<Vector3> points;              // where it interacts, TX to RX [m]
-  std::vector<std::uint8_t> interactions;   // 1 reflection, 2 diffraction, 3 scattering, 4 transmission
-  std::vector<std::string> objects;         // what it meets there; empty where that is not known
+  std::vector<std::complex<double>> a;     // amplitude gain, for each carrier
+  double tau = 0.0;                        // delay [s]
+  std::array<double, 2> aod{}, aoa{};      // zenith, azimuth [rad]
+  std::vector<Vector3> points;             // where it interacts, TX to RX [m]
+  std::vector<std::uint8_t> interactions;  // 1 reflection, 2 diffraction, 3 scattering, 4 transmission
+  std::vector<std::string> objects;        // what it meets there; empty where that is not known
 };
 
 inline std::vector<Ray> rays_of(const Value& channel) {
@@ -1668,11 +1784,13 @@ inline std::vector<Ray> rays_of(const Value& channel) {
   const auto aod = channel["aod"].elements<double>(), aoa = channel["aoa"].elements<double>();
   const auto kinds = channel["interactions"].elements<std::uint8_t>();
   const auto objects = channel["objects"].elements<std::int32_t>();
-  const std::size_t receivers = channel["rx"].size(), paths = tau.size(), carriers = channel["carriers"].size();
+  const std::size_t receivers = channel["rx"].size(), paths = tau.size(),
+                    carriers = channel["carriers"].size();
   const auto depth = static_cast<std::size_t>(channel["interactions"].at(1).integer());
   std::vector<Ray> found(paths);
   for (std::size_t pair = 0; pair + 1 < offsets.size(); ++pair) {
-    for (auto p = static_cast<std::size_t>(offsets[pair]); p < static_cast<std::size_t>(offsets[pair + 1]); ++p) {
+    for (auto p = static_cast<std::size_t>(offsets[pair]); p < static_cast<std::size_t>(offsets[pair + 1]);
+         ++p) {
       Ray& ray = found[p];
       ray.tx = channel["tx"].at(pair / receivers).text(), ray.rx = channel["rx"].at(pair % receivers).text();
       for (std::size_t c = 0; c < carriers; ++c) ray.a.push_back(a[c * paths + p]);
@@ -1687,7 +1805,8 @@ inline std::vector<Ray> rays_of(const Value& channel) {
   return found;
 }
 
-// --- 9 sockets and heartbeats --------------------------------------------------------------------------------
+// --- 9 sockets and heartbeats
+// --------------------------------------------------------------------------------
 
 using Clock = std::chrono::steady_clock;
 
@@ -1695,7 +1814,8 @@ inline std::string read_file(const char* path) {
   std::string text;
   std::FILE* file = path && *path ? std::fopen(path, "rb") : nullptr;
   char piece[4096];
-  for (std::size_t got = 1; file && got > 0; text.append(piece, got)) got = std::fread(piece, 1, sizeof piece, file);
+  for (std::size_t got = 1; file && got > 0; text.append(piece, got))
+    got = std::fread(piece, 1, sizeof piece, file);
   if (file) std::fclose(file);
   return text;
 }
@@ -1704,7 +1824,8 @@ inline std::string read_file(const char* path) {
 struct Keys {
   std::string own_public, own_secret, broker_public;
 
-  // Of the files that the environment names: CAVIAR_KEY, its own .key, and CAVIAR_BROKER_KEY, the broker's .pub.
+  // Of the files that the environment names: CAVIAR_KEY, its own .key, and CAVIAR_BROKER_KEY, the broker's
+  // .pub.
   static Keys from_environment(std::string& wrong) {
     const char *own = std::getenv("CAVIAR_KEY"), *broker = std::getenv("CAVIAR_BROKER_KEY");
     if (!own && !broker) return {};
@@ -1715,7 +1836,8 @@ struct Keys {
     if (keys.own_public.size() != 40 || keys.own_secret.size() != 40)
       wrong = std::string("CAVIAR_KEY: '") + (own ? own : "") + "' is no .key file of `caviar keys new`";
     else if (keys.broker_public.size() != 40)
-      wrong = std::string("CAVIAR_BROKER_KEY: '") + (broker ? broker : "") + "' is no .pub file of the broker";
+      wrong =
+          std::string("CAVIAR_BROKER_KEY: '") + (broker ? broker : "") + "' is no .pub file of the broker";
     return keys;
   }
 
@@ -1749,7 +1871,8 @@ inline void* open_dealer(void* context, const std::string& endpoint, const Keys&
 
 inline void send_parts(void* socket, const std::vector<Bytes>& parts) {
   for (std::size_t i = 0; socket && i < parts.size(); ++i)
-    zmq_send(socket, parts[i].data(), parts[i].size(), ZMQ_DONTWAIT | (i + 1 < parts.size() ? ZMQ_SNDMORE : 0));
+    zmq_send(socket, parts[i].data(), parts[i].size(),
+             ZMQ_DONTWAIT | (i + 1 < parts.size() ? ZMQ_SNDMORE : 0));
 }
 
 // The next message; false where none is there. Parts beyond what any message has are counted, and not kept.
@@ -1773,7 +1896,8 @@ inline bool wait_for(void* socket, std::int64_t milliseconds) {
   return zmq_poll(&item, 1, static_cast<long>(std::max<std::int64_t>(0, milliseconds))) > 0;
 }
 
-// The heartbeat connection, in a thread of its own, so that a slow frame or a loading level stops no heartbeat.
+// The heartbeat connection, in a thread of its own, so that a slow frame or a loading level stops no
+// heartbeat.
 class Heart {
  public:
   Heart() = default;
@@ -1781,10 +1905,12 @@ class Heart {
   Heart& operator=(const Heart&) = delete;
   ~Heart() { stop(); }
 
-  void start(void* context, const std::string& endpoint, const Keys& keys, Bytes attach, const Value& welcome) {
+  void start(void* context, const std::string& endpoint, const Keys& keys, Bytes attach,
+             const Value& welcome) {
     stop();
     stopping_ = false, lost_ = false;
-    const std::chrono::nanoseconds every(welcome["heartbeat_ns"].integer(1)), alive(welcome["liveness_ns"].integer(1));
+    const std::chrono::nanoseconds every(welcome["heartbeat_ns"].integer(1)),
+        alive(welcome["liveness_ns"].integer(1));
     thread_ = std::thread([=] { beat(context, endpoint, keys, attach, every, alive); });
   }
   void stop() {
@@ -1829,8 +1955,10 @@ class Heart {
 
   Bytes heartbeat(std::int64_t sequence) {
     const std::lock_guard<std::mutex> lock(mutex_);
-    return encode("Heartbeat", Value::map({{"sequence", sequence}, {"progress", progress_}, {"phase", phase_},
-                                           {"grace_ns", grace_ns_}}));
+    return encode(
+        "Heartbeat",
+        Value::map(
+            {{"sequence", sequence}, {"progress", progress_}, {"phase", phase_}, {"grace_ns", grace_ns_}}));
   }
   void lose(std::string reason) {
     const std::lock_guard<std::mutex> lock(mutex_);
@@ -1854,7 +1982,8 @@ inline void leave_on_signals() {
   std::signal(SIGINT, [](int signal) { stop_signal() = signal; });
 }
 
-// --- 10 the world --------------------------------------------------------------------------------------------
+// --- 10 the world
+// --------------------------------------------------------------------------------------------
 
 struct Input {
   std::string topic;
@@ -1866,8 +1995,8 @@ struct Input {
 // A product that came with a GRANT.
 struct Product {
   std::string topic, source;
-  std::string status;     // fresh or held
-  std::int64_t frame = 0; // that it was computed for
+  std::string status;      // fresh or held
+  std::int64_t frame = 0;  // that it was computed for
   Value value;
 };
 
@@ -1920,8 +2049,10 @@ class World {
       if (stage_ == Stage::over || left <= 0) break;
       // In slices, so that a signal or a silent broker is noticed.
       const std::int64_t slice = std::min<std::int64_t>(left, 20);
-      if (socket_) wait_for(socket_, slice);
-      else std::this_thread::sleep_for(std::chrono::milliseconds(slice));
+      if (socket_)
+        wait_for(socket_, slice);
+      else
+        std::this_thread::sleep_for(std::chrono::milliseconds(slice));
     }
     return stage_ != Stage::over;
   }
@@ -1955,8 +2086,8 @@ class World {
   // Declares names with `claim`, and offers scenery; called again when the world comes back to a run.
   virtual void prepare() {}
 
-  // Goes to the first state of an episode. `seed` and `seed_episode` are all that randomness may depend on; t0 is
-  // the simulated time of frame 0 [s].
+  // Goes to the first state of an episode. `seed` and `seed_episode` are all that randomness may depend on;
+  // t0 is the simulated time of frame 0 [s].
   virtual void reset(std::int64_t seed, double t0) { static_cast<void>(seed), static_cast<void>(t0); }
 
   // The objects at t [s since frame 0]. `previous` is that of the frame before, in frame 0 it is t: the world
@@ -1986,12 +2117,13 @@ class World {
     return name;
   }
 
-  // Offers the mesh of objects, fitted into the unit box that `dimensions` scale; returns what goes into `asset`.
-  // In `prepare`.
+  // Offers the mesh of objects, fitted into the unit box that `dimensions` scale; returns what goes into
+  // `asset`. In `prepare`.
   std::string offer_mesh(const std::string& name, const std::vector<Vector3>& vertices,
                          const std::vector<Triangle>& triangles) {
     Mesh mesh{vertices, triangles};
-    if (const std::string wrong = wrong_mesh(mesh); !wrong.empty()) return fail("mesh '" + name + "': " + wrong), "";
+    if (const std::string wrong = wrong_mesh(mesh); !wrong.empty())
+      return fail("mesh '" + name + "': " + wrong), "";
     const Box box = bounds(vertices);
     for (Vector3& vertex : mesh.vertices)
       for (std::size_t k = 0; k < 3; ++k)
@@ -2054,20 +2186,27 @@ class World {
 
   bool open() {
     socket_ = open_dealer(context_, endpoint_, keys_, 1000);
-    if (!socket_) return end("cannot connect to '" + endpoint_ + "': " + zmq_strerror(zmq_errno()) +
-                             "; an address is like tcp://127.0.0.1:5555", 1);
+    if (!socket_)
+      return end("cannot connect to '" + endpoint_ + "': " + zmq_strerror(zmq_errno()) +
+                     "; an address is like tcp://127.0.0.1:5555",
+                 1);
     stage_ = Stage::connecting;
     std::vector<Value> wanted;
     for (const Input& input : inputs()) {
       std::vector<Value> parts(input.parts.begin(), input.parts.end());
-      wanted.push_back(Value::map({{"topic", input.topic}, {"lag", input.lag}, {"required", input.required},
+      wanted.push_back(Value::map({{"topic", input.topic},
+                                   {"lag", input.lag},
+                                   {"required", input.required},
                                    {"parts", Value::list(parts)}}));
     }
-    Value hello = Value::map(
-        {{"version", Value::list({PROTOCOL_MAJOR, PROTOCOL_MINOR})}, {"name", name_}, {"role", "world"},
-         {"inputs", Value::list(wanted)}, {"outputs", Value::list({"scene"})},
-         {"capabilities", Value::list({"assets", "checkpoint", "episodes"})},
-         {"implementation", "caviar.hpp"}, {"max_in_flight", max_in_flight}});
+    Value hello = Value::map({{"version", Value::list({PROTOCOL_MAJOR, PROTOCOL_MINOR})},
+                              {"name", name_},
+                              {"role", "world"},
+                              {"inputs", Value::list(wanted)},
+                              {"outputs", Value::list({"scene"})},
+                              {"capabilities", Value::list({"assets", "checkpoint", "episodes"})},
+                              {"implementation", "caviar.hpp"},
+                              {"max_in_flight", max_in_flight}});
 #if defined(__linux__)
     // What lets a broker on this machine see at once that this process has died.
     char space[64] = {};
@@ -2087,8 +2226,10 @@ class World {
     if (!socket_) return Clock::now() < retry_at_ || open_again();
     if (Clock::now() < deadline_) return true;
     if (rejoining_) return lost("no WELCOME");
-    return end("no WELCOME within " + std::to_string(static_cast<int>(welcome_timeout_s)) + " s from " + endpoint_ +
-               "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?", 1);
+    return end("no WELCOME within " + std::to_string(static_cast<int>(welcome_timeout_s)) + " s from " +
+                   endpoint_ +
+                   "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?",
+               1);
   }
 
   // A broker that waits for this world gets a new incarnation of it, on new sockets (SPEC.md, rejoin_ns).
@@ -2134,10 +2275,14 @@ class World {
     Value fields = Value::map(entries);
     return fields.set("epoch", welcome_["epoch"]).set("attempt", welcome_["attempt"]);
   }
-  void refuse(const std::string& code, const std::string& message, const std::string& of, const Value& subject = {}) {
+  void refuse(const std::string& code, const std::string& message, const std::string& of,
+              const Value& subject = {}) {
     log("refused: " + message);
-    send_parts(socket_, {encode("Error", Value::map({{"code", code}, {"message", message}, {"of", of},
-                                                     {"subject", subject.text()}}))});
+    send_parts(
+        socket_,
+        {encode(
+            "Error",
+            Value::map({{"code", code}, {"message", message}, {"of", of}, {"subject", subject.text()}}))});
   }
 
   // --- receiving
@@ -2216,7 +2361,8 @@ class World {
     const auto found = digests_.find(get["digest"].text());
     const auto offset = static_cast<std::size_t>(get["offset"].integer());
     if (found == digests_.end() || offset > files_[found->second].size())
-      return refuse("unknown-asset", "no asset has this digest, or so many bytes", "ASSET_GET", get["digest"]);
+      return refuse("unknown-asset", "no asset has this digest, or so many bytes", "ASSET_GET",
+                    get["digest"]);
     const Bytes& data = files_[found->second];
     const Value answer = Value::map({{"digest", found->first}, {"offset", offset}, {"size", data.size()}});
     send_parts(socket_, {encode("AssetData", answer), data.substr(offset, MAX_ASSET_CHUNK)});
@@ -2244,7 +2390,8 @@ class World {
     const std::int64_t frame = message.fields["frame"].integer();
     const auto stored = answers_.find(frame);
     if (stored != answers_.end()) return send_parts(socket_, stored->second), false;
-    if (frame <= newest_) return refuse("unexpected", "frame " + std::to_string(frame) + " is over", "GRANT"), false;
+    if (frame <= newest_)
+      return refuse("unexpected", "frame " + std::to_string(frame) + " is over", "GRANT"), false;
     if (deferred_) return waiting_.push_back(std::move(message)), false;
     grant_ = std::move(message);
     failure_.clear(), commands_.clear(), products_.clear();
@@ -2263,19 +2410,24 @@ class World {
     std::size_t part = 0;
     for (const Value& input : grant_.fields["inputs"].items()) {
       if (input["status"].text() == "absent") continue;
-      Product product{input["topic"].text(), input["source"].text(), input["status"].text(),
-                      input["frame"].integer(-1), {}};
+      Product product{input["topic"].text(),
+                      input["source"].text(),
+                      input["status"].text(),
+                      input["frame"].integer(-1),
+                      {}};
       const Bytes &header = grant_.parts[part], &body = grant_.parts[part + 1];
       part += 2;
       Problem problem = decode_payload(product.topic, header, body, product.value);
       // Larger ones are compared by the recorder.
       const std::string stated = input["digest"].text();
-      if (!problem && header.size() + body.size() <= 16384 && !stated.empty() && stated != product_digest(header, body))
+      if (!problem && header.size() + body.size() <= 16384 && !stated.empty() &&
+          stated != product_digest(header, body))
         problem = malformed(product.topic + ": its bytes have another digest than its DONE said");
       if (problem.code == "limit") return refuse("limit", problem.message, "GRANT"), false;
       const std::string what = product.topic + " of " + product.source + ": " + problem.message;
       if (problem) return fault("decode", frame(), what, product.source), false;
-      for (Command& command : commands_of(product.value, product.source)) commands_.push_back(std::move(command));
+      for (Command& command : commands_of(product.value, product.source))
+        commands_.push_back(std::move(command));
       products_.push_back(std::move(product));
     }
     return true;
@@ -2289,11 +2441,14 @@ class World {
     const std::chrono::nanoseconds took = Clock::now() - began_;
     std::map<std::string, Value> devices = mounts_.devices(objects);
     for (const Object& object : objects)
-      if (devices.count(object.name)) return fault("step", frame(), "object '" + object.name + "' has a device's name");
+      if (devices.count(object.name))
+        return fault("step", frame(), "object '" + object.name + "' has a device's name");
     auto [header, body] = encode_scene(std::move(objects), devices);
     if (header.size() > MAX_HEADER) return fault("step", frame(), "the header of the scene exceeds 1 MiB");
     Value product = Value::map({{"topic", "scene"}, {"digest", product_digest(header, body)}});
-    const Value done = stamped({{"episode", episode_}, {"frame", frame()}, {"products", Value::list({product})},
+    const Value done = stamped({{"episode", episode_},
+                                {"frame", frame()},
+                                {"products", Value::list({product})},
                                 {"measured", Value::map({{"step", took.count()}})}});
     answer({encode("Done", done), std::move(header), std::move(body)});
     previous_ns_ = grant_.fields["t_ns"].integer();
@@ -2309,12 +2464,18 @@ class World {
     return {};
   }
 
-  void fault(const char* phase, std::int64_t frame, const std::string& line, const std::string& culprit = "") {
+  void fault(const char* phase, std::int64_t frame, const std::string& line,
+             const std::string& culprit = "") {
     log(std::string(phase) + ": " + line);
-    const Value fields = stamped({{"episode", std::max<std::int64_t>(0, episode_)}, {"frame", frame}, {"phase", phase},
-                                  {"message", line}, {"culprit", culprit}});
-    if (frame < 0) send_parts(socket_, {encode("Fault", fields)});
-    else answer({encode("Fault", fields)});
+    const Value fields = stamped({{"episode", std::max<std::int64_t>(0, episode_)},
+                                  {"frame", frame},
+                                  {"phase", phase},
+                                  {"message", line},
+                                  {"culprit", culprit}});
+    if (frame < 0)
+      send_parts(socket_, {encode("Fault", fields)});
+    else
+      answer({encode("Fault", fields)});
   }
 
   // Sends the answer to a GRANT, and keeps it for one that is repeated.
@@ -2352,7 +2513,8 @@ class World {
     bool right = state.rfind(MAGIC, 0) == 0 && state.size() >= begin;
     for (std::size_t i = 0; right && i < 4; ++i)
       length |= static_cast<std::size_t>(static_cast<std::uint8_t>(state[begin - 4 + i])) << (8 * i);
-    right = right && length <= state.size() - begin && !Unpacker(std::string_view(state).substr(begin, length)).read(head);
+    right = right && length <= state.size() - begin &&
+            !Unpacker(std::string_view(state).substr(begin, length)).read(head);
     failure_.clear();
     if (!right || !restore(state.substr(begin + length)) || !failure_.empty()) {
       fault("restore", -1, failure_.empty() ? "RESTORE has a state that is none of this world" : failure_);
@@ -2380,8 +2542,8 @@ class World {
   Value welcome_;
   Mounts mounts_;
   std::vector<std::string> prefixes_, notes_;
-  std::map<std::string, Bytes> files_;           // scenery by name
-  std::map<std::string, std::string> digests_;   // name by digest
+  std::map<std::string, Bytes> files_;          // scenery by name
+  std::map<std::string, std::string> digests_;  // name by digest
   std::string failure_;
 
   std::int64_t episode_ = -1, t0_ns_ = 0, seed_episode_ = 0, newest_ = -1;
