@@ -1,19 +1,15 @@
-"""The C++ client: its codec against the vectors, its axes, its refusals, and its reference world in whole runs."""
+"""Worlds made with the C++ header: compiled as in an engine, judged by the kit, killed, and in whole runs."""
 
 from __future__ import annotations
 
-import fnmatch
-import hashlib
 import importlib.util
 import json
 import re
 import shlex
-import shutil
 import signal
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,326 +17,49 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
-from scenarios_support import ROOT, environment, eventually, recorded_below, running
-from vector_files import Vector, all_vectors, array_of, is_array, load, named
+from cpp_programs import CPP, PROBE, STRICT, WORLD, compiled, program_folder
+from scenarios_support import environment, eventually, recorded_below, running
 
 from caviar_broker.control.socket import ask
 from caviar_clients.conform import conform
 from caviar_clients.conform.client import Received, Rules, Started, Wire
 from caviar_clients.conform.session import Seen, Session
 from caviar_clients.conform.street import Inputs
-from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import RunError
 from caviar_protocol.keys import Pair, write_pair
 from caviar_protocol.recording import Recording
-from caviar_protocol.topics import Action, Channel, Link
 
 pytestmark = pytest.mark.slow
 
-CPP = ROOT / "clients" / "cpp"
-PROBE = Path(__file__).with_name("cpp_probe.cpp")
-STRICT = ("-std=c++17", "-fno-exceptions", "-fno-rtti", "-Wall", "-Wextra", "-Werror", "-Wpedantic")
 ANY = "tcp://127.0.0.1:0"
 WITHIN_S = 60.0
-VECTORS = all_vectors()
 EMPTY = Inputs(without_optional=True)
 
 
-# --- compiling ------------------------------------------------------------------------------------------
-
-
-def compiled(compiler: str, source: Path, folder: Path, *flags: str) -> Path:
-    """A program of a source; skips by name where the compiler or ZeroMQ's header is missing."""
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
-    has_header = subprocess.run(
-        [compiler, "-E", "-x", "c++", "-"], input="#include <zmq.h>", capture_output=True, text=True, check=False
-    )
-    if has_header.returncode != 0:
-        pytest.skip("zmq.h is not installed (Debian: libzmq3-dev)")
-    program = folder / f"{source.stem}-{compiler}"
-    command = [compiler, *flags, f"-I{CPP}", str(source), "-o", str(program), "-lzmq", "-pthread"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return program
-
-
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cpp")
+def folder(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return program_folder(pytestconfig, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def world(folder: Path) -> Path:
-    """The reference world, compiled as an engine compiles: without exceptions, RTTI, or a warning."""
-    return compiled("g++", CPP / "world.cpp", folder, *STRICT)
-
-
-class Probe:
-    """The program that answers questions about the header."""
-
-    def __init__(self, program: Path) -> None:
-        self.program = program
-        self._process = subprocess.Popen([program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def __call__(self, *words: object) -> Any:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        shown = [f"x{word.hex()}" if isinstance(word, bytes) else str(word) for word in words]
-        self._process.stdin.write(" ".join(shown) + "\n")
-        self._process.stdin.flush()
-        return json.loads(self._process.stdout.readline())
-
-    def close(self) -> None:
-        self._process.communicate()
+    """The reference world."""
+    return compiled("g++", WORLD, folder, *STRICT)
 
 
 @pytest.fixture(scope="module")
-def probe(folder: Path) -> Iterator[Probe]:
-    found = Probe(compiled("g++", PROBE, folder, "-std=c++17", "-Wall", "-Wextra", "-Werror"))
-    yield found
-    found.close()
+def odd(folder: Path) -> Path:
+    """A world that its settings set: to be wrong, or to answer later, as an engine does."""
+    return compiled("g++", PROBE, folder, "-std=c++17", "-Wall", "-Wextra", "-Werror")
 
 
 def test_clang_compiles_the_world_without_exceptions_rtti_or_a_warning(folder: Path) -> None:
-    compiled("clang++", CPP / "world.cpp", folder, *STRICT)
+    compiled("clang++", WORLD, folder, *STRICT)
 
 
 def test_the_reference_world_has_at_most_80_lines_of_code() -> None:
-    lines = [line.strip() for line in (CPP / "world.cpp").read_text("utf-8").splitlines()]
+    lines = [line.strip() for line in WORLD.read_text("utf-8").splitlines()]
     assert sum(bool(line) and not line.startswith("//") for line in lines) <= 80
-
-
-# --- encoding -------------------------------------------------------------------------------------------
-
-
-def asked(probe: Probe, vector: Vector) -> Any:
-    """What the header makes of a vector."""
-    kind = vector.stated["kind"]
-    if kind == "message":
-        lengths = vector.stated.get("lengths", [])
-        parts: Sequence[bytes | str] = vector.parts[: len(vector.parts) - len(lengths)]
-        return probe("message", *parts, *[f"zeros:{length}" for length in lengths])
-    if kind == "payload":
-        return probe("payload", vector.stated["topic"], vector.header, vector.body)
-    return probe("arrays", vector.header, vector.body)
-
-
-@pytest.mark.parametrize("vector", [v for v in VECTORS if v.refused is not None], ids=named)
-def test_a_wrong_vector_is_refused_with_its_code(probe: Probe, vector: Vector) -> None:
-    assert asked(probe, vector).get("code") == vector.refused
-
-
-@pytest.mark.parametrize("vector", [v for v in VECTORS if v.refused is None], ids=named)
-def test_a_vector_is_read_and_written_again_in_canonical_form(probe: Probe, vector: Vector) -> None:
-    got = asked(probe, vector)
-    assert "header" in got, got
-    assert (got["header"], got.get("body", "")) == tuple(part.hex() for part in canonical(vector))
-    if vector.canonical and "value" in vector.stated:
-        assert_means(got["value"], vector.means, vector.name)
-
-
-def canonical(vector: Vector) -> tuple[bytes, bytes]:
-    """Header and body as a writer writes them."""
-    if vector.canonical:
-        return vector.header, vector.body
-    if vector.stated["kind"] == "message":
-        return msgpack.packb(vector.means), b""
-    return encode_payload(decode_payload(vector.stated["topic"], vector.header, vector.body))
-
-
-def assert_means(got: Any, stated: Any, path: str) -> None:
-    """Compare what was decoded with the JSON of a vector, which has no field that is not there."""
-    if is_array(stated):
-        expected = array_of(stated)
-        assert (got["dtype"], got["shape"]) == (stated["dtype"], list(expected.shape)), path
-        assert bytes.fromhex(got["data"]) == expected.tobytes(), path
-    elif isinstance(stated, dict):
-        assert set(got) == set(stated), path
-        for key, value in stated.items():
-            assert_means(got[key], value, f"{path}.{key}")
-    elif isinstance(stated, list):
-        assert len(got) == len(stated), path
-        for index, (item, value) in enumerate(zip(got, stated, strict=True)):
-            assert_means(item, value, f"{path}[{index}]")
-    else:
-        assert (got, type(got)) == (stated, type(stated)), path
-
-
-SIMPLE = {"≥ ": ">=", "≤ ": "<=", "> ": ">", ", ": "", "plain value": "plain"}
-
-
-def written_type(cell: str) -> str:
-    """A type of a table of SPEC.md as the header writes it."""
-    cell = re.sub(r" \(.*since .*\)$", "", cell).replace("\\|", "|")
-    if found := re.fullmatch(r"array `(.*?)` \[(.*)\]", cell):
-        return f"{found[1]}[{found[2].replace(' ', '')}]"
-    if found := re.fullmatch(r"list of (.*), 0 to (\d+) of them", cell):
-        return f"[{written_type(found[1])}]<={found[2]}"
-    if found := re.fullmatch(r"list of (\d) (\w+)", cell):
-        return f"{found[2]}*{found[1]}"
-    if found := re.fullmatch(r"list of (.*)", cell):
-        return f"[{written_type(found[1])}]"
-    if found := re.fullmatch(r"map, str to (.*)", cell):
-        return f"{{{written_type(found[1])}}}"
-    if links := re.findall(r"\[(\w+)\]\(#[\w-]+\)", cell):
-        return "/".join(links)
-    if "`" in cell:
-        return "|".join(re.findall("`(.*?)`", cell))
-    for words, sign in SIMPLE.items():
-        cell = cell.replace(words, sign)
-    return cell
-
-
-def tables_of_the_specification() -> str:
-    """All tables of fields, as the header writes them."""
-    text, found = (ROOT / "protocol" / "SPEC.md").read_text("utf-8"), []
-    for name, table in re.findall(r"<!-- fields: (\w+) -->(.*?)<!-- end -->", text, re.DOTALL):
-        words = [name]
-        for line in table.splitlines():
-            if not line.startswith("| ") or line.startswith(("| field |", "| ---")):
-                continue
-            field, kind, _, default = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:5]]
-            if field == "type":
-                words[0] += "#" + kind.strip('`"')
-                continue
-            shown = {"required": "!", "left out": "?", "all defaults": "=@"}
-            words.append(f"{field}:{written_type(kind)}{shown.get(default, '=' + default.replace(', ', ','))}")
-        found.append(" ".join(words))
-    return " ".join(found)
-
-
-def test_the_types_of_the_header_are_those_of_the_specification(probe: Probe) -> None:
-    assert probe("schema").split() == tables_of_the_specification().split()
-
-
-def test_digests_are_those_of_the_specification(probe: Probe) -> None:
-    scene = load("scene_one_object")
-    text = (ROOT / "protocol" / "SPEC.md").read_text("utf-8")
-    assert f"`{probe('digest', scene.header, scene.body)}`" in text
-    assert f"`{probe('geometry', 'objects/car.ply', b'abc')}`" in text
-    # A length at which the padding of SHA-256 takes a block of its own.
-    long = bytes(range(256)) * 3
-    for size in (47, 55, 56, 63, 64, 700):
-        right = hashlib.sha256((size).to_bytes(8, "little") + long[:size]).hexdigest()
-        assert probe("digest", long[:size], b"") == right
-
-
-# --- what a world publishes, and what it gets -----------------------------------------------------------
-
-ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))
-"""Objects that come in each frame of the vectors `mounts_0` to `mounts_4`."""
-
-
-def test_devices_are_mounted_as_in_the_vectors(probe: Probe) -> None:
-    assert probe("mounts", load("welcome_mounts").header)["code"] == ""
-    order: list[str] = []
-    for frame, new in enumerate(ARRIVALS):
-        vector = load(f"mounts_{frame}")
-        there = vector.stated["value"]["names"]
-        order = [name for name in (*order, *new) if name in there]
-        # Those that are there already may stand anywhere in the list: only who came counts.
-        shuffled = [*new, *[name for name in order if name not in new]]
-        got = probe("scene", vector.header, vector.body, ",".join(shuffled))
-        assert (got["header"], got["body"]) == (vector.header.hex(), vector.body.hex()), f"frame {frame}"
-
-
-def test_a_device_that_keeps_its_heading_turns_against_its_object(probe: Probe) -> None:
-    welcome = msgpack.unpackb(load("welcome_mounts").header)
-    spec = next(device for device in welcome["scenario"]["devices"] if device["name"] == "top")
-    scenario = {"devices": [spec | {"keeps_heading": True, "yaw_deg": 90.0}]}
-    assert probe("mounts", msgpack.packb(welcome | {"scenario": scenario}))["code"] == ""
-    stated = json.loads(json.dumps(load("scene_one_object").stated["value"]))
-    scene = decode_payload("scene", load("scene_one_object").header, load("scene_one_object").body)
-    got = probe("scene", load("scene_one_object").header, load("scene_one_object").body, stated["names"][0])
-    mounted = decode_payload("scene", bytes.fromhex(got["header"]), bytes.fromhex(got["body"])).devices[0]
-    # The object of the vector is turned by 90° about z, so that the device is not turned against it.
-    np.testing.assert_allclose(scene.orientation[0], [0.5**0.5, 0.0, 0.0, 0.5**0.5], atol=1e-9)
-    np.testing.assert_allclose(mounted.orientation, [1.0, 0.0, 0.0, 0.0], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "pattern",
-    ["car.*", "*", "c?r.[0-9]", "car.[!2-4]", "[[]x]", "*.*.*", "a[]b]c", "[", "a[b", "µ?", "ca[r-].*", "", "**b"],
-)
-def test_patterns_match_as_in_other_services(probe: Probe, pattern: str) -> None:
-    for text in ("car.1", "car.3", "uav", "[x]", "a.b.c", "a]c", "abc", "[", "a[b", "µ", "µé", "ca-.x", "", "aab"):
-        right = pattern == text or fnmatch.fnmatchcase(text, pattern)
-        assert probe("match", pattern.encode(), text.encode()) is right, f"{pattern!r} on {text!r}"
-
-
-AXES = json.loads((ROOT / "clients" / "axes.json").read_text("utf-8"))
-PARTS = ("position", "orientation", "velocity", "angular_velocity")
-
-
-@pytest.mark.parametrize("engine", AXES["engines"])
-def test_poses_convert_to_and_from_an_engine(probe: Probe, engine: str) -> None:
-    for pose in AXES["poses"]:
-        for direction, source, target in (("from", "enu", engine), ("to", engine, "enu")):
-            got = probe("axes", engine, direction, *[number for part in PARTS for number in pose[source][part]])
-            for part in PARTS:
-                right = np.array(pose[target][part])
-                found = np.array(got[part])
-                if part == "orientation" and found @ right < 0:
-                    found = -found  # q and −q are one rotation
-                np.testing.assert_allclose(found, right, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("engine", "right"),
-    [("unreal", [0.01, 0.02, 0.03]), ("unity", [3, 1, 2]), ("godot", [3, 1, 2]), ("ned", [1, 2, 3])],
-)
-def test_sides_of_a_box_have_no_sign(probe: Probe, engine: str, right: list[float]) -> None:
-    assert probe("axes", engine, "to", 1.0, 2.0, 3.0, 1.0, *[0.0] * 9)["sides"] == pytest.approx(right)
-
-
-def test_commands_of_an_action_are_read(probe: Probe) -> None:
-    vector = load("action_every_command")
-    action = decode_payload("action", vector.header, vector.body)
-    assert isinstance(action, Action)
-    got = asked(probe, vector)["typed"]
-    kinds = [("beam", "waypoint", "velocity", "schedule")[command["kind"]] for command in got]
-    assert kinds == [command.__struct_config__.tag for command in action.commands]
-    for mine, theirs in zip(got, action.commands, strict=True):
-        for field in theirs.__struct_fields__:
-            value = getattr(theirs, field)
-            assert mine[field] == (list(value) if isinstance(value, tuple) else value), field
-
-
-def test_users_of_a_link_are_read(probe: Probe) -> None:
-    vector = load("link_full")
-    link = decode_payload("link", vector.header, vector.body)
-    assert isinstance(link, Link)
-    got = asked(probe, vector)["typed"]
-    assert len(got) == len(link.tx) > 1
-    for i, user in enumerate(got):
-        for field in set(user) - {"best_tx_beam", "best_rx_beam"}:
-            assert user[field] == getattr(link, field)[i], field
-        assert [user["best_tx_beam"], user["best_rx_beam"]] == [link.top_tx_beam[i, 0], link.top_rx_beam[i, 0]]
-
-
-def test_paths_of_a_channel_are_read_as_rays(probe: Probe) -> None:
-    vector = load("channel_paths")
-    channel = decode_payload("channel", vector.header, vector.body)
-    assert isinstance(channel, Channel)
-    got = asked(probe, vector)["typed"]
-    assert len(got) == len(channel.tau) > 1
-    pair_of = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
-    for p, ray in enumerate(got):
-        depth = int(np.count_nonzero(channel.interactions[p]))
-        assert ray["tx"] == channel.tx[pair_of[p] // len(channel.rx)]
-        assert ray["rx"] == channel.rx[pair_of[p] % len(channel.rx)]
-        assert [complex(*gain) for gain in ray["a"]] == channel.a[:, p].tolist()
-        assert (ray["tau"], ray["aod"], ray["aoa"]) == (
-            channel.tau[p],
-            channel.aod[p].tolist(),
-            channel.aoa[p].tolist(),
-        )
-        assert ray["interactions"] == channel.interactions[p, :depth].tolist()
-        assert ray["points"] == channel.points[p, :depth].tolist()
-        names = [channel.object_names[i] if i >= 0 else "" for i in channel.objects[p, :depth]]
-        assert ray["objects"] == names
 
 
 # --- the protocol ---------------------------------------------------------------------------------------
@@ -359,15 +78,16 @@ def test_the_reference_world_fails_no_case_of_the_kit(world: Path) -> None:
     assert failures(world) == {}
 
 
-def test_a_world_that_answers_later_and_looks_at_channels_fails_no_case(probe: Probe) -> None:
-    assert failures(probe.program, deferred=True) == {}
+def test_a_world_that_answers_later_and_looks_at_channels_fails_no_case(odd: Path) -> None:
+    assert failures(odd, deferred=True) == {}
 
 
 @contextmanager
 def joined(program: Path, folder: Path, **welcome: Any) -> Iterator[Session]:
     """A life of a client up to WELCOME."""
     wire = Wire(ANY)
-    session = Session(wire, Started(f"{program} {{endpoint}} {{name}}", wire.endpoint, "mine", folder), Rules(), Seen())
+    client = Started(f"{program} {{endpoint}} {{name}}", wire.endpoint, "mine", folder)
+    session = Session(wire, client, Rules(), Seen())
     try:
         session.begin()
         session.welcome(**welcome)
@@ -392,9 +112,9 @@ def joined(program: Path, folder: Path, **welcome: Any) -> Iterator[Session]:
     ],
 )
 def test_a_wrong_object_is_named_in_fault_before_it_leaves(
-    probe: Probe, tmp_path: Path, wrong: str, line: str
+    odd: Path, tmp_path: Path, wrong: str, line: str
 ) -> None:
-    with joined(probe.program, tmp_path, settings={"wrong": wrong}) as session:
+    with joined(odd, tmp_path, settings={"wrong": wrong}) as session:
         session.begin_episode()
         frame = session.grant()
         fault = session.expect("FAULT")
@@ -412,8 +132,8 @@ def test_a_wrong_object_is_named_in_fault_before_it_leaves(
         ("name", "asset '../car.ply': a relative path is expected"),
     ],
 )
-def test_wrong_scenery_is_named_in_fault(probe: Probe, tmp_path: Path, wrong: str, line: str) -> None:
-    with joined(probe.program, tmp_path, settings={"wrong": wrong}) as session:
+def test_wrong_scenery_is_named_in_fault(odd: Path, tmp_path: Path, wrong: str, line: str) -> None:
+    with joined(odd, tmp_path, settings={"wrong": wrong}) as session:
         session.send("PREPARE", session.who)
         fault = session.expect("FAULT")
         assert "frame" not in fault.fields
@@ -429,7 +149,9 @@ def test_scenery_is_readable_for_a_ray_tracer(world: Path, tmp_path: Path) -> No
             "scenery/meshes/house.ply",
             "scenery/scene.xml",
         }
-        car, house = (read_mesh(session.offered[name]) for name in ("objects/car.ply", "scenery/meshes/house.ply"))
+        car, house = (
+            read_mesh(session.offered[name]) for name in ("objects/car.ply", "scenery/meshes/house.ply")
+        )
     # Meshes of objects fill the unit box; those of scenery stand where they are.
     np.testing.assert_allclose([car.min(axis=(0, 1)), car.max(axis=(0, 1))], [[-0.5] * 3, [0.5] * 3])
     np.testing.assert_allclose([house.min(axis=(0, 1)), house.max(axis=(0, 1))], [[-30, 16, 0], [30, 28, 12]])
@@ -455,8 +177,8 @@ def test_a_world_that_lost_the_broker_comes_back_under_its_name(world: Path, tmp
         hello = wait_for_hello(session.wire)
         assert {key: hello.fields[key] for key in session.hello} == session.hello
         back = Session(session.wire, session.client, Rules(), Seen())
-        back._route, back.hello = hello.route, hello.fields  # noqa: SLF001 - the kit begins each life itself
-        back._seen.allow(WITHIN_S)  # noqa: SLF001
+        back._route, back.hello = hello.route, hello.fields
+        back._seen.allow(WITHIN_S)
         back.welcome()
         back.begin_episode()
         assert back.step().parts[1:] == before
@@ -497,3 +219,114 @@ def test_keys_of_the_environment_are_those_of_its_connections(
     ended = subprocess.run([world, "tcp://127.0.0.1:1", "mine"], capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert "CAVIAR_KEY: " in ended.stderr
+
+
+# --- whole runs -----------------------------------------------------------------------------------------
+
+SCENARIO = CPP / "world.toml"
+KILLED_AFTER = 30
+"""Frames: more than between two checkpoints, so that the world takes its state over."""
+
+
+def free_space(folder: Path, *without: str) -> Path:
+    """The scenario without a ray tracer, and without some services."""
+    text = SCENARIO.read_text("utf-8")
+    for service in ("channel.settings", *without):
+        table = rf"^\[services\.{re.escape(service)}\].*?(?=^\[)"
+        text = re.sub(table, "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r'^use = "sionna-rt".*$', 'use = "free-space"', text, flags=re.MULTILINE)
+    left = [topic for topic in ("scene", "channel", "lidar", "link") if topic not in without]
+    text = re.sub(r"^record = .*$", f"record = {json.dumps(left)}", text, flags=re.MULTILINE)
+    path = folder / "free-space.toml"
+    path.write_text(text, "utf-8")
+    return path
+
+
+class Run:
+    """A run that waits for the world."""
+
+    def __init__(self, process: subprocess.Popen[str], mark: str, out: Path) -> None:
+        self._process, self._mark, self.out = process, mark, out
+        self.output = ""
+        eventually(lambda: bool(self._status()), WITHIN_S, "the run listens")
+        self.endpoint = str(self._status()["endpoint"])
+
+    def _status(self) -> dict[str, Any]:
+        for directory in self.out.glob("*/"):
+            try:
+                return dict(ask(directory, do="status")["status"])
+            except RunError:
+                return {}
+        return {}
+
+    @property
+    def directory(self) -> Path:
+        return next(self.out.glob("*/"))
+
+    @contextmanager
+    def world(self, program: Path) -> Iterator[subprocess.Popen[bytes]]:
+        with subprocess.Popen([program, self.endpoint, "world"], env=environment(self._mark)) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
+
+    def digest(self) -> str:
+        """Of the run, once it is over."""
+        self.output, _ = self._process.communicate(timeout=4 * WITHIN_S)
+        assert self._process.returncode == 0, self.output
+        return str(json.loads((self.directory / "summary.json").read_text())["digest"])
+
+
+@contextmanager
+def waiting_run(scenario: Path, folder: Path, *options: str) -> Iterator[Run]:
+    with running(scenario, folder / "out", *options) as (process, mark):
+        yield Run(process, mark, folder / "out")
+
+
+def has(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
+
+
+@pytest.mark.skipif(not has("mcap"), reason="mcap is not installed")
+def test_a_run_of_300_frames_with_rays_a_lidar_a_link_and_a_recorder(world: Path, tmp_path: Path) -> None:
+    scenario = SCENARIO if has("sionna") and has("mitsuba") else free_space(tmp_path, "lidar")
+    with waiting_run(scenario, tmp_path) as run, run.world(world) as process:
+        run.digest()
+        assert process.wait(WITHIN_S) == 0
+    recording = Recording(run.directory)
+    topics = ("scene", "channel", "link", *(["lidar"] if scenario == SCENARIO else []))
+    found: dict[str, list[Any]] = {
+        topic: [product.payload for _, product in recording.products(topic)] for topic in topics
+    }
+    assert {topic: len(products) for topic, products in found.items()} == dict.fromkeys(topics, 300)
+    assert {name for scene in found["scene"] for name in scene.names} == {"car", "pedestrian", "uav"}
+    rung = "siso-rt" if scenario == SCENARIO else "free-space"
+    assert {channel.rung for channel in found["channel"]} == {rung}
+    # The pedestrian's phone is there as long as its owner.
+    assert {len(channel.rx) for channel in found["channel"]} == {2, 3}
+    assert all(link.bit_rate.min() >= 0 for link in found["link"])
+    assert all(len(scan.ray) > 100 for lidar in found.get("lidar", []) for scan in lidar.scans)
+    if scenario == SCENARIO:
+        # Rays meet what the world brought: its ground, its house.
+        assert {"ground", "house"} <= {name for channel in found["channel"] for name in channel.object_names}
+
+
+def test_killed_and_started_again_it_goes_on_with_the_same_digest(world: Path, tmp_path: Path) -> None:
+    # Each service is a process that starts: the world, whose UAV has state, needs none of the others.
+    scenario, digests = free_space(tmp_path, "lidar", "link", "agent"), []
+    for folder in ("undisturbed", "killed"):
+        with waiting_run(scenario, tmp_path / folder, "--frames", "80") as run:
+            if folder == "killed":
+                with run.world(world) as first:
+                    wait_for_frames(run)
+                    first.send_signal(signal.SIGKILL)
+            with run.world(world):
+                digests.append(run.digest())
+    assert digests[0] == digests[1]
+    assert "back: world" in run.output
+
+
+def wait_for_frames(run: Run) -> None:
+    """Wait until as many frames are recorded as the world has to have done when it is killed."""
+    eventually(lambda: recorded_below(run.out) >= KILLED_AFTER, WITHIN_S, "frames are recorded")
