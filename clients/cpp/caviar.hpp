@@ -34,6 +34,15 @@
 #ifndef CAVIAR_HPP
 #define CAVIAR_HPP
 
+#if defined(_WIN32)  // zmq.h includes windows.h there, whose macros `min` and `max` break the standard
+                     // library
+#if !defined(NOMINMAX)
+#define NOMINMAX
+#endif
+#if !defined(WIN32_LEAN_AND_MEAN)
+#define WIN32_LEAN_AND_MEAN
+#endif
+#endif
 #include <zmq.h>
 
 #include <algorithm>
@@ -73,7 +82,7 @@ using Quaternion = std::array<double, 4>;  // (w, x, y, z)
 constexpr std::int64_t PROTOCOL_MAJOR = 1, PROTOCOL_MINOR = 5;
 constexpr std::size_t MAX_HEADER = 1048576, MAX_BODY = 1073741824, MAX_PARTS = 513, MAX_ASSET_CHUNK = 4194304;
 constexpr int MAX_NESTING = 32, MAX_DIMENSIONS = 6;
-constexpr double PI = 3.14159265358979323846, LIGHT_M_S = 299792458.0;
+constexpr double HALF_TURN = 3.14159265358979323846, LIGHT_M_S = 299792458.0;  // [rad], [m/s]
 
 // What is wrong with something: an error code of SPEC.md and a line for people. False where nothing is.
 struct Problem {
@@ -199,7 +208,7 @@ inline constexpr ElementType ELEMENT_TYPES[] = {{"|b1", 1}, {"|u1", 1}, {"|i1", 
 // fallback.
 class Value {
  public:
-  enum class Kind : std::uint8_t { nil, boolean, integer, number, text, list, map, array };
+  enum class Kind : std::uint8_t { none, boolean, integer, number, text, list, map, array };
   struct Entry;
 
   Value() = default;
@@ -310,7 +319,7 @@ class Value {
     return text;
   }
 
-  Kind kind_ = Kind::nil;
+  Kind kind_ = Kind::none;
   std::int64_t integer_ = 0;  // also a boolean, or the index of an array's element type
   double number_ = 0.0;
   std::string text_;  // also the elements of an array
@@ -336,11 +345,11 @@ class Packer {
 
   Bytes out;
 
-  void head(std::uint8_t small, std::size_t below, int first,
+  void head(std::uint8_t short_form, std::size_t below, int first,
             std::size_t count) {  // of text, a list or a map
     if (count < below) {
-      byte(small + count);
-    } else if (small == 0xa0 && count < 0x100) {
+      byte(short_form + count);
+    } else if (short_form == 0xa0 && count < 0x100) {
       byte(0xd9), big(count, 1);
     } else if (count < 0x10000) {
       byte(static_cast<std::size_t>(first)), big(count, 2);
@@ -376,7 +385,7 @@ class Packer {
 
   void value(const Value& value) {
     switch (value.kind()) {
-      case Value::Kind::nil:
+      case Value::Kind::none:
         return byte(0xc0);
       case Value::Kind::boolean:
         return boolean(value.boolean());
@@ -918,7 +927,7 @@ class Checker {
       const std::string& key = value.items()[i].text();
       for (std::size_t k = 0; k < type.fields.size() && !problem; ++k) {
         if (type.fields[k].name != key) continue;
-        problem = check(type.fields[k].type, value.items()[i + 1]);
+        problem = conform(type.fields[k].type, value.items()[i + 1]);
         if (problem) problem.message.insert(0, "." + key);
         kept[k] = std::move(value.items()[i + 1]);
         there[k] = true;
@@ -939,7 +948,7 @@ class Checker {
     return problem;
   }
 
-  Problem check(const Type& type, Value& value) {
+  Problem conform(const Type& type, Value& value) {
     switch (type.kind) {
       case Type::Kind::plain:
         return {};
@@ -1031,7 +1040,7 @@ class Checker {
     if (value.size() > type.at_most)
       return malformed(": " + std::to_string(value.size()) + " items are too many");
     for (std::size_t i = 0; i < value.size(); ++i) {
-      if (Problem problem = check(type.inner[0], value.items()[i])) {
+      if (Problem problem = conform(type.inner[0], value.items()[i])) {
         problem.message.insert(0, "[" + std::to_string(i) + "]");
         return problem;
       }
@@ -1042,7 +1051,7 @@ class Checker {
   Problem map(const Type& type, Value& value) {
     if (!value.is(Value::Kind::map)) return malformed(": a map is expected");
     for (std::size_t i = 0; i < value.items().size(); i += 2) {
-      if (Problem problem = check(type.inner[0], value.items()[i + 1])) {
+      if (Problem problem = conform(type.inner[0], value.items()[i + 1])) {
         problem.message.insert(0, "." + value.items()[i].text());
         return problem;
       }
@@ -1239,7 +1248,7 @@ inline Quaternion facing(const Vector3& velocity) {
   return from_euler(std::atan2(velocity[1], velocity[0]), 0, 0);
 }
 
-inline double radians(double degrees) { return degrees * (PI / 180.0); }
+inline double radians(double degrees) { return degrees * (HALF_TURN / 180.0); }
 
 struct Pose {
   Vector3 position{};
@@ -1911,7 +1920,9 @@ class Heart {
     stopping_ = false, lost_ = false;
     const std::chrono::nanoseconds every(welcome["heartbeat_ns"].integer(1)),
         alive(welcome["liveness_ns"].integer(1));
-    thread_ = std::thread([=] { beat(context, endpoint, keys, attach, every, alive); });
+    thread_ = std::thread([this, context, endpoint, keys, attach, every, alive] {
+      beat(context, endpoint, keys, attach, every, alive);
+    });
   }
   void stop() {
     stopping_ = true;

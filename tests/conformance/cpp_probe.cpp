@@ -58,7 +58,7 @@ static std::string json(const Value& value) {
   std::string out;
   const auto& items = value.items();
   switch (value.kind()) {
-    case Value::Kind::nil:
+    case Value::Kind::none:
       return "null";
     case Value::Kind::boolean:
       return value.boolean() ? "true" : "false";
