@@ -579,11 +579,11 @@ class Unpacker {
 // --- 3 types of messages and payloads
 // ------------------------------------------------------------------------
 
-// The tables of SPEC.md, in the order of their fields, a test compares them. `Name#TYPE field:type` and then
-// `!` where it is required, `?` where it may be left out, or `=` and its default (`@`: an object of
-// defaults). Types:
-// `[T]` list, `{T}` map, `T*3` three of them, `A/B` objects by their `type`, `a|b` words, `<f8[N,3]` an
-// array.
+// The tables of SPEC.md, to which a test compares these. A name, `#` and its `type` where it has one; then
+// fields in order, as `field:type` and `!` where it is required, `?` where it may be left out, or `=` and its
+// default
+// (`@`: an object of defaults). Types: `[T]` list, `{T}` map, `T*3` three of them, `A/B` objects by their
+// `type`, `a|b` words, `<f8[N,3]` array.
 inline constexpr char TYPES[] = R"(
 Hello#HELLO version:Version! name:NewName! role:world|channel|sensors|link|agent|recorder!
   inputs:[Input]<=256=[] outputs:[NewName]<=256=[] capabilities:[Word]<=256=[]
@@ -2054,8 +2054,9 @@ class World {
       }
       if (!keep_connected()) break;
       std::vector<Bytes> parts;
-      while (stage_ != Stage::over && socket_ && receive_parts(socket_, parts))
-        if (handle(std::move(parts))) return stage_ != Stage::over;
+      // Not all that may come, so that a flood of messages does not hold an engine up.
+      for (int left = 64; left > 0 && socket_ && receive_parts(socket_, parts); --left)
+        if (handle(std::move(parts)) || stage_ == Stage::over) return stage_ != Stage::over;
       const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - Clock::now()).count();
       if (stage_ == Stage::over || left <= 0) break;
       // In slices, so that a signal or a silent broker is noticed.
