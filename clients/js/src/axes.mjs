@@ -147,7 +147,7 @@ function determinant([[a, b, c], [d, e, f], [g, h, i]]) {
  */
 function conjugated([w, x, y, z], world, body) {
   const [a, b, c] = scaled(determinant(world), times(world, [x, y, z]));
-  const rest = /** @type {Matrix} */ (world.map((row) => times(body, row))); // W·Bᵀ: its rows are B·(a row of W)
+  const rest = /** @type {Matrix} */ (/** @type {unknown} */ (world.map((row) => times(body, row)))); // W·Bᵀ: its rows are B·(a row of W)
   const found = multiply([w, a, b, c], ofMatrix(rest));
   return found.map((value) => (found[0] < 0 ? -value : value) + 0);
 }

@@ -91,9 +91,10 @@ function write(writer, value, depth) {
 /** @param {Writer} writer  @param {object} value  @param {number} depth */
 function writeNested(writer, value, depth) {
   if (depth > MAX_NESTING) throw new ProtocolError("limit", `more than ${MAX_NESTING} maps and lists in one another`);
-  if (Array.isArray(value)) {
-    sized(writer, value.length, 0x90, 15, [0, 0xdc, 0xdd]);
-    for (const item of value) write(writer, item, depth);
+  if (Array.isArray(value) || ArrayBuffer.isView(value)) {
+    const items = /** @type {ArrayLike<unknown>} */ (/** @type {unknown} */ (value));
+    sized(writer, items.length, 0x90, 15, [0, 0xdc, 0xdd]);
+    for (const item of Array.from(items)) write(writer, item, depth);
     return;
   }
   const entries = [...(value instanceof Map ? value : Object.entries(value))].filter(([, item]) => item !== undefined);

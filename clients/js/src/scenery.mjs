@@ -68,6 +68,7 @@ export class Assets {
    */
   offerScenery(meshes, materials) {
     for (const [key, { type, thickness = 0.1 }] of Object.entries(materials)) {
+      if (!/^[\w.-]+$/.test(key)) throw new SceneError(`a material is named ${JSON.stringify(key)}; use letters, digits, _, . and -`);
       if (!MATERIALS.includes(type)) throw new SceneError(`material ${JSON.stringify(key)} is of the type ${JSON.stringify(type)}; choose one of ${MATERIALS.join(", ")}`);
       if (!(thickness > 0)) throw new SceneError(`material ${JSON.stringify(key)} has the thickness ${thickness}; give it metres above 0`);
     }
@@ -163,12 +164,11 @@ export function ply(points, corners) {
 
 /** @param {readonly SceneryMesh[]} meshes  @param {Record<string, Material>} materials */
 function sceneXml(meshes, materials) {
-  const id = (/** @type {string} */ key) => `mat-${key.replace(/[^\w.-]/g, "_")}`;
   const bsdfs = Object.entries(materials).map(([key, { type, thickness = 0.1 }]) =>
-    `  <bsdf type="itu-radio-material" id="${id(key)}">\n    <string name="type" value="${type}"/>\n` +
+    `  <bsdf type="itu-radio-material" id="mat-${key}">\n    <string name="type" value="${type}"/>\n` +
     `    <float name="thickness" value="${thickness}"/>\n  </bsdf>\n`);
   const shapes = meshes.map(({ name, material }) =>
     `  <shape type="ply" id="mesh-${name}">\n    <string name="filename" value="meshes/${name}.ply"/>\n` +
-    `    <boolean name="face_normals" value="true"/>\n    <ref id="${id(material)}" name="bsdf"/>\n  </shape>\n`);
+    `    <boolean name="face_normals" value="true"/>\n    <ref id="mat-${material}" name="bsdf"/>\n  </shape>\n`);
   return `<scene version="2.1.0">\n${bsdfs.join("")}${shapes.join("")}</scene>\n`;
 }

@@ -1,0 +1,59 @@
+// One WebSocket to the gateway: that of the browser, or of Node, or our own for a Node that has none.
+import { joinParts } from "./messages.mjs";
+
+/** How a WebSocket ended. @typedef {{ code: number, reason: string }} Closed */
+
+/** A WebSocket that is open. */
+export class Socket {
+  /** Gets each message. @type {(frame: Uint8Array) => void} */
+  onmessage = () => {};
+  /** Is called once, unless this side closed it. @type {(closed: Closed) => void} */
+  onclose = () => {};
+  #socket;
+  #over = false;
+
+  /** @param {any} socket  of the browser's interface, open */
+  constructor(socket) {
+    this.#socket = socket;
+    // Text is no message of this protocol: an empty frame is refused as one.
+    socket.onmessage = (/** @type {{ data: ArrayBuffer | string }} */ { data }) => {
+      if (!this.#over) this.onmessage(typeof data === "string" ? new Uint8Array(0) : new Uint8Array(data));
+    };
+    socket.onclose = (/** @type {Closed} */ { code, reason }) => {
+      if (this.#over) return;
+      this.#over = true;
+      this.onclose({ code, reason });
+    };
+  }
+
+  /** @param {Uint8Array[]} parts  of one message */
+  send(parts) {
+    if (!this.#over) this.#socket.send(joinParts(parts));
+  }
+
+  /** Close it after what was sent; nothing is heard of it afterwards. */
+  close() {
+    this.#over = true;
+    this.#socket.close(1000);
+  }
+}
+
+/**
+ * Open a WebSocket.
+ *
+ * @param {string} url
+ * @param {string} token  empty: none
+ * @returns {Promise<Socket>}
+ * @throws {Error} where nothing listens there; browsers do not say why
+ */
+export async function openSocket(url, token) {
+  const Constructor = /** @type {any} */ (globalThis.WebSocket ?? (await import("./node_websocket.mjs")).WebSocket);
+  const socket = new Constructor(url, ["caviar.v1", ...(token ? [`bearer.${token}`] : [])]);
+  socket.binaryType = "arraybuffer";
+  return new Promise((resolve, reject) => {
+    let why = "";
+    socket.onopen = () => resolve(new Socket(socket));
+    socket.onerror = (/** @type {any} */ event) => { why ||= event?.message ?? event?.error?.message ?? ""; };
+    socket.onclose = (/** @type {Closed} */ { code, reason }) => reject(new Error(`${url} does not answer (${why || reason || `code ${code}`})`));
+  });
+}
