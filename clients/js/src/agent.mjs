@@ -31,8 +31,8 @@ export class Agent extends Service {
    * @param {object} options
    * @param {string} [options.name]  as in the scenario
    * @param {InputDeclaration[]} [options.inputs]  scene and, of the frame before, link unless said otherwise
-   * @param {string[]} [options.actuators]  that it owns, such as `motion:uav`; what the scenario says, and `beam:*`
-   *   where it says nothing, unless given
+   * @param {string[]} [options.actuators]  that it owns, such as `motion:uav`; what the scenario says, and
+   *   `beam:*` where it says nothing, unless given
    * @param {number} [options.grace]  [s] that `prepare` may take
    */
   constructor({ name = "agent", inputs = INPUTS, actuators, grace = 60 } = {}) {
@@ -40,27 +40,27 @@ export class Agent extends Service {
     this.actuators = actuators;
   }
 
-  /** Load what the agent needs. @param {RunInfo} _run  @returns {void | Promise<void>} */
-  prepare(_run) {}
+  /** Load what the agent needs. @param {RunInfo} run  @returns {void | Promise<void>} */
+  prepare(run) {}
 
   /**
    * Choose.
    *
-   * @param {number} _t  time of the frame [s]
-   * @param {number} _previous  time of the frame before [s]
-   * @param {Input[]} _inputs  as declared; those that are absent, too
+   * @param {number} t  time of the frame [s]
+   * @param {number} previous  time of the frame before [s]
+   * @param {Input[]} inputs  as declared; those that are absent, too
    * @returns {Command[] | Promise<Command[]>} in any order
    */
-  step(_t, _previous, _inputs) {
+  step(t, previous, inputs) {
     throw new TypeError("an agent says in step what is to be done");
   }
 
   /**
    * Look at what the last action of an episode led to.
-   * @param {Input[]} _inputs
+   * @param {Input[]} inputs
    * @returns {void | Promise<void>}
    */
-  finish(_inputs) {}
+  finish(inputs) {}
 
   /**
    * Whether the scenario leaves a receiver to this agent (`users`, `except_users` of its settings).
@@ -69,7 +69,8 @@ export class Agent extends Service {
    */
   serves(receiver) {
     const { users, except_users: others } = this.info.settings;
-    const owns = (/** @type {string[]} */ patterns) => patterns.some((pattern) => matches(pattern.replace(/^beam:/, ""), receiver));
+    const owns = (/** @type {string[]} */ patterns) =>
+      patterns.some((pattern) => matches(pattern.replace(/^beam:/, ""), receiver));
     return users?.length ? owns(users) : !(others?.length && owns(others));
   }
 
@@ -78,8 +79,8 @@ export class Agent extends Service {
     this.#ending = { end_episode: true };
   }
 
-  /** @override  @param {Message} _prepare */
-  async prepared(_prepare) {
+  /** @override  @param {Message} prepare */
+  async prepared(prepare) {
     await this.prepare(this.info);
     return { ready: { actuators: this.actuators ?? this.#given() } };
   }
@@ -87,11 +88,19 @@ export class Agent extends Service {
   /** @returns {string[]} */
   #given() {
     const { users, except_users: others } = this.info.settings;
-    if (users?.length) return users.map((/** @type {string} */ pattern) => (/^(beam|motion|schedule):/.test(pattern) ? pattern : `beam:${pattern}`));
+    if (users?.length)
+      return users.map((/** @type {string} */ pattern) =>
+        /^(beam|motion|schedule):/.test(pattern) ? pattern : `beam:${pattern}`,
+      );
     return others?.length ? [] : ["beam:*"];
   }
 
-  /** @override  @param {Message} grant  @param {Input[]} inputs  @returns {Promise<{ products: Product[], [field: string]: any }>} */
+  /**
+   * @override
+   * @param {Message} grant
+   * @param {Input[]} inputs
+   * @returns {Promise<{ products: Product[], [field: string]: any }>}
+   */
   async answered(grant, inputs) {
     if (grant.final) {
       await this.finish(inputs);
@@ -105,9 +114,12 @@ export class Agent extends Service {
 
 /** @param {Command[]} commands  @returns {Command[]} by actuator, TX and carrier, as SPEC.md asks */
 function sorted(commands) {
-  const keyed = commands.map((command) => /** @type {const} */ ([keyOf(command), command])).sort(([a], [b]) => byBytes(a, b));
+  const keyed = commands
+    .map((command) => /** @type {const} */ ([keyOf(command), command]))
+    .sort(([a], [b]) => byBytes(a, b));
   keyed.forEach(([key], index) => {
-    if (index && key === keyed[index - 1][0]) throw new CaviarError(`two commands for ${key.split("\0").filter(Boolean).join(", ")}; give one`);
+    if (index && key === keyed[index - 1][0])
+      throw new CaviarError(`two commands for ${key.split("\0").filter(Boolean).join(", ")}; give one`);
   });
   return keyed.map(([, command]) => command);
 }
@@ -115,8 +127,11 @@ function sorted(commands) {
 /** @param {Command} command */
 function keyOf(command) {
   switch (command.type) {
-    case "beam": return `beam:${command.rx}\0${command.tx}\0${command.carrier ?? ""}`;
-    case "schedule": return `schedule:${command.tx}\0${command.rx}\0`;
-    default: return `motion:${command.object}\0\0`;
+    case "beam":
+      return `beam:${command.rx}\0${command.tx}\0${command.carrier ?? ""}`;
+    case "schedule":
+      return `schedule:${command.tx}\0${command.rx}\0`;
+    default:
+      return `motion:${command.object}\0\0`;
   }
 }

@@ -2,22 +2,34 @@
 import { ProtocolError } from "./errors.mjs";
 
 /** @typedef {"|b1" | "|u1" | "|i1" | "<u2" | "<i4" | "<i8" | "<u8" | "<f4" | "<f8" | "<c8" | "<c16"} Dtype */
-/** @typedef {Uint8Array | Int8Array | Uint16Array | Int32Array | BigInt64Array | BigUint64Array | Float32Array | Float64Array} Elements */
+/**
+ * @typedef {Uint8Array | Int8Array | Uint16Array | Int32Array | BigInt64Array | BigUint64Array | Float32Array
+ *   | Float64Array} Elements
+ */
 
 const MAX_DIMENSIONS = 6;
 /** Numbers that one element has: a complex one has two. */
 const NUMBERS = /** @type {Record<Dtype, number>} */ ({ "<c8": 2, "<c16": 2 });
 /** @type {Record<Dtype, { new (buffer: ArrayBuffer): Elements, BYTES_PER_ELEMENT: number }>} */
 const STORES = {
-  "|b1": Uint8Array, "|u1": Uint8Array, "|i1": Int8Array, "<u2": Uint16Array, "<i4": Int32Array, "<i8": BigInt64Array,
-  "<u8": BigUint64Array, "<f4": Float32Array, "<f8": Float64Array, "<c8": Float32Array, "<c16": Float64Array,
+  "|b1": Uint8Array,
+  "|u1": Uint8Array,
+  "|i1": Int8Array,
+  "<u2": Uint16Array,
+  "<i4": Int32Array,
+  "<i8": BigInt64Array,
+  "<u8": BigUint64Array,
+  "<f4": Float32Array,
+  "<f8": Float64Array,
+  "<c8": Float32Array,
+  "<c16": Float64Array,
 };
 
 /**
  * An array of numbers, in C order (the last index runs fastest).
  *
- * Typed arrays have the byte order of the machine, and all that run JavaScript today are little-endian, as the
- * protocol is.
+ * Typed arrays have the byte order of the machine, and all that run JavaScript today are little-endian, as
+ * the protocol is.
  */
 export class NumericArray {
   /**
@@ -38,7 +50,9 @@ export class NumericArray {
    * @param {ReadonlyArray<ArrayLike<number>>} rows
    */
   static ofRows(dtype, columns, rows) {
-    const data = /** @type {Float64Array} */ (new STORES[dtype](new ArrayBuffer(rows.length * columns * STORES[dtype].BYTES_PER_ELEMENT)));
+    const data = /** @type {Float64Array} */ (
+      new STORES[dtype](new ArrayBuffer(rows.length * columns * STORES[dtype].BYTES_PER_ELEMENT))
+    );
     rows.forEach((row, i) => {
       for (let j = 0; j < columns; j++) data[i * columns + j] = row[j] + 0; // + 0: no −0
     });
@@ -52,10 +66,12 @@ export class NumericArray {
    * @example channel.a.at(0, path) // [real, imaginary]
    */
   at(...indices) {
-    if (indices.length !== this.shape.length) throw new RangeError(`${indices.length} indices of ${this.shape.length} dimensions`);
+    if (indices.length !== this.shape.length)
+      throw new RangeError(`${indices.length} indices of ${this.shape.length} dimensions`);
     let place = 0;
     indices.forEach((index, axis) => {
-      if (!(index >= 0 && index < this.shape[axis])) throw new RangeError(`index ${index} of ${this.shape[axis]} in dimension ${axis}`);
+      if (!(index >= 0 && index < this.shape[axis]))
+        throw new RangeError(`index ${index} of ${this.shape[axis]} in dimension ${axis}`);
       place = place * this.shape[axis] + index;
     });
     if (this.dtype === "|b1") return this.data[place] === 1;
@@ -121,10 +137,13 @@ export class BodyReader {
     const { dtype, shape, offset } = this.#checked(reference, place);
     const Store = STORES[dtype];
     const size = Store.BYTES_PER_ELEMENT * (NUMBERS[dtype] ?? 1);
-    const count = shape.reduce((product, length) => product * length, 1); // a float: huge ones do not wrap around
-    if (offset < this.#end) throw malformed(`${place} begins at byte ${offset}, before the end of the array before it`);
+    const count = shape.reduce((product, length) => product * length, 1); // huge ones do not wrap around
+    if (offset < this.#end)
+      throw malformed(`${place} begins at byte ${offset}, before the end of the array before it`);
     if (offset + count * size > this.body.length) {
-      throw malformed(`${place} needs ${count * size} bytes from ${offset} on, and the body has ${this.body.length}`);
+      throw malformed(
+        `${place} needs ${count * size} bytes from ${offset} on, and the body has ${this.body.length}`,
+      );
     }
     this.#end = offset + count * size;
     // Not `this.body.slice`: that of Node's Buffer copies nothing.
@@ -141,13 +160,21 @@ export class BodyReader {
     return new NumericArray(dtype, shape, data);
   }
 
-  /** @param {any} reference  @param {string} place  @returns {{ dtype: Dtype, shape: number[], offset: number }} */
+  /**
+   * @param {any} reference
+   * @param {string} place
+   * @returns {{ dtype: Dtype, shape: number[], offset: number }}
+   */
   #checked(reference, place) {
     const { dtype, shape, offset } = reference ?? {};
-    if (typeof dtype !== "string" || !Object.hasOwn(STORES, dtype)) throw malformed(`${place} has elements of ${dtype}`);
-    if (!Array.isArray(shape) || !shape.every(isSize)) throw malformed(`${place} has the shape ${JSON.stringify(shape)}`);
-    if (shape.length > MAX_DIMENSIONS) throw new ProtocolError("limit", `${place} has ${shape.length} dimensions, at most ${MAX_DIMENSIONS}`);
-    if (!isSize(offset) || offset % 8 !== 0) throw malformed(`${place} has the offset ${offset}, no multiple of 8`);
+    if (typeof dtype !== "string" || !Object.hasOwn(STORES, dtype))
+      throw malformed(`${place} has elements of ${dtype}`);
+    if (!Array.isArray(shape) || !shape.every(isSize))
+      throw malformed(`${place} has the shape ${JSON.stringify(shape)}`);
+    if (shape.length > MAX_DIMENSIONS)
+      throw new ProtocolError("limit", `${place} has ${shape.length} dimensions, at most ${MAX_DIMENSIONS}`);
+    if (!isSize(offset) || offset % 8 !== 0)
+      throw malformed(`${place} has the offset ${offset}, no multiple of 8`);
     return { dtype: /** @type {Dtype} */ (dtype), shape, offset };
   }
 }

@@ -1,4 +1,5 @@
-// Errors of the library: what the peer did wrong, what the user of the library did wrong, and what ended a run.
+// Errors of the library: what the peer did wrong, what the user of the library did wrong, and what ended a
+// run.
 //
 //   CaviarError
 //     ProtocolError   bytes that are no message or no payload of the protocol; `code` as in ERROR

@@ -37,7 +37,8 @@ export class Heartbeat {
     this.lost = lost;
     this.liveness_ms = welcome.liveness_ns / 1e6;
     socket.onmessage = (frame) => this.#received(frame);
-    socket.onclose = ({ code, reason }) => lost(`the heartbeat connection closed (${reason || `code ${code}`})`);
+    socket.onclose = ({ code, reason }) =>
+      lost(`the heartbeat connection closed (${reason || `code ${code}`})`);
     this.#send({ type: "ATTACH", ...who });
     this.#timer = setInterval(() => this.#beat(), welcome.heartbeat_ns / 1e6);
   }
@@ -53,11 +54,15 @@ export class Heartbeat {
     this.#send({ type: "HEARTBEAT", sequence: this.#sequence++, progress, phase, grace_ns });
     const oldest = this.#unanswered;
     if (Date.now() - oldest < this.liveness_ms) return;
-    // A page in the background or a long step holds this timer up, and answers that came meanwhile have not been
-    // read yet: they are before the next turn but one.
-    setTimeout(() => {
-      if (this.#unanswered === oldest) this.lost(`the broker has been silent for ${Math.round(Date.now() - oldest)} ms`);
-    }, Math.min(100, this.liveness_ms));
+    // A page in the background or a long step holds this timer up, and answers that came meanwhile have not
+    // been read yet: they are before the next turn but one.
+    setTimeout(
+      () => {
+        if (this.#unanswered === oldest)
+          this.lost(`the broker has been silent for ${Math.round(Date.now() - oldest)} ms`);
+      },
+      Math.min(100, this.liveness_ms),
+    );
   }
 
   /** @param {import("./messages.mjs").Message} message */
@@ -75,6 +80,7 @@ export class Heartbeat {
     } catch {
       return; // noise: the next heartbeat asks again
     }
-    if (message.type === "REFUSE" || (message.type === "ERROR" && message.code === "unknown-peer")) this.lost(message.message);
+    if (message.type === "REFUSE" || (message.type === "ERROR" && message.code === "unknown-peer"))
+      this.lost(message.message);
   }
 }

@@ -2,11 +2,23 @@
 export { Agent } from "./agent.mjs";
 export { NumericArray } from "./arrays.mjs";
 export {
-  ENGINES, EngineAxes, GODOT, multiply, NED, quaternion, THREE, THREE_MODEL, UNITY, UNREAL, wxyz, xyzw,
+  ENGINES,
+  EngineAxes,
+  GODOT,
+  multiply,
+  NED,
+  quaternion,
+  THREE,
+  THREE_MODEL,
+  UNITY,
+  UNREAL,
+  wxyz,
+  xyzw,
 } from "./axes.mjs";
 export { CaviarError, ProtocolError, RunError, SceneError } from "./errors.mjs";
 export { main } from "./main.mjs";
 export { generator } from "./random.mjs";
+export { cos, sin } from "./trigonometry.mjs";
 export { decodePayload, encodePayload } from "./topics.mjs";
 export { World } from "./world.mjs";
 

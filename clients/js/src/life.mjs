@@ -1,5 +1,5 @@
-// One incarnation of a service at a broker: from HELLO to BYE, or to the loss of a connection. Rows of SPEC.md's
-// table "Wrong things and their answers" are answered here.
+// One incarnation of a service at a broker: from HELLO to BYE, or to the loss of a connection. Rows of
+// SPEC.md's table "Wrong things and their answers" are answered here.
 import { ProtocolError, RunError } from "./errors.mjs";
 import { Heartbeat, Progress } from "./heartbeat.mjs";
 import { decodeMessage, encodeMessage, splitFrame } from "./messages.mjs";
@@ -24,12 +24,15 @@ import { decodePayload, payloadDigest } from "./topics.mjs";
  * @property {(welcome: Message) => void} welcomed
  * @property {(prepare: Message) => Promise<{ ready: Record<string, any>, assets?: Assets }>} prepared
  * @property {(reset: Message) => Promise<void>} began
- * @property {(grant: Message, inputs: Input[]) => Promise<{ products: Product[], [field: string]: any }>} answered
+ * @property {(grant: Message, inputs: Input[]) => Promise<{ products: Product[], [field: string]: any }>}
+ *   answered
  * @property {() => Promise<Uint8Array>} saved
  * @property {(state: Uint8Array) => Promise<void>} restored
  */
-/** How a life ended: the run is over, or its connections are lost.
- * @typedef {{ over: string } | { lost: string, welcomed: boolean, rejoin_ms: number, taken?: boolean }} Outcome */
+/**
+ * How a life ended: the run is over, or its connections are lost.
+ * @typedef {{ over: string } | { lost: string, welcomed: boolean, rejoin_ms: number }} Outcome
+ */
 
 /** [B] of answers that are kept beyond the newest two, for a GRANT that is repeated. */
 const KEPT = 64 << 20;
@@ -120,11 +123,11 @@ export class Life {
     this.#reject(error);
   }
 
-  /** @param {string} lost  @param {boolean} taken  the name, so that it is to be tried again */
-  #lose(lost, taken = false) {
+  /** @param {string} lost  why */
+  #lose(lost) {
     if (this.#over) return;
     this.#end();
-    this.#resolve({ lost, welcomed: this.#state !== "connecting", rejoin_ms: this.#rejoin_ms, taken });
+    this.#resolve({ lost, welcomed: this.#state !== "connecting", rejoin_ms: this.#rejoin_ms });
   }
 
   /** @param {Closed} closed */
@@ -149,9 +152,13 @@ export class Life {
   #received(frame) {
     if (this.#over) return;
     try {
-      const parts = splitFrame(frame), message = decodeMessage(parts);
+      const parts = splitFrame(frame),
+        message = decodeMessage(parts);
       if (AT_ONCE.has(message.type)) this.#handledAtOnce(message);
-      else this.#queue = this.#queue.then(() => this.#handled(message, parts)).catch((error) => this.#fail(error));
+      else
+        this.#queue = this.#queue
+          .then(() => this.#handled(message, parts))
+          .catch((error) => this.#fail(error));
     } catch (error) {
       if (!(error instanceof ProtocolError)) this.#fail(/** @type {Error} */ (error));
       else if (error.code === "version") this.#fail(new RunError(error.message));
@@ -162,12 +169,20 @@ export class Life {
   /** @param {Message} message */
   #handledAtOnce(message) {
     switch (message.type) {
-      case "ASSET_GET": return this.#assetGet(message);
-      case "STALE": return this.log(`${this.part.name}: my ${message.of} was stale`);
-      case "ERROR": return this.log(`${this.part.name}: the broker could not use a message: ${message.code}: ${message.message}`);
-      case "REFUSE": return message.code === "name-taken" && this.returning ? this.#lose(message.message, true)
-        : this.#fail(new RunError(`refused: ${message.code}: ${message.message}`));
-      case "SHUTDOWN": return this.leave(message.reason);
+      case "ASSET_GET":
+        return this.#assetGet(message);
+      case "STALE":
+        return this.log(`${this.part.name}: my ${message.of} was stale`);
+      case "ERROR":
+        return this.log(
+          `${this.part.name}: the broker could not use a message: ${message.code}: ${message.message}`,
+        );
+      case "REFUSE":
+        return message.code === "name-taken" && this.returning
+          ? this.#lose(message.message)
+          : this.#fail(new RunError(`refused: ${message.code}: ${message.message}`));
+      case "SHUTDOWN":
+        return this.leave(message.reason);
     } // CANCEL is advice: the answer that is under way is still due
   }
 
@@ -176,7 +191,8 @@ export class Life {
     if (this.#over) return;
     const { type } = message;
     if (type === "WELCOME" && this.#state === "connecting") await this.#welcome(message);
-    else if (type === "PREPARE" && this.#state === "joined" && this.#isMine(message)) await this.#prepare(message);
+    else if (type === "PREPARE" && this.#state === "joined" && this.#isMine(message))
+      await this.#prepare(message);
     else if (type === "RESET" && this.#state === "ready" && this.#isMine(message)) await this.#reset(message);
     else if (this.#state !== "active" || !this.#isMine(message)) this.#unexpected(message);
     else if (type === "GRANT") await this.#grant(message, parts);
@@ -186,17 +202,31 @@ export class Life {
     else this.#unexpected(message);
   }
 
-  /** @param {Message} message  @returns {boolean} whether it is for this incarnation, and this episode where it says one */
+  /**
+   * @param {Message} message
+   * @returns {boolean} whether it is for this incarnation, and this episode where it says one
+   */
   #isMine(message) {
     const expected = message.type === "RESET" ? this.#who : { ...this.#who, ...this.#turn };
-    return Object.entries(expected).every(([field, value]) => message[field] === undefined || message[field] === value);
+    return Object.entries(expected).every(
+      ([field, value]) => message[field] === undefined || message[field] === value,
+    );
   }
 
   /** @param {Message} message */
   #unexpected({ type, epoch, attempt, episode, frame }) {
-    const of = [["epoch", epoch], ["attempt", attempt], ["episode", episode], ["frame", frame]]
-      .filter(([, value]) => value !== undefined).map((pair) => pair.join(" ")).join(", ");
-    this.#complain("unexpected", `${type}${of && ` of ${of}`} is not due: this service is ${this.#state}`, { of: type });
+    const of = [
+      ["epoch", epoch],
+      ["attempt", attempt],
+      ["episode", episode],
+      ["frame", frame],
+    ]
+      .filter(([, value]) => value !== undefined)
+      .map((pair) => pair.join(" "))
+      .join(", ");
+    this.#complain("unexpected", `${type}${of && ` of ${of}`} is not due: this service is ${this.#state}`, {
+      of: type,
+    });
   }
 
   /** @param {Message} welcome */
@@ -232,7 +262,11 @@ export class Life {
   /** @param {Message} get */
   #assetGet({ digest, offset }) {
     const found = this.#assets?.piece(digest, offset);
-    if (!found) return this.#complain("unknown-asset", `no file that I offered has this digest and a byte ${offset}`, { of: "ASSET_GET", subject: digest });
+    if (!found)
+      return this.#complain("unknown-asset", `no file that I offered has this digest and a byte ${offset}`, {
+        of: "ASSET_GET",
+        subject: digest,
+      });
     this.#send({ type: "ASSET_DATA", digest, offset, size: found.size }, found.piece);
   }
 
@@ -276,7 +310,10 @@ export class Life {
       const began = performance.now();
       const { products, ...more } = await this.part.answered(grant, inputs);
       const done = {
-        type: "DONE", ...turn, ...more, products: products.map(({ topic, digest }) => ({ topic, digest })),
+        type: "DONE",
+        ...turn,
+        ...more,
+        products: products.map(({ topic, digest }) => ({ topic, digest })),
         measured: { step: Math.round(1e6 * (performance.now() - began)) },
       };
       return [encodeMessage(done), ...products.flatMap(({ header, body }) => [header, body])];
@@ -336,7 +373,10 @@ function inputOf({ topic, source, digest }, header, body) {
     }
     return decodePayload(topic, header, body);
   } catch (error) {
-    throw new ProtocolError("malformed", `the product of ${topic} from ${source} cannot be used: ${asError(error).message}`);
+    throw new ProtocolError(
+      "malformed",
+      `the product of ${topic} from ${source} cannot be used: ${asError(error).message}`,
+    );
   }
 }
 

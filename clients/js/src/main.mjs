@@ -11,9 +11,9 @@ const END_MS = 1000;
 /**
  * Run a service until its run is over.
  *
- * In Node `URL [NAME]` are the arguments of the program and the token is in the variable CAVIAR_TOKEN; it says BYE
- * at SIGTERM, and the exit status is 0 only where the run ended. In a page they are `?url=…&name=…&token=…` of its
- * address.
+ * In Node `URL [NAME]` are the arguments of the program and the token is in the variable CAVIAR_TOKEN; it
+ * says BYE at SIGTERM, and the exit status is 0 only where the run ended. In a page they are
+ * `?url=…&name=…&token=…` of its address.
  *
  * @param {Service} service
  * @param {string} url  where none is given
@@ -40,7 +40,7 @@ export async function main(service, url = "ws://127.0.0.1:8080/ws") {
   } catch (error) {
     const { message, stack } = /** @type {Error} */ (error);
     // What the library says is for the user; anything else is a fault of a program, and has a place in it.
-    told = error instanceof CaviarError ? message : stack ?? message;
+    told = error instanceof CaviarError ? message : (stack ?? message);
     console.error(`${service.name}: ${told}`);
     if (inNode) process.exitCode = 1;
   }

@@ -1,5 +1,5 @@
-// MessagePack in the canonical form of SPEC.md: every integer, string, list and map as short as it can be, every
-// float in nine bytes, maps with string keys. Binary and extension types do not occur.
+// MessagePack in the canonical form of SPEC.md: every integer, string, list and map as short as it can be,
+// every float in nine bytes, maps with string keys. Binary and extension types do not occur.
 import { ProtocolError } from "./errors.mjs";
 
 /** Maps and lists in one another that are read and written; deeper ones are refused (SPEC.md, Limits). */
@@ -45,7 +45,11 @@ class Writer {
     return at;
   }
 
-  /** @param {number} code  @param {number} size  @param {number} value  an unsigned number behind a type code */
+  /**
+   * @param {number} code
+   * @param {number} size
+   * @param {number} value  an unsigned number behind a type code
+   */
   coded(code, size, value) {
     const at = this.take(1 + size);
     this.bytes[at] = code;
@@ -90,14 +94,17 @@ function write(writer, value, depth) {
 
 /** @param {Writer} writer  @param {object} value  @param {number} depth */
 function writeNested(writer, value, depth) {
-  if (depth > MAX_NESTING) throw new ProtocolError("limit", `more than ${MAX_NESTING} maps and lists in one another`);
+  if (depth > MAX_NESTING)
+    throw new ProtocolError("limit", `more than ${MAX_NESTING} maps and lists in one another`);
   if (Array.isArray(value) || ArrayBuffer.isView(value)) {
     const items = /** @type {ArrayLike<unknown>} */ (/** @type {unknown} */ (value));
     sized(writer, items.length, 0x90, 15, [0, 0xdc, 0xdd]);
     for (const item of Array.from(items)) write(writer, item, depth);
     return;
   }
-  const entries = [...(value instanceof Map ? value : Object.entries(value))].filter(([, item]) => item !== undefined);
+  const entries = [...(value instanceof Map ? value : Object.entries(value))].filter(
+    ([, item]) => item !== undefined,
+  );
   sized(writer, entries.length, 0x80, 15, [0, 0xde, 0xdf]);
   for (const [key, item] of entries) {
     writeText(writer, key);
@@ -152,7 +159,8 @@ function writeInteger(writer, value) {
 
 /** @param {Writer} writer  @param {bigint} value */
 function writeBig(writer, value) {
-  if (BigInt.asIntN(54, value) === value && Number.isSafeInteger(Number(value))) writeInteger(writer, Number(value));
+  if (BigInt.asIntN(54, value) === value && Number.isSafeInteger(Number(value)))
+    writeInteger(writer, Number(value));
   else if (value >= 0n && value < 1n << 64n) writeWide(writer, 0xcf, value);
   else if (value >= -(1n << 63n)) writeWide(writer, 0xd3, value);
   else throw new RangeError(`${value} does not fit 64 bits`);
@@ -166,8 +174,8 @@ function writeWide(writer, code, value) {
 }
 
 /**
- * Decode one value that fills the bytes. Floats come as `Float`, integers beyond 2⁵³ as bigint, maps as objects
- * without a prototype, so that no key of a peer means anything to JavaScript.
+ * Decode one value that fills the bytes. Floats come as `Float`, integers beyond 2⁵³ as bigint, maps as
+ * objects without a prototype, so that no key of a peer means anything to JavaScript.
  *
  * @param {Uint8Array} bytes
  * @returns {any}
@@ -176,7 +184,8 @@ function writeWide(writer, code, value) {
 export function decode(bytes) {
   const reader = new Reader(bytes);
   const value = reader.value(0);
-  if (reader.at < bytes.length) throw new ProtocolError("malformed", `${bytes.length - reader.at} bytes too many`);
+  if (reader.at < bytes.length)
+    throw new ProtocolError("malformed", `${bytes.length - reader.at} bytes too many`);
   return value;
 }
 
@@ -195,7 +204,8 @@ class Reader {
    */
   take(count) {
     const at = this.at;
-    if (count > this.bytes.length - at) throw new ProtocolError("malformed", `it ends within a value, at byte ${at}`);
+    if (count > this.bytes.length - at)
+      throw new ProtocolError("malformed", `it ends within a value, at byte ${at}`);
     this.at += count;
     return at;
   }
@@ -203,7 +213,11 @@ class Reader {
   /** @param {number} size  @returns {number} an unsigned number of 1, 2 or 4 bytes */
   count(size) {
     const at = this.take(size);
-    return size === 1 ? this.view.getUint8(at) : size === 2 ? this.view.getUint16(at) : this.view.getUint32(at);
+    return size === 1
+      ? this.view.getUint8(at)
+      : size === 2
+        ? this.view.getUint16(at)
+        : this.view.getUint32(at);
   }
 
   /** @param {number} depth  @returns {any} */
@@ -215,26 +229,46 @@ class Reader {
     if (code < 0xc0) return this.text(code & 31);
     if (code >= 0xe0) return code - 0x100;
     switch (code) {
-      case 0xc0: return null;
-      case 0xc2: return false;
-      case 0xc3: return true;
-      case 0xca: return new Float(this.view.getFloat32(this.take(4)));
-      case 0xcb: return new Float(this.view.getFloat64(this.take(8)));
-      case 0xcc: return this.count(1);
-      case 0xcd: return this.count(2);
-      case 0xce: return this.count(4);
-      case 0xcf: return narrow(this.view.getBigUint64(this.take(8)));
-      case 0xd0: return this.view.getInt8(this.take(1));
-      case 0xd1: return this.view.getInt16(this.take(2));
-      case 0xd2: return this.view.getInt32(this.take(4));
-      case 0xd3: return narrow(this.view.getBigInt64(this.take(8)));
-      case 0xd9: return this.text(this.count(1));
-      case 0xda: return this.text(this.count(2));
-      case 0xdb: return this.text(this.count(4));
-      case 0xdc: return this.list(this.count(2), depth + 1);
-      case 0xdd: return this.list(this.count(4), depth + 1);
-      case 0xde: return this.map(this.count(2), depth + 1);
-      case 0xdf: return this.map(this.count(4), depth + 1);
+      case 0xc0:
+        return null;
+      case 0xc2:
+        return false;
+      case 0xc3:
+        return true;
+      case 0xca:
+        return new Float(this.view.getFloat32(this.take(4)));
+      case 0xcb:
+        return new Float(this.view.getFloat64(this.take(8)));
+      case 0xcc:
+        return this.count(1);
+      case 0xcd:
+        return this.count(2);
+      case 0xce:
+        return this.count(4);
+      case 0xcf:
+        return narrow(this.view.getBigUint64(this.take(8)));
+      case 0xd0:
+        return this.view.getInt8(this.take(1));
+      case 0xd1:
+        return this.view.getInt16(this.take(2));
+      case 0xd2:
+        return this.view.getInt32(this.take(4));
+      case 0xd3:
+        return narrow(this.view.getBigInt64(this.take(8)));
+      case 0xd9:
+        return this.text(this.count(1));
+      case 0xda:
+        return this.text(this.count(2));
+      case 0xdb:
+        return this.text(this.count(4));
+      case 0xdc:
+        return this.list(this.count(2), depth + 1);
+      case 0xdd:
+        return this.list(this.count(4), depth + 1);
+      case 0xde:
+        return this.map(this.count(2), depth + 1);
+      case 0xdf:
+        return this.map(this.count(4), depth + 1);
     }
     throw new ProtocolError("malformed", `type 0x${code.toString(16)} at byte ${this.at - 1} does not occur`);
   }
@@ -263,7 +297,8 @@ class Reader {
     const found = Object.create(null);
     for (let i = 0; i < count; i++) {
       const key = this.value(depth);
-      if (typeof key !== "string") throw new ProtocolError("malformed", `a key that is no text, before byte ${this.at}`);
+      if (typeof key !== "string")
+        throw new ProtocolError("malformed", `a key that is no text, before byte ${this.at}`);
       found[key] = this.value(depth);
     }
     return found;
@@ -271,9 +306,13 @@ class Reader {
 
   /** @param {number} values  that follow, of at least a byte each  @param {number} depth */
   announce(values, depth) {
-    if (depth > MAX_NESTING) throw new ProtocolError("limit", `more than ${MAX_NESTING} maps and lists in one another`);
+    if (depth > MAX_NESTING)
+      throw new ProtocolError("limit", `more than ${MAX_NESTING} maps and lists in one another`);
     if (values > this.bytes.length - this.at) {
-      throw new ProtocolError("malformed", `${values} values announced at byte ${this.at}, more than there are bytes`);
+      throw new ProtocolError(
+        "malformed",
+        `${values} values announced at byte ${this.at}, more than there are bytes`,
+      );
     }
   }
 }

@@ -1,4 +1,5 @@
-// Devices of the scenario as a world publishes them: on which objects they stand, and where (SPEC.md, Worlds).
+// Devices of the scenario as a world publishes them: on which objects they stand, and where (SPEC.md,
+// Worlds).
 import { multiply, quaternion } from "./axes.mjs";
 import { SceneError } from "./errors.mjs";
 import { byBytes } from "./schema.mjs";
@@ -42,7 +43,10 @@ export class Mounts {
   devices(objects) {
     const there = new Map(objects.map((object) => [object.name, object]));
     const known = new Set(this.#arrived);
-    this.#arrived = [...this.#arrived.filter((name) => there.has(name)), ...[...there.keys()].filter((name) => !known.has(name))];
+    this.#arrived = [
+      ...this.#arrived.filter((name) => there.has(name)),
+      ...[...there.keys()].filter((name) => !known.has(name)),
+    ];
     /** @type {Device[]} */
     const found = [];
     for (const spec of this.specs) {
@@ -70,24 +74,44 @@ export function deviceOf(spec, parent) {
     name: parent ? `${parent.name}/${spec.name}` : spec.name,
     parent: parent?.name ?? "",
     position: [x, y, z + (parent ? heightOf(spec.mount) * parent.dimensions[2] : 0)],
-    orientation: parent && spec.keeps_heading ? multiply(conjugate(parent.orientation ?? [1, 0, 0, 0]), turned) : turned,
+    orientation:
+      parent && spec.keeps_heading ? multiply(conjugate(parent.orientation ?? [1, 0, 0, 0]), turned) : turned,
   };
   switch (spec.kind) {
     case "antenna":
-      return { type: "antenna", ...common, role: spec.role, array: arrayOf(spec.array), power_dbm: spec.power_dbm };
-    case "lidar": {
-      const [low, high] = spec.elevation_deg, [near, far] = spec.range_m;
       return {
-        type: "lidar", ...common, beams: spec.beams, azimuth_steps: spec.azimuth_steps, elevation_min: radians(low),
-        elevation_max: radians(high), max_range: far, min_range: near,
+        type: "antenna",
+        ...common,
+        role: spec.role,
+        array: arrayOf(spec.array),
+        power_dbm: spec.power_dbm,
+      };
+    case "lidar": {
+      const [low, high] = spec.elevation_deg,
+        [near, far] = spec.range_m;
+      return {
+        type: "lidar",
+        ...common,
+        beams: spec.beams,
+        azimuth_steps: spec.azimuth_steps,
+        elevation_min: radians(low),
+        elevation_max: radians(high),
+        max_range: far,
+        min_range: near,
       };
     }
     case "camera":
       return {
-        type: "camera", ...common, width: spec.size_px[0], height: spec.size_px[1], field_of_view: radians(spec.field_of_view_deg),
+        type: "camera",
+        ...common,
+        width: spec.size_px[0],
+        height: spec.size_px[1],
+        field_of_view: radians(spec.field_of_view_deg),
       };
   }
-  throw new SceneError(`device ${spec.name} is of the kind ${spec.kind}, which this version of the library does not know`);
+  throw new SceneError(
+    `device ${spec.name} is of the kind ${spec.kind}, which this version of the library does not know`,
+  );
 }
 
 /** @param {string} mount */
@@ -97,9 +121,25 @@ function heightOf(mount) {
 
 /** @param {Record<string, any> | null | undefined} array  of the scenario  @returns {any} */
 function arrayOf(array) {
-  const { rows = 1, columns = 1, vertical_spacing = 0.5, horizontal_spacing = 0.5, pattern = "iso", polarization = "V" } = array ?? {};
+  const {
+    rows = 1,
+    columns = 1,
+    vertical_spacing = 0.5,
+    horizontal_spacing = 0.5,
+    pattern = "iso",
+    polarization = "V",
+  } = array ?? {};
   const file = array?.pattern_file ? `patterns/${array.pattern_file.split("/").at(-1)}` : "";
-  return { rows, columns, vertical_spacing, horizontal_spacing, pattern, polarization, pattern_file: file, panels: array?.panels ?? [] };
+  return {
+    rows,
+    columns,
+    vertical_spacing,
+    horizontal_spacing,
+    pattern,
+    polarization,
+    pattern_file: file,
+    panels: array?.panels ?? [],
+  };
 }
 
 /** @param {number} degrees */
@@ -113,8 +153,8 @@ function conjugate([w, x, y, z]) {
 }
 
 /**
- * Whether a device stands on an object: `*` is any text, `?` one character, `[abc]`, `[a-z]` and `[!abc]` one of a
- * set; a whole name matches itself, whatever is in it.
+ * Whether a device stands on an object: `*` is any text, `?` one character, `[abc]`, `[a-z]` and `[!abc]` one
+ * of a set; a whole name matches itself, whatever is in it.
  *
  * @param {string} pattern
  * @param {string} name
@@ -160,13 +200,21 @@ function members(set) {
       at += 2;
     } else ranges.push([set[at], set[at]]);
   }
-  return (character) => ranges.some(([low, high]) => byBytes(low, character) <= 0 && byBytes(character, high) <= 0);
+  return (character) =>
+    ranges.some(([low, high]) => byBytes(low, character) <= 0 && byBytes(character, high) <= 0);
 }
 
-/** @param {Piece[]} pattern  @param {number} p  @param {string[]} name  @param {number} n  @returns {boolean} */
+/**
+ * @param {Piece[]} pattern
+ * @param {number} p
+ * @param {string[]} name
+ * @param {number} n
+ * @returns {boolean}
+ */
 function matchesFrom(pattern, p, name, n) {
   // Only the last star is ever taken back: whatever an earlier one could take, that one can take too.
-  let star = -1, taken = 0;
+  let star = -1,
+    taken = 0;
   while (n < name.length) {
     const piece = pattern[p];
     if (piece === "*") {

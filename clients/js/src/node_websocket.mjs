@@ -1,5 +1,6 @@
-// A WebSocket (RFC 6455) for versions of Node that have none of their own, 18 to 21: what a client of one gateway
-// needs, with the part of the browser's interface that socket.mjs uses. Bundlers for browsers leave this file out.
+// A WebSocket (RFC 6455) for versions of Node that have none of their own, 18 to 21: what a client of one
+// gateway needs, with the part of the browser's interface that socket.mjs uses. Bundlers for browsers leave
+// this file out.
 import { createHash, randomBytes } from "node:crypto";
 import http from "node:http";
 import https from "node:https";
@@ -7,7 +8,12 @@ import https from "node:https";
 /** @import { Duplex } from "node:stream" */
 
 const GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
-const CONTINUATION = 0, TEXT = 1, BINARY = 2, CLOSE = 8, PING = 9, PONG = 10;
+const CONTINUATION = 0,
+  TEXT = 1,
+  BINARY = 2,
+  CLOSE = 8,
+  PING = 9,
+  PONG = 10;
 const MAX_MESSAGE = 1 << 28;
 /** [ms] that the peer has for its part of the closing handshake. */
 const CLOSE_MS = 1000;
@@ -45,13 +51,21 @@ export class WebSocket {
     const key = randomBytes(16).toString("base64");
     const request = (protocol === "wss:" ? https : http).request(href.replace(/^ws/, "http"), {
       headers: {
-        Connection: "Upgrade", Upgrade: "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key,
+        Connection: "Upgrade",
+        Upgrade: "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": key,
         "Sec-WebSocket-Protocol": protocols.join(", "),
       },
       agent: false,
     });
     request.on("upgrade", (response, stream, head) => {
-      if (response.headers["sec-websocket-accept"] !== createHash("sha1").update(key + GUID).digest("base64")) {
+      if (
+        response.headers["sec-websocket-accept"] !==
+        createHash("sha1")
+          .update(key + GUID)
+          .digest("base64")
+      ) {
         stream.destroy();
         this.#end("the answer is none of a WebSocket");
       } else this.#opened(stream, head);
@@ -89,7 +103,9 @@ export class WebSocket {
     this.#stream = stream;
     /** @type {any} */ (stream).setNoDelay?.(true);
     stream.on("data", (chunk) => this.#take(chunk));
-    stream.on("error", (error) => { this.#told.reason ||= error.message; });
+    stream.on("error", (error) => {
+      this.#told.reason ||= error.message;
+    });
     stream.on("close", () => this.#end(""));
     stream.on("end", () => stream.destroy());
     queueMicrotask(() => {
@@ -115,7 +131,8 @@ export class WebSocket {
     frame[1] = 0x80 | (size === 0 ? payload.length : size === 2 ? 126 : 127);
     if (size === 2) frame.writeUInt16BE(payload.length, 2);
     if (size === 8) frame.writeBigUInt64BE(BigInt(payload.length), 2);
-    const mask = randomBytes(4), at = 6 + size;
+    const mask = randomBytes(4),
+      at = 6 + size;
     mask.copy(frame, at - 4);
     for (let i = 0; i < payload.length; i++) frame[at + i] = payload[i] ^ mask[i & 3];
     this.#stream.write(frame);
@@ -143,21 +160,26 @@ export class WebSocket {
   #wanted() {
     const bytes = this.#received;
     if (bytes.length < 2) return 2;
-    const short = bytes[1] & 0x7f, size = short === 126 ? 2 : short === 127 ? 8 : 0;
+    const short = bytes[1] & 0x7f,
+      size = short === 126 ? 2 : short === 127 ? 8 : 0;
     if (bytes.length < 2 + size) return 2 + size;
     const length = size === 2 ? bytes.readUInt16BE(2) : size === 8 ? Number(bytes.readBigUInt64BE(2)) : short;
     return 2 + size + length;
   }
 
   #frame() {
-    const bytes = this.#received, total = this.#wanted(), short = bytes[1] & 0x7f;
+    const bytes = this.#received,
+      total = this.#wanted(),
+      short = bytes[1] & 0x7f;
     const begin = short === 126 ? 4 : short === 127 ? 10 : 2;
     if (bytes.length < total) return;
     const payload = bytes.subarray(begin, total);
     this.#received = bytes.subarray(total);
-    const opcode = bytes[0] & 15, final = (bytes[0] & 0x80) !== 0;
+    const opcode = bytes[0] & 15,
+      final = (bytes[0] & 0x80) !== 0;
     // A server never masks, and control frames are short and whole.
-    if (bytes[1] & 0x80 || bytes[0] & 0x70 || (opcode >= CLOSE && (!final || payload.length > 125))) this.#refuse();
+    if (bytes[1] & 0x80 || bytes[0] & 0x70 || (opcode >= CLOSE && (!final || payload.length > 125)))
+      this.#refuse();
     else if (opcode === PING) this.#write(PONG, payload);
     else if (opcode === CLOSE) this.#closed(payload);
     else if (opcode !== PONG) this.#data(opcode, final, payload);
@@ -170,7 +192,10 @@ export class WebSocket {
 
   /** @param {Buffer} payload */
   #closed(payload) {
-    this.#told = payload.length >= 2 ? { code: payload.readUInt16BE(0), reason: payload.subarray(2).toString() } : { code: 1005, reason: "" };
+    this.#told =
+      payload.length >= 2
+        ? { code: payload.readUInt16BE(0), reason: payload.subarray(2).toString() }
+        : { code: 1005, reason: "" };
     if (!this.#closing) {
       this.#closing = true;
       this.#write(CLOSE, payload.subarray(0, 2));
@@ -188,6 +213,10 @@ export class WebSocket {
     if (!final) return;
     const whole = Buffer.concat(this.#fragments);
     this.#fragments = [];
-    this.onmessage({ data: this.#fragmentsAreText ? whole.toString() : /** @type {ArrayBuffer} */ (Uint8Array.prototype.slice.call(whole).buffer) });
+    this.onmessage({
+      data: this.#fragmentsAreText
+        ? whole.toString()
+        : /** @type {ArrayBuffer} */ (Uint8Array.prototype.slice.call(whole).buffer),
+    });
   }
 }

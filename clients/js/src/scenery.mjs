@@ -9,9 +9,25 @@ import { sha256 } from "./sha256.mjs";
 
 /** Materials of Recommendation ITU-R P.2040. */
 const MATERIALS = [
-  "asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete", "floorboard",
-  "glass", "marble", "metal", "plasterboard", "plywood", "vinyl_tile", "wood", "very_dry_ground", "medium_dry_ground",
-  "wet_ground", "vacuum",
+  "asphalt_concrete",
+  "brick",
+  "carpet_tile",
+  "ceiling_board",
+  "chipboard",
+  "clear_acrylic",
+  "concrete",
+  "floorboard",
+  "glass",
+  "marble",
+  "metal",
+  "plasterboard",
+  "plywood",
+  "vinyl_tile",
+  "wood",
+  "very_dry_ground",
+  "medium_dry_ground",
+  "wet_ground",
+  "vacuum",
 ];
 const utf8 = new TextEncoder();
 
@@ -29,11 +45,14 @@ export class Assets {
    */
   offerFile(name, data) {
     if (!/^(?!\.{1,2}(\/|$))[^/\\\x00-\x1f\x7f]+(\/(?!\.{1,2}(\/|$))[^/\\\x00-\x1f\x7f]+)*$/u.test(name)) {
-      throw new SceneError(`an asset is named ${JSON.stringify(name)}; give it a relative path without . and ..`);
+      throw new SceneError(
+        `an asset is named ${JSON.stringify(name)}; give it a relative path without . and ..`,
+      );
     }
     const digest = sha256(data);
     const before = this.#byName.get(name);
-    if (before && before.digest !== digest) throw new SceneError(`two different files are offered as ${JSON.stringify(name)}`);
+    if (before && before.digest !== digest)
+      throw new SceneError(`two different files are offered as ${JSON.stringify(name)}`);
     this.#byName.set(name, { name, digest, size: data.length, data });
     this.#byDigest.set(digest, data);
   }
@@ -46,18 +65,27 @@ export class Assets {
    * @returns {OfferedMesh}
    */
   offerMesh(name, vertices, triangles) {
-    const points = flat(vertices), corners = flat(triangles);
+    const points = flat(vertices),
+      corners = flat(triangles);
     checkMesh(name, points, corners);
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+    const low = [Infinity, Infinity, Infinity],
+      high = [-Infinity, -Infinity, -Infinity];
     points.forEach((value, index) => {
       low[index % 3] = Math.min(low[index % 3], value);
       high[index % 3] = Math.max(high[index % 3], value);
     });
     const dimensions = triple((axis) => high[axis] - low[axis]);
-    if (!dimensions.every((side) => side > 0)) throw new SceneError(`mesh ${JSON.stringify(name)} is flat: its sides are ${dimensions.join(", ")} m`);
+    if (!dimensions.every((side) => side > 0))
+      throw new SceneError(`mesh ${JSON.stringify(name)} is flat: its sides are ${dimensions.join(", ")} m`);
     const centre = triple((axis) => (high[axis] + low[axis]) / 2);
     const asset = `objects/${name}.ply`;
-    this.offerFile(asset, ply(points.map((value, index) => (value - centre[index % 3]) / dimensions[index % 3]), corners));
+    this.offerFile(
+      asset,
+      ply(
+        points.map((value, index) => (value - centre[index % 3]) / dimensions[index % 3]),
+        corners,
+      ),
+    );
     return { asset, dimensions, centre };
   }
 
@@ -68,18 +96,34 @@ export class Assets {
    */
   offerScenery(meshes, materials) {
     for (const [key, { type, thickness = 0.1 }] of Object.entries(materials)) {
-      if (!/^[\w.-]+$/.test(key)) throw new SceneError(`a material is named ${JSON.stringify(key)}; use letters, digits, _, . and -`);
-      if (!MATERIALS.includes(type)) throw new SceneError(`material ${JSON.stringify(key)} is of the type ${JSON.stringify(type)}; choose one of ${MATERIALS.join(", ")}`);
-      if (!(thickness > 0)) throw new SceneError(`material ${JSON.stringify(key)} has the thickness ${thickness}; give it metres above 0`);
+      if (!/^[\w.-]+$/.test(key))
+        throw new SceneError(`a material is named ${JSON.stringify(key)}; use letters, digits, _, . and -`);
+      if (!MATERIALS.includes(type))
+        throw new SceneError(
+          `material ${JSON.stringify(key)} is of the type ${JSON.stringify(type)}; ` +
+            `choose one of ${MATERIALS.join(", ")}`,
+        );
+      if (!(thickness > 0))
+        throw new SceneError(
+          `material ${JSON.stringify(key)} has the thickness ${thickness}; give it metres above 0`,
+        );
     }
     const names = new Set();
     for (const { name, vertices, triangles, material } of meshes) {
       if (!/^[\w.-]+$/.test(name) || name.startsWith("mesh-") || names.has(name)) {
-        throw new SceneError(`a mesh of the scenery is named ${JSON.stringify(name)}; give each another name of letters, digits, _, . and -, that does not begin with mesh-`);
+        throw new SceneError(
+          `a mesh of the scenery is named ${JSON.stringify(name)}; give each another name of letters, ` +
+            "digits, _, . and -, that does not begin with mesh-",
+        );
       }
-      if (!Object.hasOwn(materials, material)) throw new SceneError(`mesh ${name} has the material ${JSON.stringify(material)}, which is none of ${Object.keys(materials).join(", ")}`);
+      if (!Object.hasOwn(materials, material))
+        throw new SceneError(
+          `mesh ${name} has the material ${JSON.stringify(material)}, ` +
+            `which is none of ${Object.keys(materials).join(", ")}`,
+        );
       names.add(name);
-      const points = flat(vertices), corners = flat(triangles);
+      const points = flat(vertices),
+        corners = flat(triangles);
       checkMesh(name, points, corners);
       this.offerFile(`scenery/meshes/${name}.ply`, ply(points, corners));
     }
@@ -100,7 +144,9 @@ export class Assets {
   /** Digest of all names and digests; empty without files. */
   get geometry() {
     const { listed } = this;
-    return listed.length ? sha256(...listed.map(({ name, digest }) => utf8.encode(`${name}\0${digest}\0`))) : "";
+    return listed.length
+      ? sha256(...listed.map(({ name, digest }) => utf8.encode(`${name}\0${digest}\0`)))
+      : "";
   }
 
   /**
@@ -129,13 +175,17 @@ function triple(value) {
 /** @param {string} name  @param {number[]} points  @param {number[]} corners */
 function checkMesh(name, points, corners) {
   const where = `mesh ${JSON.stringify(name)}`;
-  if (!points.length || points.length % 3) throw new SceneError(`${where} has ${points.length} coordinates; give three for each vertex`);
+  if (!points.length || points.length % 3)
+    throw new SceneError(`${where} has ${points.length} coordinates; give three for each vertex`);
   const wrong = points.findIndex((value) => !Number.isFinite(value));
-  if (wrong >= 0) throw new SceneError(`${where}: vertex ${Math.floor(wrong / 3)} has the coordinate ${points[wrong]}`);
-  if (!corners.length || corners.length % 3) throw new SceneError(`${where} has ${corners.length} corners; give three for each triangle`);
+  if (wrong >= 0)
+    throw new SceneError(`${where}: vertex ${Math.floor(wrong / 3)} has the coordinate ${points[wrong]}`);
+  if (!corners.length || corners.length % 3)
+    throw new SceneError(`${where} has ${corners.length} corners; give three for each triangle`);
   const count = points.length / 3;
   const outside = corners.find((index) => !Number.isInteger(index) || index < 0 || index >= count);
-  if (outside !== undefined) throw new SceneError(`${where}: a triangle refers to vertex ${outside} of ${count}`);
+  if (outside !== undefined)
+    throw new SceneError(`${where}: a triangle refers to vertex ${outside} of ${count}`);
 }
 
 /**
@@ -145,10 +195,11 @@ function checkMesh(name, points, corners) {
  * @returns {Uint8Array}
  */
 export function ply(points, corners) {
-  const vertices = points.length / 3, faces = corners.length / 3;
+  const vertices = points.length / 3,
+    faces = corners.length / 3;
   const head = utf8.encode(
     `ply\nformat binary_little_endian 1.0\nelement vertex ${vertices}\nproperty float x\nproperty float y\n` +
-    `property float z\nelement face ${faces}\nproperty list uchar int vertex_indices\nend_header\n`,
+      `property float z\nelement face ${faces}\nproperty list uchar int vertex_indices\nend_header\n`,
   );
   const file = new Uint8Array(head.length + 4 * points.length + 13 * faces);
   file.set(head);
@@ -164,11 +215,16 @@ export function ply(points, corners) {
 
 /** @param {readonly SceneryMesh[]} meshes  @param {Record<string, Material>} materials */
 function sceneXml(meshes, materials) {
-  const bsdfs = Object.entries(materials).map(([key, { type, thickness = 0.1 }]) =>
-    `  <bsdf type="itu-radio-material" id="mat-${key}">\n    <string name="type" value="${type}"/>\n` +
-    `    <float name="thickness" value="${thickness}"/>\n  </bsdf>\n`);
-  const shapes = meshes.map(({ name, material }) =>
-    `  <shape type="ply" id="mesh-${name}">\n    <string name="filename" value="meshes/${name}.ply"/>\n` +
-    `    <boolean name="face_normals" value="true"/>\n    <ref id="mat-${material}" name="bsdf"/>\n  </shape>\n`);
+  const bsdfs = Object.entries(materials).map(
+    ([key, { type, thickness = 0.1 }]) =>
+      `  <bsdf type="itu-radio-material" id="mat-${key}">\n    <string name="type" value="${type}"/>\n` +
+      `    <float name="thickness" value="${thickness}"/>\n  </bsdf>\n`,
+  );
+  const shapes = meshes.map(
+    ({ name, material }) =>
+      `  <shape type="ply" id="mesh-${name}">\n    <string name="filename" value="meshes/${name}.ply"/>\n` +
+      '    <boolean name="face_normals" value="true"/>\n' +
+      `    <ref id="mat-${material}" name="bsdf"/>\n  </shape>\n`,
+  );
   return `<scene version="2.1.0">\n${bsdfs.join("")}${shapes.join("")}</scene>\n`;
 }

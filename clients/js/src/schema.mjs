@@ -1,12 +1,14 @@
-// Types of fields, and how values of them are read and written in canonical form. The tables of messages.mjs and
-// topics.mjs are made of these.
+// Types of fields, and how values of them are read and written in canonical form. The tables of messages.mjs
+// and topics.mjs are made of these.
 import { BodyReader, BodyWriter, NumericArray } from "./arrays.mjs";
 import { ProtocolError } from "./errors.mjs";
 import { Float } from "./messagepack.mjs";
 
 /**
- * What a value is read or written with: the body of a payload, and sizes of the innermost object that are known.
- * @typedef {{ reader?: BodyReader, writer?: BodyWriter, sizes: Record<string, number>, keepFloats?: boolean }} Context
+ * What a value is read or written with: the body of a payload, and sizes of the innermost object that are
+ * known.
+ * @typedef {{ reader?: BodyReader, writer?: BodyWriter, sizes: Record<string, number>, keepFloats?: boolean }
+ * } Context
  */
 /**
  * A type of field.
@@ -40,7 +42,8 @@ function shown(value) {
 export function integer(least = -MAX_INTEGER - 1n, most = MAX_INTEGER) {
   return {
     read(value, place) {
-      if (typeof value !== "bigint" && !(typeof value === "number")) throw bad(place, `is ${shown(value)}, no integer`);
+      if (typeof value !== "bigint" && !(typeof value === "number"))
+        throw bad(place, `is ${shown(value)}, no integer`);
       if (value < least || value > most) throw bad(place, `is ${value}, which is not in its range`);
       return value;
     },
@@ -87,15 +90,18 @@ export const bool = {
 
 /**
  * A string.
- * @param {{ least?: number, most?: number, pattern?: RegExp, values?: readonly string[] }} rules  lengths in code points
+ * @param {{ least?: number, most?: number, pattern?: RegExp, values?: readonly string[] }} rules  lengths in
+ *   code points
  * @returns {Type}
  */
 export function string({ least = 0, most = Infinity, pattern, values } = {}) {
   return {
     read(value, place) {
       if (typeof value !== "string") throw bad(place, `is ${shown(value)}, no text`);
-      if (values && !values.includes(value)) throw bad(place, `is ${shown(value)}, not one of ${values.join(", ")}`);
-      if (value.length < least || (value.length > most && [...value].length > most)) throw bad(place, `has ${value.length} characters`);
+      if (values && !values.includes(value))
+        throw bad(place, `is ${shown(value)}, not one of ${values.join(", ")}`);
+      if (value.length < least || (value.length > most && [...value].length > most))
+        throw bad(place, `has ${value.length} characters`);
       if (pattern && !pattern.test(value)) throw bad(place, `is ${shown(value)}, which is not allowed`);
       return value;
     },
@@ -113,7 +119,8 @@ export function list(of, { most = Infinity, exactly } = {}) {
   return {
     read(value, place, context) {
       if (!Array.isArray(value)) throw bad(place, `is ${shown(value)}, no list`);
-      if (value.length > most || (exactly !== undefined && value.length !== exactly)) throw bad(place, `has ${value.length} items`);
+      if (value.length > most || (exactly !== undefined && value.length !== exactly))
+        throw bad(place, `has ${value.length} items`);
       return value.map((item, index) => of.read(item, `${place}[${index}]`, context));
     },
     write: (value, context) => Array.from(value, (item) => of.write(item, context)),
@@ -132,12 +139,18 @@ export function map(of) {
       return mapped(value, (item, key) => of.read(item, `${place}.${key}`, context));
     },
     write: (value, context) =>
-      new Map(Object.keys(value).sort(byBytes).map((key) => [key, of.write(value[key], context)])),
+      new Map(
+        Object.keys(value)
+          .sort(byBytes)
+          .map((key) => [key, of.write(value[key], context)]),
+      ),
   };
 }
 
-/** Whatever JSON has. Floats are read as numbers, or kept as `Float` where a caller has to tell them from integers.
- * @type {Type} */
+/**
+ * Whatever JSON has. Floats are read as numbers, or kept as `Float` where a caller tells them from integers.
+ * @type {Type}
+ */
 export const plain = {
   read: (value, place, context) => plainOf(value, context),
   write: (value) => sorted(value),
@@ -154,7 +167,11 @@ function plainOf(value, context) {
 function sorted(value) {
   if (Array.isArray(value)) return value.map(sorted);
   if (!isMap(value)) return value;
-  return new Map(Object.keys(value).sort(byBytes).map((key) => [key, sorted(value[key])]));
+  return new Map(
+    Object.keys(value)
+      .sort(byBytes)
+      .map((key) => [key, sorted(value[key])]),
+  );
 }
 
 /**
@@ -169,12 +186,14 @@ export function array(dtype, ...shape) {
       if (!context.reader) throw new TypeError("arrays stand in payloads only");
       const found = context.reader.read(value, place);
       if (found.dtype !== dtype) throw bad(place, `has elements of ${found.dtype}, not ${dtype}`);
-      if (found.shape.length !== shape.length) throw bad(place, `has ${found.shape.length} dimensions, not ${shape.length}`);
+      if (found.shape.length !== shape.length)
+        throw bad(place, `has ${found.shape.length} dimensions, not ${shape.length}`);
       shape.forEach((size, axis) => agree(context, size, found.shape[axis], place));
       return found;
     },
     write(value, context) {
-      if (!(value instanceof NumericArray) || !context.writer) throw new TypeError("a field of a payload wants a NumericArray");
+      if (!(value instanceof NumericArray) || !context.writer)
+        throw new TypeError("a field of a payload wants a NumericArray");
       return context.writer.place(value);
     },
   };
@@ -214,7 +233,8 @@ export class Struct {
    */
   constructor(fields, check = () => {}) {
     this.fields = Object.entries(fields).map(([name, field]) => ({
-      name, ...("type" in field ? field : { type: field, optional: false, standard: undefined }),
+      name,
+      ...("type" in field ? field : { type: field, optional: false, standard: undefined }),
     }));
     this.check = check;
   }
@@ -238,7 +258,11 @@ export class Struct {
     return found;
   }
 
-  /** @param {any} value  @param {Context} context  @returns {Record<string, any>} without what equals its default */
+  /**
+   * @param {any} value
+   * @param {Context} context
+   * @returns {Record<string, any>} without what equals its default
+   */
   write(value, context) {
     /** @type {Record<string, any>} */
     const written = {};
@@ -261,7 +285,8 @@ export function tagged(kinds) {
   return {
     read(value, place, context) {
       const kind = isMap(value) ? value.type : undefined;
-      if (typeof kind !== "string" || !Object.hasOwn(kinds, kind)) throw bad(place, `has the type ${shown(kind)}, not one of ${Object.keys(kinds).join(", ")}`);
+      if (typeof kind !== "string" || !Object.hasOwn(kinds, kind))
+        throw bad(place, `has the type ${shown(kind)}, not one of ${Object.keys(kinds).join(", ")}`);
       return { type: kind, ...kinds[kind].read(value, place, context) };
     },
     write: (value, context) => ({ type: value.type, ...kinds[value.type].write(value, context) }),

@@ -58,17 +58,25 @@ export class Service {
    * @throws {Error} of the service's own code, outside of a frame
    */
   async run(url, { token = "", patience = PATIENCE_S, log = console.warn } = {}) {
-    let until = Date.now() + 1000 * patience, pause = PAUSE_MS, lost = "";
+    let until = Date.now() + 1000 * patience,
+      pause = PAUSE_MS,
+      lost = "";
     for (;;) {
       const outcome = await this.#live(url, token, log, until, lost !== "");
       if ("over" in outcome) return outcome.over;
       if (this.#left) return this.#left;
       if (outcome.welcomed) {
         if (!outcome.rejoin_ms) throw new RunError(outcome.lost);
-        if (!lost) log(`${this.name}: ${outcome.lost}; trying to come back for ${outcome.rejoin_ms / 1000} s`);
+        if (!lost)
+          log(`${this.name}: ${outcome.lost}; trying to come back for ${outcome.rejoin_ms / 1000} s`);
         [until, pause, lost] = [Date.now() + outcome.rejoin_ms, FIRST_PAUSE_MS, outcome.lost];
       }
-      if (Date.now() >= until) throw new RunError(lost ? `${lost}, and it could not come back: ${outcome.lost}` : `${outcome.lost} within ${patience} s`);
+      if (Date.now() >= until)
+        throw new RunError(
+          lost
+            ? `${lost}, and it could not come back: ${outcome.lost}`
+            : `${outcome.lost} within ${patience} s`,
+        );
       await new Promise((resolve) => {
         this.#wake = () => resolve(undefined);
         setTimeout(this.#wake, pause);
@@ -88,7 +96,14 @@ export class Service {
     this.#wake();
   }
 
-  /** @param {string} url  @param {string} token  @param {(line: string) => void} log  @param {number} until  @param {boolean} returning  @returns {Promise<Outcome>} */
+  /**
+   * @param {string} url
+   * @param {string} token
+   * @param {(line: string) => void} log
+   * @param {number} until
+   * @param {boolean} returning
+   * @returns {Promise<Outcome>}
+   */
   async #live(url, token, log, until, returning) {
     try {
       const socket = await openSocket(url, token);
@@ -106,13 +121,21 @@ export class Service {
     }
   }
 
-  // --- what a life asks for ---------------------------------------------------------------------------------
+  // --- what a life asks for
+  // ---------------------------------------------------------------------------------
 
   /** @returns {Message} */
   hello() {
     return {
-      type: "HELLO", version: VERSION, name: this.name, role: this.role, inputs: this.inputs, outputs: this.outputs,
-      capabilities: ["assets", "checkpoint", "episodes", "parts"], implementation: "caviar-js", max_in_flight: 4,
+      type: "HELLO",
+      version: VERSION,
+      name: this.name,
+      role: this.role,
+      inputs: this.inputs,
+      outputs: this.outputs,
+      capabilities: ["assets", "checkpoint", "episodes", "parts"],
+      implementation: "caviar-js",
+      max_in_flight: 4,
     };
   }
 
@@ -122,8 +145,8 @@ export class Service {
     this.info = { run, seed, settings, scenario, devices: scenario.devices ?? [], samplingPeriod };
   }
 
-  /** @param {Message} _prepare  @returns {Promise<{ ready: Record<string, any>, assets?: Assets }>} */
-  async prepared(_prepare) {
+  /** @param {Message} prepare  @returns {Promise<{ ready: Record<string, any>, assets?: Assets }>} */
+  async prepared(prepare) {
     throw new TypeError("a service says what it prepares");
   }
 
@@ -140,20 +163,25 @@ export class Service {
   /**
    * Go to the state at the start of an episode; equal arguments lead to equal frames.
    *
-   * @param {bigint} _seed
-   * @param {number} _t0  time of frame 0 [s]
-   * @param {number} _episode  number of the episode from the first one with this seed
+   * @param {bigint} seed
+   * @param {number} t0  time of frame 0 [s]
+   * @param {number} episode  number of the episode from the first one with this seed
    * @returns {void | Promise<void>}
    */
-  reset(_seed, _t0, _episode) {}
+  reset(seed, t0, episode) {}
 
-  /** @param {Message} _grant  @param {Input[]} _inputs  @returns {Promise<{ products: Product[], [field: string]: any }>} */
-  async answered(_grant, _inputs) {
+  /**
+   * @param {Message} grant
+   * @param {Input[]} inputs
+   * @returns {Promise<{ products: Product[], [field: string]: any }>}
+   */
+  async answered(grant, inputs) {
     throw new TypeError("a service says what it answers");
   }
 
   /**
-   * Time of a grant and of the frame that this service completed before it [s]; of the first frame both are t0.
+   * Time of a grant and of the frame that this service completed before it [s]; of the first frame both are
+   * t0.
    * @param {Message} grant
    * @returns {[t: number, previous: number]}
    */
@@ -164,7 +192,8 @@ export class Service {
   }
 
   /**
-   * State that later frames depend on, beyond what `reset` and the frames' inputs make of it; null where there is none.
+   * State that later frames depend on, beyond what `reset` and the frames' inputs make of it; null where
+   * there is none.
    * @returns {unknown} plain: what JSON has, and typed arrays, which come back as lists
    */
   save() {
@@ -173,18 +202,18 @@ export class Service {
 
   /**
    * Take over a state that `save` returned, in this or in another process.
-   * @param {any} _state
+   * @param {any} state
    * @returns {void | Promise<void>}
    */
-  restore(_state) {}
+  restore(state) {}
 
   /** What the library itself has to remember. @returns {unknown} */
   ownState() {
     return null;
   }
 
-  /** @param {any} _state */
-  restoreOwnState(_state) {}
+  /** @param {any} state */
+  restoreOwnState(state) {}
 
   /** @returns {Promise<Uint8Array>} */
   async saved() {
@@ -194,7 +223,8 @@ export class Service {
   /** @param {Uint8Array} bytes */
   async restored(bytes) {
     const found = unmarked(decode(bytes));
-    if (found?.caviar !== this.role) throw new SceneError(`a state that no ${this.role} of this library saved`);
+    if (found?.caviar !== this.role)
+      throw new SceneError(`a state that no ${this.role} of this library saved`);
     this.restoreOwnState(found.own);
     await this.restore(found.state);
   }

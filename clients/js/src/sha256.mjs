@@ -1,4 +1,5 @@
-// SHA-256 (FIPS 180-4), synchronous: WebCrypto's is not, and a product's digest is due in the middle of a step.
+// SHA-256 (FIPS 180-4), synchronous: WebCrypto's is not, and a product's digest is due in the middle of a
+// step.
 
 const PRIMES = primes(64);
 const K = Uint32Array.from(PRIMES, (prime) => fraction(Math.cbrt(prime)));
@@ -59,7 +60,8 @@ export function sha256(...pieces) {
 function compress(state, block) {
   for (let i = 0; i < 16; i++) words[i] = block.getUint32(4 * i);
   for (let i = 16; i < 64; i++) {
-    const x = words[i - 15], y = words[i - 2];
+    const x = words[i - 15],
+      y = words[i - 2];
     const s0 = ((x >>> 7) | (x << 25)) ^ ((x >>> 18) | (x << 14)) ^ (x >>> 3);
     const s1 = ((y >>> 17) | (y << 15)) ^ ((y >>> 19) | (y << 13)) ^ (y >>> 10);
     words[i] = words[i - 16] + s0 + words[i - 7] + s1;
@@ -79,5 +81,7 @@ function compress(state, block) {
     b = a;
     a = (t1 + t2) | 0;
   }
-  [a, b, c, d, e, f, g, h].forEach((word, i) => { state[i] += word; });
+  [a, b, c, d, e, f, g, h].forEach((word, i) => {
+    state[i] += word;
+  });
 }

@@ -47,13 +47,18 @@ export class Socket {
  * @throws {Error} where nothing listens there; browsers do not say why
  */
 export async function openSocket(url, token) {
-  const Constructor = /** @type {any} */ (globalThis.WebSocket ?? (await import("./node_websocket.mjs")).WebSocket);
+  const Constructor = /** @type {any} */ (
+    globalThis.WebSocket ?? (await import("./node_websocket.mjs")).WebSocket
+  );
   const socket = new Constructor(url, ["caviar.v1", ...(token ? [`bearer.${token}`] : [])]);
   socket.binaryType = "arraybuffer";
   return new Promise((resolve, reject) => {
     let why = "";
     socket.onopen = () => resolve(new Socket(socket));
-    socket.onerror = (/** @type {any} */ event) => { why ||= event?.message ?? event?.error?.message ?? ""; };
-    socket.onclose = (/** @type {Closed} */ { code, reason }) => reject(new Error(`${url} does not answer (${why || reason || `code ${code}`})`));
+    socket.onerror = (/** @type {any} */ event) => {
+      why ||= event?.message ?? event?.error?.message ?? "";
+    };
+    socket.onclose = (/** @type {Closed} */ { code, reason }) =>
+      reject(new Error(`${url} does not answer (${why || reason || `code ${code}`})`));
   });
 }

@@ -8,18 +8,20 @@ import { encodePayload } from "./topics.mjs";
 
 /** @import { Product } from "./life.mjs" */
 /** @import { Message } from "./messages.mjs" */
-/** @import { Action, Command, Input, InputDeclaration, Material, OfferedMesh, RunInfo, SceneObject, SceneryMesh } from "./types.d.ts" */
+/** @import { Action, Command, Input, InputDeclaration, Material, OfferedMesh } from "./types.d.ts" */
+/** @import { RunInfo, SceneObject, SceneryMesh } from "./types.d.ts" */
 /** @import { Triples } from "./scenery.mjs" */
 
 /**
  * A world of a run. A subclass says in `step` where its objects are; the library does the rest: it mounts the
- * devices of the scenario, serves scenery, keeps heartbeats up, answers what is repeated, refuses what is wrong, and
- * comes back where a connection is lost.
+ * devices of the scenario, serves scenery, keeps heartbeats up, answers what is repeated, refuses what is
+ * wrong, and comes back where a connection is lost.
  *
  * @example
  * class Street extends World {
  *   step(t) {
- *     return [{ name: "car", class: "car", position: [10 * t, 0, 0.75], velocity: [10, 0, 0], dimensions: [4.5, 1.8, 1.5] }];
+ *     const position = [10 * t, 0, 0.75], velocity = [10, 0, 0], dimensions = [4.5, 1.8, 1.5];
+ *     return [{ name: "car", class: "car", position, velocity, dimensions }];
  *   }
  * }
  * await new Street({ name: "world", prefixes: ["car"] }).run("ws://127.0.0.1:8080/ws");
@@ -31,7 +33,8 @@ export class World extends Service {
   /**
    * @param {object} options
    * @param {string} [options.name]  as in the scenario
-   * @param {string[]} options.prefixes  what the names of its objects begin with; whole names where they are known
+   * @param {string[]} options.prefixes  what the names of its objects begin with; whole names where they are
+   *   known
    * @param {InputDeclaration[]} [options.inputs]  products that `step` gets, such as
    *   `{ topic: "link", lag: 1, required: false }`; commands of agents come without being declared
    * @param {number} [options.grace]  [s] that `prepare` may take
@@ -43,23 +46,23 @@ export class World extends Service {
 
   /**
    * Load what the world needs, and offer meshes and scenery.
-   * @param {RunInfo} _run
+   * @param {RunInfo} run
    * @returns {void | Promise<void>}
    */
-  prepare(_run) {}
+  prepare(run) {}
 
   /**
    * Say where the objects are.
    *
-   * @param {number} _t  time of the frame [s]
-   * @param {number} _previous  time of the frame that this world completed before [s], from which it has to advance;
-   *   it equals `_t` in the first frame
-   * @param {Command[]} _commands  of agents in the frame before
-   * @param {Input[]} _inputs  products that the world asked for
-   * @returns {SceneObject[] | Promise<SceneObject[]>} those that came first in front: they get the devices of a
-   *   scenario first; the same with the same seed
+   * @param {number} t  time of the frame [s]
+   * @param {number} previous  time of the frame that this world completed before [s], from which it has to
+   *   advance; it equals `t` in the first frame
+   * @param {Command[]} commands  of agents in the frame before
+   * @param {Input[]} inputs  products that the world asked for
+   * @returns {SceneObject[] | Promise<SceneObject[]>} those that came first in front: they get the devices of
+   *   a scenario first; the same with the same seed
    */
-  step(_t, _previous, _commands, _inputs) {
+  step(t, previous, commands, inputs) {
     throw new TypeError("a world says in step where its objects are");
   }
 
@@ -100,8 +103,8 @@ export class World extends Service {
     this.#mounts = new Mounts(this.info.devices);
   }
 
-  /** @override  @param {Message} _prepare */
-  async prepared(_prepare) {
+  /** @override  @param {Message} prepare */
+  async prepared(prepare) {
     await this.prepare(this.info);
     const prefixes = [...new Set([...this.prefixes, ...this.#mounts.fixedNames])].sort(byBytes);
     return { ready: { geometry: this.#assets.geometry, prefixes }, assets: this.#assets };
@@ -115,12 +118,15 @@ export class World extends Service {
   /** @override  @param {Message} grant  @param {Input[]} inputs */
   async answered(grant, inputs) {
     const actions = inputs.filter((input) => input.topic === "action");
-    const commands = actions.flatMap((input) => /** @type {Action | undefined} */ (input.payload)?.commands ?? []);
+    const commands = actions.flatMap(
+      (input) => /** @type {Action | undefined} */ (input.payload)?.commands ?? [],
+    );
     const objects = await this.step(...this.times(grant), commands, inputs);
-    // The scene is checked first: an error names the object, where a device on it would name itself.
-    const rules = { prefixes: this.prefixes, offered: (/** @type {string} */ name) => this.#assets.has(name) };
-    sceneOf(objects, rules);
-    const scene = sceneOf(objects, { ...rules, devices: this.#mounts.devices(objects) });
+    const scene = sceneOf(objects, {
+      prefixes: this.prefixes,
+      offered: (name) => this.#assets.has(name),
+      devices: () => this.#mounts.devices(objects),
+    });
     return { products: [/** @type {Product} */ ({ topic: "scene", ...encodePayload("scene", scene) })] };
   }
 
