@@ -36,9 +36,10 @@ export class Heartbeat {
     this.progress = progress;
     this.lost = lost;
     this.liveness_ms = welcome.liveness_ns / 1e6;
-    socket.onmessage = (frame) => this.#received(frame);
-    socket.onclose = ({ code, reason }) =>
-      lost(`the heartbeat connection closed (${reason || `code ${code}`})`);
+    socket.listen(
+      (frame) => this.#received(frame),
+      ({ code, reason }) => lost(`the heartbeat connection closed (${reason || `code ${code}`})`),
+    );
     this.#send({ type: "ATTACH", ...who });
     this.#timer = setInterval(() => this.#beat(), welcome.heartbeat_ns / 1e6);
   }

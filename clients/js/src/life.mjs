@@ -91,14 +91,16 @@ export class Life {
    */
   live(socket, welcome_ms) {
     this.socket = socket;
-    socket.onmessage = (frame) => this.#received(frame);
-    socket.onclose = (closed) => this.#closed(closed);
     const patience = setTimeout(() => this.#lose("no WELCOME came"), welcome_ms);
     const outcome = new Promise((resolve, reject) => {
       this.#resolve = resolve;
       this.#reject = reject;
     });
     this.#send(this.part.hello());
+    socket.listen(
+      (frame) => this.#received(frame),
+      (closed) => this.#closed(closed),
+    );
     return /** @type {Promise<Outcome>} */ (outcome.finally(() => clearTimeout(patience)));
   }
 

@@ -5,25 +5,40 @@ import { joinParts } from "./messages.mjs";
 
 /** A WebSocket that is open. */
 export class Socket {
-  /** Gets each message. @type {(frame: Uint8Array) => void} */
-  onmessage = () => {};
-  /** Is called once, unless this side closed it. @type {(closed: Closed) => void} */
-  onclose = () => {};
+  /** @type {(frame: Uint8Array) => void} */
+  #onmessage;
+  /** @type {(closed: Closed) => void} */
+  #onclose;
+  /** What came before somebody listened: a refusal comes with the answer to the request. @type {(() => void)[]} */
+  #early = [];
   #socket;
   #over = false;
 
   /** @param {any} socket  of the browser's interface, open */
   constructor(socket) {
     this.#socket = socket;
+    this.#onmessage = (frame) => this.#early.push(() => this.#onmessage(frame));
+    this.#onclose = (closed) => this.#early.push(() => this.#onclose(closed));
     // Text is no message of this protocol: an empty frame is refused as one.
     socket.onmessage = (/** @type {{ data: ArrayBuffer | string }} */ { data }) => {
-      if (!this.#over) this.onmessage(typeof data === "string" ? new Uint8Array(0) : new Uint8Array(data));
+      if (!this.#over) this.#onmessage(typeof data === "string" ? new Uint8Array(0) : new Uint8Array(data));
     };
     socket.onclose = (/** @type {Closed} */ { code, reason }) => {
       if (this.#over) return;
       this.#over = true;
-      this.onclose({ code, reason });
+      this.#onclose({ code, reason });
     };
+  }
+
+  /**
+   * Get what came so far and what comes.
+   * @param {(frame: Uint8Array) => void} onmessage  gets each message
+   * @param {(closed: Closed) => void} onclose  is called once, unless this side closed it
+   */
+  listen(onmessage, onclose) {
+    this.#onmessage = onmessage;
+    this.#onclose = onclose;
+    for (const deliver of this.#early.splice(0)) deliver();
   }
 
   /** @param {Uint8Array[]} parts  of one message */
