@@ -202,3 +202,11 @@ test("an agent owns what the scenario says, and gives one command for each actua
   assert.equal((await agent.answered(grant, [])).end_episode, true);
   assert.deepEqual(await agent.answered({ ...grant, final: true }, []), { products: [] });
 });
+
+test("a gateway that is not there is named, and waiting for it can be ended", async () => {
+  const world = new World({ prefixes: ["car"] }), nowhere = "ws://127.0.0.1:1/ws";
+  await assert.rejects(world.run(nowhere, { patience: 0.1 }), { name: "RunError", message: /^ws:\/\/127.0.0.1:1\/ws does not answer/ });
+  const waiting = world.run(nowhere, { patience: 60 });
+  setTimeout(() => world.leave("the user went home"), 50);
+  assert.equal(await waiting, "the user went home");
+});

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 from node_project import node_project
-from scenarios_support import ROOT, caviar, environment, eventually, running
+from scenarios_support import ROOT, blocks, caviar, environment, eventually, running
 from test_websocket_agent import WITHIN_S, WebRun
 
 from caviar_broker.control.socket import ask
@@ -220,6 +220,7 @@ def scenes(directory: Path) -> list[str]:
     return [product.digest for _, product in Recording(directory).products("scene")]
 
 
+@pytest.mark.channel
 def test_300_frames_have_paths_scans_and_links_of_what_the_world_brings(
     undisturbed: tuple[str, Path],
 ) -> None:
@@ -287,6 +288,7 @@ class Cable:
         self.cut()
 
 
+@pytest.mark.channel
 def test_cut_off_then_killed_and_started_again_it_makes_the_same_digest(
     node: str, undisturbed: tuple[str, Path], tmp_path: Path
 ) -> None:
@@ -309,14 +311,31 @@ def test_cut_off_then_killed_and_started_again_it_makes_the_same_digest(
         assert run.output.count("back: world") == 2
 
 
-def test_its_token_lets_it_in_and_another_one_is_refused_by_name(
-    node: str, light: Path, tmp_path: Path
+def with_its_own_websocket(node: str) -> list[str]:
+    """Node with the WebSocket that it brings, where it brings one; without it the library has its own."""
+    told = subprocess.run([node, "--version"], capture_output=True, text=True, check=True).stdout
+    major, minor = map(int, re.findall(r"\d+", told)[:2])
+    return [node, "--experimental-websocket"] if (20, 10) <= (major, minor) < (22, 0) else [node]
+
+
+def followed(page: Path, folder: Path) -> Path:
+    """The first world and the scenario of the page in a folder with the library; returns the scenario."""
+    (folder / "node_modules").mkdir()
+    (folder / "node_modules" / "caviar-client").symlink_to(CLIENT)  # as npm installs a folder
+    first = dict(reversed(blocks(page)))
+    (folder / "world.mjs").write_text(first["js"])
+    (folder / "run.toml").write_text(first["toml"])
+    return folder / "run.toml"
+
+
+def test_the_world_of_the_page_gets_to_its_frames_with_its_token_and_with_no_other(
+    node: str, tmp_path: Path
 ) -> None:
-    keys = tmp_path / "keys"
+    scenario, keys = followed(ROOT / "docs/howto/js-client.md", tmp_path), tmp_path / "keys"
     assert caviar("keys", "new", "broker", "--directory", keys).status == 0
     made = caviar("keys", "token", "world", "--role", "world", "--directory", keys)
-    command = (node, str(CLIENT / "world.mjs"))
-    with waiting_run(tmp_path, "--frames", "3", "--keys", str(keys), scenario=light) as run:
+    command = (*with_its_own_websocket(node), str(tmp_path / "world.mjs"))
+    with waiting_run(tmp_path, "--frames", "3", "--keys", str(keys), scenario=scenario) as run:
         stranger = subprocess.run(
             [*command, run.url, "world"], env=environment(run.mark, CAVIAR_TOKEN=made.output[1:].strip()),
             capture_output=True, text=True, timeout=WITHIN_S, check=False,
@@ -353,6 +372,7 @@ def served(folder: Path) -> Iterator[str]:
         server.server_close()
 
 
+@pytest.mark.channel
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_page_in_chromium_publishes_the_scenes_that_node_publishes(
     undisturbed: tuple[str, Path], light: Path, tmp_path: Path

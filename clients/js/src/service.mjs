@@ -75,7 +75,7 @@ export class Service {
         throw new RunError(
           lost
             ? `${lost}, and it could not come back: ${outcome.lost}`
-            : `${outcome.lost} within ${patience} s`,
+            : `${outcome.lost}, for ${patience} s now; start a run with  caviar run SCENARIO --http HOST:PORT`,
         );
       await new Promise((resolve) => {
         this.#wake = () => resolve(undefined);

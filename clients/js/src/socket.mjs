@@ -3,6 +3,9 @@ import { joinParts } from "./messages.mjs";
 
 /** How a WebSocket ended. @typedef {{ code: number, reason: string }} Closed */
 
+/** [ms] that a WebSocket may take to open. */
+const OPEN_MS = 5000;
+
 /** A WebSocket that is open. */
 export class Socket {
   /** @type {(frame: Uint8Array) => void} */
@@ -28,6 +31,7 @@ export class Socket {
       this.#over = true;
       this.#onclose({ code, reason });
     };
+    socket.onerror = () => setTimeout(() => socket.onclose({ code: 1006, reason: "" }));
   }
 
   /**
@@ -68,12 +72,21 @@ export async function openSocket(url, token) {
   const socket = new Constructor(url, ["caviar.v1", ...(token ? [`bearer.${token}`] : [])]);
   socket.binaryType = "arraybuffer";
   return new Promise((resolve, reject) => {
-    let why = "";
-    socket.onopen = () => resolve(new Socket(socket));
-    socket.onerror = (/** @type {any} */ event) => {
-      why ||= event?.message ?? event?.error?.message ?? "";
+    const fail = (/** @type {string} */ why) => {
+      clearTimeout(patience);
+      reject(new Error(`${url} does not answer (${why})`));
     };
-    socket.onclose = (/** @type {Closed} */ { code, reason }) =>
-      reject(new Error(`${url} does not answer (${why || reason || `code ${code}`})`));
+    const patience = setTimeout(() => {
+      fail(`not within ${OPEN_MS} ms`);
+      socket.close();
+    }, OPEN_MS);
+    socket.onopen = () => {
+      clearTimeout(patience);
+      resolve(new Socket(socket));
+    };
+    socket.onclose = (/** @type {Closed} */ { code, reason }) => fail(reason || `code ${code}`);
+    // The WebSocket of Node 20 does not close where it could not open, others close after their error.
+    socket.onerror = (/** @type {any} */ event) =>
+      setTimeout(() => fail(event?.message || event?.error?.message || "nothing listens there"));
   });
 }
