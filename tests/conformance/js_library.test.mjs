@@ -205,8 +205,10 @@ test("an agent owns what the scenario says, and gives one command for each actua
 
 test("a gateway that is not there is named, and waiting for it can be ended", async () => {
   const world = new World({ prefixes: ["car"] }), nowhere = "ws://127.0.0.1:1/ws";
-  await assert.rejects(world.run(nowhere, { patience: 0.1 }), { name: "RunError", message: /^ws:\/\/127.0.0.1:1\/ws does not answer/ });
-  const waiting = world.run(nowhere, { patience: 60 });
+  await assert.rejects(world.run(nowhere, { patience: 0.1, log() {} }), { name: "RunError", message: /^ws:\/\/127.0.0.1:1\/ws does not answer/ });
+  await assert.rejects(world.run("127.0.0.1:8080"), /is no address of a gateway; write ws:/);
+  const told = [], waiting = world.run(nowhere, { patience: 60, log: (line) => told.push(line) });
   setTimeout(() => world.leave("the user went home"), 50);
   assert.equal(await waiting, "the user went home");
+  assert.match(told.join("\n"), /^world: ws:.* does not answer .*; trying again for 60 s$/);
 });

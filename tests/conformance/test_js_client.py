@@ -42,12 +42,14 @@ class Typed extends World {
     for (const command of commands) if (command.type === "waypoint") this.speed = command.speed;
     const ahead = { position: [0, 0, -t * this.speed], velocity: [0, 0, -this.speed] };
     const { position, velocity } = GODOT.toEnu(ahead);
-    return [{ name: "car", class: "car", position, velocity, dimensions: [4, 2, 1.5] }];
+    const object: SceneObject = { name: "car", class: "car", position, velocity, dimensions: [4, 2, 1.5] };
+    // @ts-expect-error: tsc says so where this is no mistake
+    const wrong: SceneObject = { ...object, velocity: 3 };
+    return [object, wrong];
   }
 }
 export const ended: Promise<string> = new Typed({ prefixes: ["car"] }).run("ws://127.0.0.1:8080/ws");
 """
-WRONG_IN_TYPESCRIPT = WORLD_IN_TYPESCRIPT.replace("velocity, dim", "velocity: 3, dim")
 
 CASES_OF_THE_AGENT = (
     "hello", "ready", "frames", "repeated-grant", "queued-grants", "held-inputs", "absent-inputs", "episodes",
@@ -128,12 +130,6 @@ def test_the_library_is_strictly_typed_and_so_is_a_world_in_typescript(tools: Pa
     config["include"] = ["src", "typed.ts"]
     (tools / "tsconfig.json").write_text(json.dumps(config))
     printed(tools / "node_modules/.bin/tsc", cwd=tools)
-    script.write_text(WRONG_IN_TYPESCRIPT)
-    wrong = subprocess.run(
-        [tools / "node_modules/.bin/tsc"], cwd=tools, capture_output=True, text=True, check=False
-    )
-    assert wrong.returncode != 0
-    assert re.search(r"typed.ts.*'number' is not assignable to type 'Vector3'", wrong.stdout), wrong.stdout
     script.unlink()
 
 

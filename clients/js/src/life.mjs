@@ -34,7 +34,7 @@ import { decodePayload, payloadDigest } from "./topics.mjs";
  * @typedef {{ over: string } | { lost: string, welcomed: boolean, rejoin_ms: number }} Outcome
  */
 
-/** [B] of answers that are kept beyond the newest two, for a GRANT that is repeated. */
+/** [B] of answers that are kept for a GRANT that is repeated; the newest two are, however large. */
 const KEPT = 64 << 20;
 /** [B] of an input up to which its digest is compared. */
 const COMPARED = 16 << 10;
@@ -53,6 +53,8 @@ export class Life {
   #answered = -1;
   /** @type {Map<number, Uint8Array[]>} */
   #answers = new Map();
+  /** [B] of them. */
+  #kept = 0;
   /** @type {Promise<void>} */
   #queue = Promise.resolve();
   #progress = new Progress();
@@ -276,6 +278,7 @@ export class Life {
   async #reset(reset) {
     this.#turn = { episode: reset.episode };
     this.#answers.clear();
+    this.#kept = 0;
     this.#answered = -1;
     this.#progress.enter("reset");
     await this.#orFault("reset", () => this.part.began(reset));
@@ -329,10 +332,11 @@ export class Life {
   /** @param {number} frame  @param {Uint8Array[]} answer */
   #keep(frame, answer) {
     this.#answers.set(frame, answer);
-    let bytes = 0;
-    for (const kept of [...this.#answers.keys()].reverse()) {
-      if (bytes > KEPT && kept < frame - 1) this.#answers.delete(kept);
-      else for (const part of this.#answers.get(kept) ?? []) bytes += part.length;
+    this.#kept += sizeOf(answer);
+    for (const [oldest, parts] of this.#answers) {
+      if (this.#kept <= KEPT || this.#answers.size <= 2) break;
+      this.#answers.delete(oldest);
+      this.#kept -= sizeOf(parts);
     }
   }
 
@@ -380,6 +384,11 @@ function inputOf({ topic, source, digest }, header, body) {
       `the product of ${topic} from ${source} cannot be used: ${asError(error).message}`,
     );
   }
+}
+
+/** @param {Uint8Array[]} parts */
+function sizeOf(parts) {
+  return parts.reduce((bytes, part) => bytes + part.length, 0);
 }
 
 /** @param {unknown} error  @returns {Error} */

@@ -58,6 +58,9 @@ export class Service {
    * @throws {Error} of the service's own code, outside of a frame
    */
   async run(url, { token = "", patience = PATIENCE_S, log = console.warn } = {}) {
+    if (!/^wss?:\/\/./.test(url))
+      throw new RunError(`${url} is no address of a gateway; write ws://HOST:PORT/ws`);
+    let said = "";
     let until = Date.now() + 1000 * patience,
       pause = PAUSE_MS,
       lost = "";
@@ -65,6 +68,10 @@ export class Service {
       const outcome = await this.#live(url, token, log, until, lost !== "");
       if ("over" in outcome) return outcome.over;
       if (this.#left) return this.#left;
+      if (!outcome.welcomed && !lost && outcome.lost !== said) {
+        said = outcome.lost;
+        log(`${this.name}: ${said}; trying again for ${Math.round((until - Date.now()) / 1000)} s`);
+      }
       if (outcome.welcomed) {
         if (!outcome.rejoin_ms) throw new RunError(outcome.lost);
         if (!lost)
