@@ -279,8 +279,9 @@ test("three.js has the axes of Godot, and its models face +z", () => {
     angular_velocity: [7, 8, 9],
   };
   assert.deepEqual(THREE.fromEnu(pose), GODOT.fromEnu(pose));
-  const forward = ([w, x, y, z]) => [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]; // R·(1, 0, 0)
-  const facing = ([w, x, y, z]) => [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]; // R·(0, 0, 1)
+  // Columns of the rotation: where x, and where z, points to.
+  const forward = ([w, x, y, z]) => [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+  const facing = ([w, x, y, z]) => [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
   const { velocity: ahead } = THREE.fromEnu({ velocity: forward(pose.orientation) });
   facing(THREE_MODEL.fromEnu(pose).orientation).forEach((value, axis) =>
     assert.ok(Math.abs(value - ahead[axis]) < 1e-15),
