@@ -3,6 +3,9 @@ import { encodeMessage, decodeMessage, splitFrame } from "./messages.mjs";
 
 /** @import { Socket } from "./socket.mjs" */
 
+/** [ms] at most that an answer may be late beyond the broker's liveness. */
+const LATE_MS = 1000;
+
 /** What the user sees of a service that stalls. */
 export class Progress {
   progress = 0;
@@ -55,14 +58,14 @@ export class Heartbeat {
     this.#send({ type: "HEARTBEAT", sequence: this.#sequence++, progress, phase, grace_ns });
     const oldest = this.#unanswered;
     if (Date.now() - oldest < this.liveness_ms) return;
-    // A page in the background or a long step holds this timer up, and answers that came meanwhile have not
-    // been read yet: they are before the next turn but one.
+    // A page in the background or a long step holds this timer up, and answers that came meanwhile have not been
+    // read yet; a busy broker is late. So it has a while more before its silence is believed.
     setTimeout(
       () => {
         if (this.#unanswered === oldest)
           this.lost(`the broker has been silent for ${Math.round(Date.now() - oldest)} ms`);
       },
-      Math.min(100, this.liveness_ms),
+      Math.min(LATE_MS, this.liveness_ms),
     );
   }
 
