@@ -723,8 +723,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             var sizes = (List<object>)shape;
             int width;
             if (!NdArray.Sizes.TryGetValue((string)dtype, out width)) throw ProtocolException.Malformed(place + ": no element is a '" + dtype + "'");
-            if (sizes.Count > 6 || sizes.Any(size => !(size is long) || (long)size < 0 || (long)size > int.MaxValue))
-                throw ProtocolException.Malformed(place + ": the shape is no list of at most 6 sizes");
+            if (sizes.Count > 6) throw new ProtocolException("limit", place + " has " + sizes.Count + " dimensions; at most 6 may travel");
+            if (sizes.Any(size => !(size is long) || (long)size < 0 || (long)size > int.MaxValue))
+                throw ProtocolException.Malformed(place + ": the shape is no list of sizes");
             // The product of sizes may exceed 64 bits; a body never does.
             double length = sizes.Aggregate((double)width, (product, size) => product * (long)size);
             long begin = (long)offset;
