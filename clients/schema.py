@@ -1,7 +1,7 @@
 """Fields of all messages and payloads in a compact text, which client libraries carry in their sources.
 
     python clients/schema.py            print the text
-    python clients/schema.py FILE …     replace it in sources, between lines with «schema: begin» and «schema: end»
+    python clients/schema.py FILE …     replace it in sources, between «schema: begin» and «schema: end»
 
 Each line is a struct: its name, with ``:TAG`` where a field ``type`` says which it is, then ``field:type`` or
 ``field:type=default`` in the order of the wire, ``?`` for a field without a value. Types are
@@ -48,7 +48,9 @@ def schema() -> str:
 def _struct(cls: type[msgspec.Struct]) -> str:
     hints, config = get_type_hints(cls, include_extras=True), cls.__struct_config__
     name = f"{cls.__name__}:{config.tag}" if config.tag_field else cls.__name__
-    found = [f"{field.name}:{_type(hints[field.name])}{_default(field)}" for field in msgspec.structs.fields(cls)]
+    found = [
+        f"{field.name}:{_type(hints[field.name])}{_default(field)}" for field in msgspec.structs.fields(cls)
+    ]
     return " ".join([name, *found])
 
 
@@ -62,7 +64,9 @@ def _type(hint: Any, metas: tuple[msgspec.Meta, ...] = ()) -> str:
             return f"a({','.join([spec.dtype, *map(str, spec.shape)])})"
     if origin in (Union, UnionType):
         members = [member for member in arguments if member is not NoneType]
-        return _type(members[0], metas) if len(members) == 1 else "/".join(_type(member) for member in members)
+        return (
+            _type(members[0], metas) if len(members) == 1 else "/".join(_type(member) for member in members)
+        )
     if origin is Literal:
         return f"e({','.join(map(str, arguments))})"
     if origin is tuple and arguments[1:] == (...,):

@@ -1,18 +1,21 @@
-"""What the tests of client libraries for game engines share: cases as lines of text, and runs with their worlds.
+"""What the tests of client libraries for game engines share: cases as lines of text, runs with their worlds.
 
-A library is asked through a small program in its language: it reads cases, fields divided by tabs, from a file, and
-prints one line for each.
+A library is asked through a small program in its language: it reads cases, fields divided by tabs, from a
+file, and prints one line for each. Numbers are written as ``x`` and the 16 digits of their 8 bytes, as a
+language may read and print decimals inexactly.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
+import socket
+import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +28,17 @@ from caviar_protocol.arrays import WIRE_DTYPES
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.recording import Recording
-from caviar_protocol.topics import Channel, Lidar, Link, Scene
+from caviar_protocol.topics import (
+    Action,
+    BeamChoice,
+    Channel,
+    Lidar,
+    Link,
+    Scene,
+    UserSchedule,
+    VelocityCommand,
+    WaypointCommand,
+)
 
 FRAMES = 300
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))
@@ -83,9 +96,13 @@ def check_arrays(ask: Ask) -> None:
             if expected.dtype.kind == "c":
                 expected = expected.view("<f8" if expected.dtype.itemsize == 16 else "<f4")
             if expected.dtype.kind in "iu":
-                assert [int(word) % 2**64 for word in integers.split()] == [int(x) % 2**64 for x in expected], name
-            got = [float(word) for word in floats.split()]
-            assert all(math.isclose(a, float(b), rel_tol=1e-12) for a, b in zip(got, expected, strict=True)), name
+                assert [int(word) % 2**64 for word in integers.split()] == [
+                    int(x) % 2**64 for x in expected
+                ], name
+            got = [_number(word) for word in floats.split()]
+            assert all(
+                math.isclose(a, float(b), rel_tol=1e-12) for a, b in zip(got, expected, strict=True)
+            ), name
     assert seen == set(WIRE_DTYPES)
 
 
@@ -99,9 +116,8 @@ def check_axes(ask: Ask) -> None:
     cases = [(engine, pose) for pose in poses for engine in pose if engine != "enu"]
     lines = ["\t".join([engine, *(_numbers(pose["enu"][key]) for key in keys)]) for engine, pose in cases]
     for (engine, pose), answer in zip(cases, ask("axes", lines), strict=True):
-        got = [[float(word) for word in field.split()] for field in answer.split("\t")]
-        for expected, there, back in zip((pose[engine], pose["enu"]), (got[:4], got[4:]), keys, strict=False):
-            del back
+        got = [[_number(word) for word in field.split()] for field in answer.split("\t")]
+        for expected, there in ((pose[engine], got[:4]), (pose["enu"], got[4:])):
             for key, numbers in zip(keys, there, strict=True):
                 assert _alike(numbers, expected[key], key == "orientation"), f"{engine} {key}: {numbers}"
 
@@ -114,7 +130,11 @@ def _alike(got: list[float], expected: list[float], is_rotation: bool) -> bool:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
+    return " ".join("x" + struct.pack(">d", value).hex() for value in values)
+
+
+def _number(word: str) -> float:
+    return float(struct.unpack(">d", bytes.fromhex(word[1:]))[0]) if word.startswith("x") else float(word)
 
 
 # --- the scene builder --------------------------------------------------------------------------------------
@@ -180,7 +200,8 @@ def check_wrong_objects(ask: Ask) -> None:
 MATCHES = (
     ("car.*", "car.1", True), ("car.*", "carx1", False), ("car.?", "car.12", False), ("*", "", True),
     ("[bc]ar", "car", True), ("[!bc]ar", "car", False), ("[a-c]ar", "bar", True), ("[a-c]ar", "dar", False),
-    ("x[[]y", "x[y", True), ("a[1]", "a[1]", True), ("a[1", "a[1", True), ("*.*.z", "a.b.z", True), ("uav", "uav.1", False),
+    ("x[[]y", "x[y", True), ("a[1]", "a[1]", True), ("a[1", "a[1", True), ("*.*.z", "a.b.z", True),
+    ("uav", "uav.1", False),
 )  # fmt: skip
 
 
@@ -203,13 +224,86 @@ def check_wrong_scenery(ask: Ask) -> None:
         assert expected in answer
 
 
+# --- what others made ---------------------------------------------------------------------------------------
+
+
+def check_decoders(ask: Ask) -> None:
+    """Users of a link, paths of a channel and commands of an action are those that our codec reads."""
+    link = decode_payload("link", *_product("link_full"))
+    assert isinstance(link, Link)
+    columns = zip(link.abs_y, link.snr, link.tx_beam, link.rx_beam, strict=True)
+    _same(
+        ask("users", [_fields("link_full")]),
+        [
+            [*ends, *numbers]
+            for ends, numbers in zip(zip(link.tx, link.rx, link.carrier, strict=True), columns, strict=True)
+        ],
+    )
+    _same(ask("paths", [_fields("channel_full")]), list(_paths()))
+    action = decode_payload("action", *_product("action_every_command"))
+    assert isinstance(action, Action)
+    _same(
+        ask("commands", [_fields("action_every_command")]), [_command(command) for command in action.commands]
+    )
+
+
+def _fields(name: str) -> str:
+    return "\t".join(part.hex() for part in _product(name))
+
+
+def _same(answers: list[str], expected: list[list[Any]]) -> None:
+    (answer,) = answers
+    rows = [row.split() for row in answer.split("\t")]
+    assert len(rows) == len(expected) > 0
+    for row, words in zip(rows, expected, strict=True):
+        assert len(row) == len(words)
+        for got, wanted in zip(row, words, strict=True):
+            if isinstance(wanted, str):
+                assert got == wanted
+            else:
+                assert math.isclose(_number(got), wanted, rel_tol=1e-12), f"{got} in {row}"
+
+
+def _paths() -> Iterator[list[Any]]:
+    channel = decode_payload("channel", *_product("channel_full"))
+    assert isinstance(channel, Channel)
+    for pair in range(len(channel.offsets) - 1):
+        for path in range(*channel.offsets[pair : pair + 2].tolist()):
+            ends = [channel.tx[pair // len(channel.rx)], channel.rx[pair % len(channel.rx)]]
+            met = channel.interactions[path] > 0
+            yield [
+                *ends, channel.tau[path], *channel.aod[path],
+                *channel.a[:, path].real, *channel.a[:, path].imag, *channel.doppler[:, path],
+                *channel.interactions[path][met], *channel.points[path][met].ravel(),
+            ]  # fmt: skip
+
+
+def _command(command: BeamChoice | WaypointCommand | VelocityCommand | UserSchedule) -> list[Any]:
+    kind = type(command).__struct_config__.tag
+    if isinstance(command, WaypointCommand):
+        return [kind, command.object, 0, command.speed, *command.position]
+    if isinstance(command, VelocityCommand):
+        return [kind, command.object, 0, 0, *command.velocity]
+    return [kind, command.tx, command.tx_beam if isinstance(command, BeamChoice) else 0, 0]
+
+
 # --- conformance and runs -----------------------------------------------------------------------------------
 
 
 def check_conformance(command: str, folder: Path) -> None:
     """``caviar conform --ws --role world`` has no failure, and plays what a world with state has to know."""
     verdicts = folder / "verdicts.json"
-    words = ["--ws", "--listen", "ws://127.0.0.1:0/ws", "--role", "world", "--name", "world", "--json", str(verdicts)]
+    words = [
+        "--ws",
+        "--listen",
+        "ws://127.0.0.1:0/ws",
+        "--role",
+        "world",
+        "--name",
+        "world",
+        "--json",
+        str(verdicts),
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "caviar_clients", "conform", *words, "--command", command],
         env=environment("conform"), capture_output=True, text=True, timeout=120, check=False,
@@ -237,7 +331,8 @@ def token_of(folder: Path) -> str:
     base = [sys.executable, "-m", "caviar_clients", "keys"]
     for words in (("new", "broker"), ("token", "world", "--role", "world")):
         done = subprocess.run(
-            [*base, *words, "--directory", str(folder)], env=environment("keys"), capture_output=True, text=True, check=True
+            [*base, *words, "--directory", str(folder)], env=environment("keys"),
+            capture_output=True, text=True, check=True,
         )  # fmt: skip
     return done.stdout.strip()
 
@@ -258,7 +353,7 @@ def whole_run(scenario: Path, folder: Path, command: Sequence[str]) -> tuple[str
 
 
 def check_recording(directory: Path) -> None:
-    """Frames have a scene with its devices, a channel to three receivers, LIDAR hits on what the world brought."""
+    """A frame has its devices, a channel to three receivers, LIDAR hits on what the world brought."""
     recording = Recording(directory)
     assert len(recording) == FRAMES
     frame = recording.frame(0, 100)
@@ -282,21 +377,66 @@ def check_recording(directory: Path) -> None:
     assert link.has_path.all()
 
 
+class Line:
+    """A TCP line to the gateway that can be cut without a closing handshake, as by a network that fails."""
+
+    def __init__(self, url: str) -> None:
+        host, port = url.removeprefix("ws://").split("/")[0].split(":")
+        self._target = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._ends: list[socket.socket] = []
+        self.url = f"ws://127.0.0.1:{self._listener.getsockname()[1]}/ws"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """End all connections that there are; new ones are accepted."""
+        ends, self._ends = self._ends, []
+        for end in ends:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Cut, and accept no more."""
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self.cut()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection(self._target)
+                self._ends += [near, far]
+                for source, target in ((near, far), (far, near)):
+                    threading.Thread(target=self._copy, args=(source, target), daemon=True).start()
+
+    def _copy(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError), source:
+            while data := source.recv(1 << 16):
+                target.sendall(data)
+        with suppress(OSError):
+            target.shutdown(socket.SHUT_RDWR)
+
+
 def check_kill(scenario: Path, folder: Path, command: Sequence[str], digest: str) -> None:
-    """Killed and started again, a world makes the same run."""
-    with waiting_run(scenario, folder) as run:
-        with run.agent(*command, run.url, "world") as first:
+    """Cut off, it comes back by itself; killed and started again, it goes on: the run is the same."""
+    with waiting_run(scenario, folder) as run, closing(Line(run.url)) as line:
+        with run.agent(*command, line.url, "world") as first:
             eventually(lambda: recorded_below(run.out) >= 25, WITHIN_S, "some frames are recorded")
+            before = recorded_below(run.out)
+            line.cut()
+            eventually(lambda: recorded_below(run.out) >= before + 30, WITHIN_S, "it comes back and goes on")
             first.kill()
         with run.agent(*command, run.url, "world"):
             assert run.digest() == digest
-        assert "back: world" in run.output
+        assert run.output.count("back: world") == 2, run.output
 
 
 def schema_is_current(source: Path) -> bool:
     """Whether a source holds the schema that ``clients/schema.py`` makes today."""
     text = source.read_text("utf-8")
     done = subprocess.run(
-        [sys.executable, ROOT / "clients" / "schema.py"], env=dict(os.environ), capture_output=True, text=True, check=True
-    )  # fmt: skip
+        [sys.executable, ROOT / "clients" / "schema.py"], capture_output=True, text=True, check=True
+    )
     return done.stdout in text

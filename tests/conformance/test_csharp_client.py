@@ -48,7 +48,11 @@ def ask(build: Path, tmp_path: Path) -> worlds.Ask:
         cases = tmp_path / "cases.txt"
         cases.write_text("\n".join(lines) + "\n", "utf-8")
         done = subprocess.run(
-            ["mono", build / "Check.exe", kind, cases], capture_output=True, text=True, timeout=120, check=False
+            ["mono", build / "Check.exe", kind, cases],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.removesuffix("\n").split("\n")
@@ -82,6 +86,10 @@ def test_devices_are_mounted_as_the_vectors_say(ask: worlds.Ask) -> None:
 def test_wrong_objects_and_scenery_are_refused(ask: worlds.Ask) -> None:
     worlds.check_wrong_objects(ask)
     worlds.check_wrong_scenery(ask)
+
+
+def test_links_channels_and_actions_are_decoded(ask: worlds.Ask) -> None:
+    worlds.check_decoders(ask)
 
 
 def test_the_reference_world_fails_no_case_of_the_kit(command: list[str], tmp_path: Path) -> None:

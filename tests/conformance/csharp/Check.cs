@@ -15,6 +15,7 @@ internal static class Check
         var answers = new Dictionary<string, Func<string[], string>>
         {
             { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted }, { "match", Match }, { "mesh", Mesh },
+            { "users", Users }, { "paths", Paths }, { "commands", Commands },
         };
         foreach (var line in File.ReadAllLines(arguments[1])) Console.WriteLine(answers[arguments[0]](line.Split('\t')));
     }
@@ -85,6 +86,26 @@ internal static class Check
         catch (ArgumentException problem) { return problem.Message; }
     }
 
+    // header, body: a field for each user, path or command.
+    private static string Users(string[] fields)
+    {
+        return string.Join("\t", LinkUser.All(Codec.DecodePayload("link", Hex(fields[0]), Hex(fields[1])))
+            .Select(user => user.Tx + " " + user.Rx + " " + user.Carrier + " " + Text(new[] { user.AbsY, user.Snr, user.TxBeam, user.RxBeam })));
+    }
+
+    private static string Paths(string[] fields)
+    {
+        return string.Join("\t", ChannelPath.All(Codec.DecodePayload("channel", Hex(fields[0]), Hex(fields[1])))
+            .Select(path => path.Tx + " " + path.Rx + " " + Text(new[] { path.Tau }.Concat(path.Aod).Concat(path.Real).Concat(path.Imaginary).Concat(path.Doppler)
+                .Concat(path.Interactions.Select(kind => (double)kind)).Concat(path.Points.SelectMany(point => point)).ToArray())));
+    }
+
+    private static string Commands(string[] fields)
+    {
+        return string.Join("\t", Command.All(Codec.DecodePayload("action", Hex(fields[0]), Hex(fields[1])))
+            .Select(command => command.Type + " " + (command.Object == "" ? command.Tx : command.Object) + " " + Text(new[] { command.TxBeam, command.Speed }.Concat(command.Position ?? command.Velocity ?? new double[0]).ToArray())));
+    }
+
     private static string Match(string[] fields) { return SceneBuilder.Matches(fields[0], fields[1]).ToString(); }
 
     private sealed class Still : World
@@ -105,7 +126,13 @@ internal static class Check
     }
 
     private static string Text(double[] numbers) { return string.Join(" ", numbers.Select(number => number.ToString("R", CultureInfo.InvariantCulture))); }
-    private static double[] Numbers(string text) { return text.Split(' ').Select(word => double.Parse(word, CultureInfo.InvariantCulture)).ToArray(); }
+    private static double[] Numbers(string text) { return text.Split(' ').Select(Number).ToArray(); }
+    private static double Number(string word)
+    {
+        if (word[0] == 'x') return BitConverter.Int64BitsToDouble(Convert.ToInt64(word.Substring(1), 16));
+        return double.Parse(word, CultureInfo.InvariantCulture);
+    }
+
     private static string Hex(byte[] bytes) { return string.Concat(bytes.Select(value => value.ToString("x2"))); }
     private static byte[] Hex(string text) { return Enumerable.Range(0, text.Length / 2).Select(i => Convert.ToByte(text.Substring(2 * i, 2), 16)).ToArray(); }
 }
