@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
-from scenarios_support import ROOT, environment, eventually, recorded_below, running
+from scenarios_support import ROOT, blocks, environment, eventually, recorded_below, running
 from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
 
@@ -440,3 +440,11 @@ def schema_is_current(source: Path) -> bool:
         [sys.executable, ROOT / "clients" / "schema.py"], capture_output=True, text=True, check=True
     )
     return done.stdout in text
+
+
+def block_of(page: Path, name: str, folder: Path) -> Path:
+    """A program of a page, the fenced block that begins with a comment of its name, as a file."""
+    (text,) = (text for _, text in blocks(page) if text.splitlines()[0].endswith(f" {name}"))
+    source = folder / name
+    source.write_text(text, "utf-8")
+    return source

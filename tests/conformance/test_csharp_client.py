@@ -92,6 +92,17 @@ def test_links_channels_and_actions_are_decoded(ask: worlds.Ask) -> None:
     worlds.check_decoders(ask)
 
 
+def test_the_programs_of_its_page_compile(build: Path, tmp_path: Path) -> None:
+    stub = CHECK.with_name("UnityStub.cs")
+    for name, *more in (("Street.cs",), ("CaviarStreet.cs", stub)):
+        source = worlds.block_of(ROOT / "docs" / "howto" / "csharp-client.md", name, tmp_path)
+        command = ["mcs", "-langversion:7.2", "-target:library", f"-out:{tmp_path / name}.dll"]
+        done = subprocess.run(
+            [*command, source, *more, CSHARP / "Caviar.cs"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_reference_world_fails_no_case_of_the_kit(command: list[str], tmp_path: Path) -> None:
     worlds.check_conformance(" ".join([*command, "{endpoint}", "{name}"]), tmp_path)
 
