@@ -1242,7 +1242,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return found.OrderBy(device => device.Text("name"), Comparer<string>.Create(Bytes.Compare)).Cast<object>().ToList();
         }
 
-        private static double Radians(double degrees) { return degrees * Math.PI / 180; }
+        private static double Radians(double degrees) { return degrees * (Math.PI / 180); }
 
         private static Map Device(Map spec, WorldObject parent)
         {
