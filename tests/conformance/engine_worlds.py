@@ -99,7 +99,7 @@ def check_arrays(ask: Ask) -> None:
                 assert [int(word) % 2**64 for word in integers.split()] == [
                     int(x) % 2**64 for x in expected
                 ], name
-            got = [_number(word) for word in floats.split()]
+            got = [number(word) for word in floats.split()]
             assert all(
                 math.isclose(a, float(b), rel_tol=1e-12) for a, b in zip(got, expected, strict=True)
             ), name
@@ -116,7 +116,7 @@ def check_axes(ask: Ask) -> None:
     cases = [(engine, pose) for pose in poses for engine in pose if engine != "enu"]
     lines = ["\t".join([engine, *(_numbers(pose["enu"][key]) for key in keys)]) for engine, pose in cases]
     for (engine, pose), answer in zip(cases, ask("axes", lines), strict=True):
-        got = [[_number(word) for word in field.split()] for field in answer.split("\t")]
+        got = [[number(word) for word in field.split()] for field in answer.split("\t")]
         for expected, there in ((pose[engine], got[:4]), (pose["enu"], got[4:])):
             for key, numbers in zip(keys, there, strict=True):
                 assert _alike(numbers, expected[key], key == "orientation"), f"{engine} {key}: {numbers}"
@@ -133,7 +133,7 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join("x" + struct.pack(">d", value).hex() for value in values)
 
 
-def _number(word: str) -> float:
+def number(word: str) -> float:
     return float(struct.unpack(">d", bytes.fromhex(word[1:]))[0]) if word.startswith("x") else float(word)
 
 
@@ -261,7 +261,7 @@ def _same(answers: list[str], expected: list[list[Any]]) -> None:
             if isinstance(wanted, str):
                 assert got == wanted
             else:
-                assert math.isclose(_number(got), wanted, rel_tol=1e-12), f"{got} in {row}"
+                assert math.isclose(number(got), wanted, rel_tol=1e-12), f"{got} in {row}"
 
 
 def _paths() -> Iterator[list[Any]]:

@@ -7,7 +7,7 @@
 CAVIAR_STOP_FILE=$(mktemp -u "${TMPDIR:-/tmp}/caviar-stop-XXXXXXXX")
 export CAVIAR_STOP_FILE
 trap 'touch "$CAVIAR_STOP_FILE"' TERM INT
-"${GODOT:-godot3-server}" -s "$@" &
+${GODOT:-godot3-server} -s "$@" & # GODOT may have options, such as --path
 # A trap ends `wait` before the world has ended.
 while :; do
   wait $!
