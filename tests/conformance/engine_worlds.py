@@ -102,7 +102,7 @@ def check_arrays(ask: Ask) -> None:
             got = [number(word) for word in floats.split()]
             assert all(
                 math.isclose(a, float(b), rel_tol=1e-12) for a, b in zip(got, expected, strict=True)
-            ), name
+            ), f"{name}: {got} of {stated}"
     assert seen == set(WIRE_DTYPES)
 
 

@@ -125,7 +125,7 @@ static func quaternion_of(m):
 	var found = []
 	var length = 0.0
 	for part in rows[greatest]:
-		length += float(part) * part
+		length += part * part
 	for part in rows[greatest]:
 		found.append(part / sqrt(length))
 	return found

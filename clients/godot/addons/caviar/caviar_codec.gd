@@ -42,8 +42,9 @@ class NdArray:
 				found.append(buffer.get_float())
 		else:
 			for element in to_ints():
-				# An int has 64 bits with a sign: the upper half of uint64 is negative there.
-				found.append(float(element) + (18446744073709551616.0 if dtype == "<u8" and element < 0 else 0.0))
+				# An int has 64 bits with a sign: the upper half of uint64 is negative there. `float(int)` has single
+				# precision in Godot 3, a sum with a float has double.
+				found.append(element + (pow(2.0, 64) if dtype == "<u8" and element < 0 else 0.0))
 		return found
 
 	# Elements of an array of integers or booleans; of uint64 the same 64 bits.
@@ -69,7 +70,7 @@ static func rows(columns, values):
 	var buffer = StreamPeerBuffer.new()
 	for row in values:
 		for i in range(columns):
-			buffer.put_double(float(row[i]) + 0.0)
+			buffer.put_double(row[i] + 0.0)
 	var made = NdArray.new()
 	made.dtype = "<f8"
 	made.shape = [values.size(), columns]
@@ -135,7 +136,7 @@ func _read_field(type, value, place, sizes):
 		right = kind == TYPE_INT and _in_bounds(type, value)
 	elif type.kind == "f":
 		if kind == TYPE_INT:
-			value = float(value)
+			value += 0.0
 		right = (kind == TYPE_INT or kind == FLOAT) and _in_bounds(type, value)
 	elif type.kind == "e":
 		right = kind == TYPE_STRING and value in type.words
@@ -236,7 +237,7 @@ func _reference(value, place):
 	if shape.size() > 6:
 		return _fail("limit", "%s has %d dimensions; at most 6 may travel" % [place, shape.size()])
 	# As floats: the product of sizes may exceed 64 bits, and a body never does.
-	var length = float(WIDTHS[value["dtype"]])
+	var length = WIDTHS[value["dtype"]] + 0.0
 	for size in shape:
 		if typeof(size) != TYPE_INT or size < 0:
 			return _malformed("%s: the shape is no list of sizes" % place)
@@ -306,7 +307,7 @@ static func _near(a, b):
 func _written(type, value, place):
 	var to = _big()
 	if type.kind == "f":
-		var number = float(value)
+		var number = value + 0.0
 		if is_nan(number) or is_inf(number):
 			return _malformed("%s is %s; it has to be finite" % [place, str(number)])
 		_write(to, number)

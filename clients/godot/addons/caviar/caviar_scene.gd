@@ -152,7 +152,7 @@ static func _radians(degrees):
 
 static func _device(spec, parent):
 	var turned = Axes.from_euler(_radians(spec["yaw_deg"]), _radians(spec["pitch_deg"]), _radians(spec["roll_deg"]))
-	var position = [float(spec["position_m"][0]), float(spec["position_m"][1]), float(spec["position_m"][2])]
+	var position = spec["position_m"].duplicate()
 	var made = {"type": spec["kind"], "name": spec["name"]}
 	if parent != null:
 		made["name"] = "%s/%s" % [parent["name"], spec["name"]]

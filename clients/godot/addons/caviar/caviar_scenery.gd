@@ -49,7 +49,7 @@ func offer_scenery(meshes, materials, name = "world"):
 	var xml = "<scene version=\"2.1.0\">\n"
 	var known = {}
 	for material in materials:
-		var thickness = float(material.get("thickness", 0.2))
+		var thickness = material.get("thickness", 0.2) + 0.0
 		if not material["type"] in MATERIALS:
 			_wrong("material '%s': no type is '%s'; one of %s" % [material["name"], material["type"], str(MATERIALS)])
 		if not thickness > 0:
@@ -110,7 +110,7 @@ static func _in_unit_box(vertices):
 			high = max(high, vertex[i])
 		for j in range(vertices.size()):
 			if high > low:
-				found[j][i] = float(vertices[j][i] - low) / (high - low) - 0.5
+				found[j][i] = (vertices[j][i] - low + 0.0) / (high - low) - 0.5
 	return found
 
 

@@ -162,4 +162,4 @@ func _standard(text, type):
 static func _number(text):
 	var expression = Expression.new()
 	expression.parse(text)
-	return float(expression.execute())
+	return expression.execute() + 0.0
