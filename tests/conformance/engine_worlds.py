@@ -433,6 +433,32 @@ def check_kill(scenario: Path, folder: Path, command: Sequence[str], digest: str
         assert run.output.count("back: world") == 2, run.output
 
 
+BARE = """
+[run]
+name = "bare"
+frames = 20
+record = ["scene"]
+
+[services]
+world = { role = "world", use = "remote", budget_ms = 1000 }
+recorder = { role = "recorder", use = "mcap", budget_ms = 1000 }
+"""
+"""A run of a world that needs nothing else."""
+
+
+def check_slow_and_wrong(folder: Path, command: Sequence[str]) -> None:
+    """A world may take several ticks for a frame; its wrong object ends the run, and is named."""
+    scenario = folder / "bare.toml"
+    scenario.write_text(BARE, "utf-8")
+    with waiting_run(scenario, folder) as run, run.agent(*command, run.url, "world") as world:
+        output, _ = run.process.communicate(timeout=WITHIN_S)
+        assert run.process.returncode == 1, output
+        assert world.wait(WITHIN_S) == 0
+    assert "object 'lorry': no prefix of READY begins its name" in " ".join(output.split())
+    scenes = [frame.scene() for frame in Recording(next(run.out.glob("*/")))]
+    assert [scene.position[0, 1] for scene in scenes if scene is not None] == [3, 6, 9, 12, 15]
+
+
 def schema_is_current(source: Path) -> bool:
     """Whether a source holds the schema that ``clients/schema.py`` makes today."""
     text = source.read_text("utf-8")

@@ -27,7 +27,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed (Debian: mono-mcs, mono-runtime, libmono-posix4.0-cil)")
     folder = tmp_path_factory.mktemp("csharp")
-    for source in (CSHARP / "World.cs", CHECK):
+    for source in (CSHARP / "World.cs", CHECK, CHECK.with_name("Slow.cs")):
         # Unity 2020 has C# 8; mcs ends at 7.2.
         command = ["mcs", "-langversion:7.2", "-warnaserror", f"-out:{folder / source.stem}.exe"]
         done = subprocess.run(
@@ -105,6 +105,10 @@ def test_the_programs_of_its_page_compile(build: Path, tmp_path: Path) -> None:
 
 def test_the_reference_world_fails_no_case_of_the_kit(command: list[str], tmp_path: Path) -> None:
     worlds.check_conformance(" ".join([*command, "{endpoint}", "{name}"]), tmp_path)
+
+
+def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path, tmp_path: Path) -> None:
+    worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
 
 
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(

@@ -1,4 +1,4 @@
-"""The add-on for Godot, run by Godot 3 without a screen: vectors, conformance, a whole run, and a killed world."""
+"""The add-on for Godot, run by Godot 3 without a screen: vectors, conformance, whole runs, a killed world."""
 
 from __future__ import annotations
 
@@ -97,6 +97,11 @@ def test_the_reference_world_fails_no_case_of_the_kit(godot: str, tmp_path: Path
     # The script around Godot turns SIGTERM into a file that the add-on looks for.
     command = f"env GODOT='{godot} --path {GODOT}' {ADDON / 'run_headless.sh'} world.gd {{endpoint}} {{name}}"
     worlds.check_conformance(command, tmp_path)
+
+
+def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(godot: str, tmp_path: Path) -> None:
+    script = str(CHECK.with_name("slow.gd"))
+    worlds.check_slow_and_wrong(tmp_path, [godot, "--path", str(GODOT), "-s", script])
 
 
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
