@@ -318,10 +318,10 @@ def check_conformance(command: str, folder: Path) -> None:
 
 
 @contextmanager
-def waiting_run(scenario: Path, folder: Path, *options: str) -> Iterator[WebRun]:
+def waiting_run(scenario: Path, folder: Path, *options: str, frames: int = FRAMES) -> Iterator[WebRun]:
     """``caviar run --http`` of a scenario that waits for its world."""
     out = folder / "out"
-    options = ("--frames", str(FRAMES), "--http", "127.0.0.1:0", *options)
+    options = ("--frames", str(frames), "--http", "127.0.0.1:0", *options)
     with running(scenario, out, *options) as (process, mark):
         yield WebRun(process, mark, out)
 

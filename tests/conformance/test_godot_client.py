@@ -12,6 +12,8 @@ import engine_worlds as worlds
 import pytest
 from scenarios_support import ROOT
 
+from caviar_protocol.recording import Recording
+
 pytestmark = pytest.mark.slow
 
 GODOT = ROOT / "clients" / "godot"
@@ -102,6 +104,51 @@ def test_the_reference_world_fails_no_case_of_the_kit(godot: str, tmp_path: Path
 def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(godot: str, tmp_path: Path) -> None:
     script = str(CHECK.with_name("slow.gd"))
     worlds.check_slow_and_wrong(tmp_path, [godot, "--path", str(GODOT), "-s", script])
+
+
+TREE = """extends SceneTree
+
+func _init():
+	var node = load("res://caviar_node.gd").new()
+	var car = RigidBody.new()
+	car.name = "Car"
+	car.translation = Vector3(3, 100, -20)
+	car.linear_velocity = Vector3(0, 0, -10)
+	car.linear_damp = 0
+	node.add_child(car)
+	node.tracked = [NodePath("Car")]
+	root.add_child(node)
+
+func _idle(_delta):
+	return root.get_child(0).world.end_reason != ""
+"""
+
+
+def test_the_node_of_its_page_tells_where_physics_move_a_body(godot: str, tmp_path: Path) -> None:
+    """Godot's -z is east, its x south: a body thrown along -z goes east while it falls."""
+    project, run_folder = tmp_path / "project", tmp_path / "run"
+    shutil.copytree(GODOT / "addons", project / "addons")
+    (project / "project.godot").write_text("config_version=4\n", "utf-8")
+    (project / "tree.gd").write_text(TREE, "utf-8")
+    run_folder.mkdir()
+    scenario = run_folder / "bare.toml"
+    scenario.write_text(worlds.BARE, "utf-8")
+    with worlds.waiting_run(scenario, run_folder, frames=20) as run:
+        source = worlds.block_of(ROOT / "docs" / "howto" / "godot-client.md", "caviar_node.gd", project)
+        source.write_text(source.read_text("utf-8").replace("ws://127.0.0.1:8080/ws", run.url), "utf-8")
+        with run.agent(godot, "--path", str(project), "-s", "tree.gd"):
+            run.digest()
+    scenes = [frame.scene() for frame in Recording(next(run.out.glob("*/")))]
+    x, y, z = zip(*(scene.position[0].tolist() for scene in scenes if scene is not None), strict=True)
+    assert len(x) == 20
+    assert 20 <= x[0] < x[-1]
+    assert y == pytest.approx([-3] * 20)
+    assert 100 >= z[0] > z[-1]
+    first, last = scenes[0], scenes[-1]
+    assert first is not None
+    assert last is not None
+    assert last.velocity[0, 0] == pytest.approx(10, rel=1e-3)
+    assert last.velocity[0, 2] < first.velocity[0, 2] <= 0
 
 
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
