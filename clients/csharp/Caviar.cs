@@ -1,12 +1,12 @@
 // Caviar.cs: a game engine as a world of a CAVIAR run, over WebSocket. One file for Unity and .NET, no packages.
 //
-// Derive from World, override Step, and call Poll once a tick (or Run in a program without a loop of its own):
+// Derive from World, override Step, and call Poll once a tick (or Run, in a program without a loop of its own):
 //
-//     class Street : Caviar.World
+//     class Street : World
 //     {
-//         protected override IEnumerable<Caviar.WorldObject> Step(double t, double previous, IList<Caviar.Command> commands)
+//         protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
 //         {
-//             yield return new Caviar.WorldObject("car", "car", new[] { 10.0 * t, 0.0, 0.75 }, new[] { 4.5, 1.8, 1.5 });
+//             yield return new WorldObject("car", "car", new[] { 10 * t, 0, 0.75 }, new[] { 4.5, 1.8, 1.5 });
 //         }
 //     }
 //
@@ -34,7 +34,10 @@ namespace Caviar
 
         public ProtocolException(string code, string message) : base(message) { Code = code; }
 
-        internal static ProtocolException Malformed(string message) { return new ProtocolException("malformed", message); }
+        internal static ProtocolException Malformed(string message)
+        {
+            return new ProtocolException("malformed", message);
+        }
     }
 
     /// <summary>A map of the protocol: fields by name, defaults filled in where it was decoded.</summary>
@@ -43,7 +46,11 @@ namespace Caviar
     {
         public long Whole(string key) { return Convert.ToInt64(this[key], CultureInfo.InvariantCulture); }
         public double Number(string key) { return Convert.ToDouble(this[key], CultureInfo.InvariantCulture); }
-        public string Text(string key) { object found; return TryGetValue(key, out found) ? found as string ?? "" : ""; }
+        public string Text(string key)
+        {
+            object found;
+            return TryGetValue(key, out found) ? found as string ?? "" : "";
+        }
         public bool Flag(string key) { return (bool)this[key]; }
         public Map Child(string key) { return this[key] as Map; }
         public List<object> List(string key) { return (List<object>)this[key]; }
@@ -53,10 +60,15 @@ namespace Caviar
         }
         public string[] Texts(string key) { return List(key).Cast<string>().ToArray(); }
         /// <summary>The array of a field, or null where the field is left out.</summary>
-        public NdArray Array(string key) { object found; return TryGetValue(key, out found) ? (NdArray)found : null; }
+        public NdArray Array(string key)
+        {
+            object found;
+            return TryGetValue(key, out found) ? (NdArray)found : null;
+        }
     }
 
-    /// <summary>An array of a product: element type, shape, and the elements as little-endian bytes in C order.</summary>
+    /// <summary>An array of a product: element type, shape, and the elements as little-endian bytes in C
+    /// order.</summary>
     public sealed class NdArray
     {
         internal static readonly Dictionary<string, int> Sizes = new Dictionary<string, int>
@@ -129,7 +141,10 @@ namespace Caviar
             for (int i = 0; i < width; i++) data[at + i] = (byte)(value >> 8 * i);
         }
 
-        public static double Double(byte[] data, int at) { return BitConverter.Int64BitsToDouble(Whole(data, at, 8)); }
+        public static double Double(byte[] data, int at)
+        {
+            return BitConverter.Int64BitsToDouble(Whole(data, at, 8));
+        }
 
         // -0.0 equals 0.0 and has other bytes: adding 0 makes equal values equal bytes.
         public static void PutDouble(byte[] data, int at, double value)
@@ -170,7 +185,8 @@ namespace Caviar
         public const int MaxNesting = 32;
         private static readonly UTF8Encoding Strict = new UTF8Encoding(false, true);
 
-        /// <summary>Write a value in canonical form: everything shortest, floats in nine bytes, keys of a Map sorted.</summary>
+        /// <summary>Write a value in canonical form: everything shortest, floats in nine bytes, keys of a Map
+        /// sorted.</summary>
         public static byte[] Pack(object value)
         {
             var stream = new MemoryStream();
@@ -182,7 +198,11 @@ namespace Caviar
         {
             if (value == null) to.WriteByte(0xc0);
             else if (value is bool) to.WriteByte((bool)value ? (byte)0xc3 : (byte)0xc2);
-            else if (value is double) { to.WriteByte(0xcb); Big(to, BitConverter.DoubleToInt64Bits((double)value + 0.0), 8); }
+            else if (value is double)
+            {
+                to.WriteByte(0xcb);
+                Big(to, BitConverter.DoubleToInt64Bits((double)value + 0.0), 8);
+            }
             else if (value is long) WriteWhole(to, (long)value);
             else if (value is int) WriteWhole(to, (int)value);
             else if (value is string) WriteText(to, (string)value);
@@ -242,12 +262,14 @@ namespace Caviar
             for (int i = width - 1; i >= 0; i--) to.WriteByte((byte)(value >> 8 * i));
         }
 
-        /// <summary>Read one value that fills all bytes; raises ProtocolException where it does not.</summary>
+        /// <summary>Read one value that fills all bytes; raises ProtocolException where it does
+        /// not.</summary>
         public static object Unpack(byte[] data)
         {
             int at = 0;
             var found = Read(data, ref at, 0);
-            if (at != data.Length) throw ProtocolException.Malformed((data.Length - at) + " bytes after the end of the header");
+            if (at != data.Length)
+                throw ProtocolException.Malformed((data.Length - at) + " bytes after the end of the header");
             return found;
         }
 
@@ -264,14 +286,18 @@ namespace Caviar
                 case 0xc0: return null;
                 case 0xc2: return false;
                 case 0xc3: return true;
-                case 0xca: { var four = Take(data, ref at, 4); Array.Reverse(four); return (double)Bytes.Single(four, 0); }
+                case 0xca:
+                    var four = Take(data, ref at, 4);
+                    Array.Reverse(four);
+                    return (double)Bytes.Single(four, 0);
                 case 0xcb: return BitConverter.Int64BitsToDouble(Big(data, ref at, 8));
                 case 0xcc: return Big(data, ref at, 1);
                 case 0xcd: return Big(data, ref at, 2);
                 case 0xce: return Big(data, ref at, 4);
                 case 0xcf:
                     long whole = Big(data, ref at, 8);
-                    if (whole < 0) throw ProtocolException.Malformed("an integer does not fit into 64 bits with a sign");
+                    if (whole < 0)
+                        throw ProtocolException.Malformed("an integer does not fit into 64 bits with a sign");
                     return whole;
                 case 0xd0: return (long)(sbyte)Big(data, ref at, 1);
                 case 0xd1: return (long)(short)Big(data, ref at, 2);
@@ -284,13 +310,15 @@ namespace Caviar
                 case 0xdd: return ReadList(data, ref at, Big(data, ref at, 4), depth);
                 case 0xde: return ReadMap(data, ref at, Big(data, ref at, 2), depth);
                 case 0xdf: return ReadMap(data, ref at, Big(data, ref at, 4), depth);
-                default: throw ProtocolException.Malformed("the byte 0x" + code.ToString("x2") + " begins no value of a header");
+                default: throw ProtocolException.Malformed("the byte 0x" + code.ToString("x2")
+                    + " begins no value of a header");
             }
         }
 
         private static byte[] Take(byte[] data, ref int at, long count)
         {
-            if (count > data.Length - at) throw ProtocolException.Malformed("the header ends in the middle of a value");
+            if (count > data.Length - at)
+                throw ProtocolException.Malformed("the header ends in the middle of a value");
             var found = new byte[count];
             Buffer.BlockCopy(data, at, found, 0, (int)count);
             at += (int)count;
@@ -314,8 +342,10 @@ namespace Caviar
         // A count costs nothing before its items are there: each takes a byte at least.
         private static void CheckCount(byte[] data, int at, long count, int depth)
         {
-            if (depth >= MaxNesting) throw new ProtocolException("limit", "maps and lists nest deeper than " + MaxNesting);
-            if (count > data.Length - at) throw ProtocolException.Malformed("a length announces more items than there are bytes");
+            if (depth >= MaxNesting)
+                throw new ProtocolException("limit", "maps and lists nest deeper than " + MaxNesting);
+            if (count > data.Length - at)
+                throw ProtocolException.Malformed("a length announces more items than there are bytes");
         }
 
         private static List<object> ReadList(byte[] data, ref int at, long count, int depth)
@@ -340,7 +370,8 @@ namespace Caviar
         }
     }
 
-    /// <summary>Field types of all messages and payloads, from the text below that clients/schema.py makes.</summary>
+    /// <summary>Field types of all messages and payloads, from the text below that clients/schema.py
+    /// makes.</summary>
     internal sealed class Schema
     {
         private const string Text = @"// schema: begin
@@ -439,12 +470,14 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         static Schema()
         {
-            foreach (var line in Text.Split('\n').Select(line => line.Trim()).Where(line => line != "" && line[0] != '/'))
+            foreach (var line in Text.Split('\n').Select(line => line.Trim())
+                .Where(line => line != "" && line[0] != '/'))
             {
                 var words = line.Split(' ');
                 if (line[0] == '=')
                     foreach (var size in words.Skip(1))
-                        Structs[words[0].Substring(1)]._sizes[size.Split(':')[0]] = size.Split(':')[1].Split(',');
+                        Structs[words[0].Substring(1)]._sizes[size.Split(':')[0]] = 
+                            size.Split(':')[1].Split(',');
                 else if (line[0] == '@')
                     foreach (var topic in words.Skip(1))
                         Topics[topic.Split(':')[0]] = Structs[topic.Split(':')[1]];
@@ -462,7 +495,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             {
                 int colon = word.IndexOf(':'), equals = word.IndexOf('=', colon);
                 var field = new Field { Name = word.Substring(0, colon) };
-                field.Type = Parse(equals < 0 ? word.Substring(colon + 1) : word.Substring(colon + 1, equals - colon - 1));
+                field.Type = Parse(equals < 0 ? word.Substring(colon + 1)
+                    : word.Substring(colon + 1, equals - colon - 1));
                 if (equals >= 0)
                 {
                     field.Required = false;
@@ -480,7 +514,11 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             string head = open < 0 ? text.Substring(1) : text.Substring(1, open - 1);
             string inner = open < 0 ? "" : text.Substring(open + 1, text.Length - open - 2);
             if (char.IsUpper(text[0]) && text != "D") { type.Kind = 'S'; type.Words = text.Split('/'); }
-            else if (text[0] == 'l') { type.Inner = Parse(inner); if (head != "") type.Most = int.Parse(head); }
+            else if (text[0] == 'l')
+            {
+                type.Inner = Parse(inner);
+                if (head != "") type.Most = int.Parse(head);
+            }
             else if (text[0] == 't') { type.Inner = Parse(inner); type.Fewest = type.Most = int.Parse(head); }
             else if (text[0] == 'm') type.Inner = Parse(inner);
             else if (text[0] == 'e' || text[0] == 'a') type.Words = inner.Split(',');
@@ -508,13 +546,14 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 case 'f': return double.Parse(text, CultureInfo.InvariantCulture);
                 case 'l': return new List<object>();
                 case 't':
-                    return text.Trim('[', ']').Split(',').Select(item => DefaultOf(item, type.Inner)).ToList();
+                    return text.Trim('[', ']').Split(',')
+                        .Select(item => DefaultOf(item, type.Inner)).ToList();
                 case 'm': case 'S': return new Map();
                 default: return text.Trim('\'');
             }
         }
 
-        // --- reading: types are checked, defaults filled in, arrays taken from the body ---------------------
+        // --- reading: types are checked, defaults filled in, arrays taken from the body --------------------
 
         /// <summary>A map as a struct of this kind; raises ProtocolException where it is none.</summary>
         public Map Read(object value, BodyReader body, string place)
@@ -529,7 +568,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 object given;
                 if (map.TryGetValue(field.Name, out given))
                     found[field.Name] = ReadField(field.Type, given, body, place + "." + field.Name, sizes);
-                else if (field.Required) throw ProtocolException.Malformed(place + "." + field.Name + " is missing");
+                else if (field.Required)
+                    throw ProtocolException.Malformed(place + "." + field.Name + " is missing");
                 else if (field.Type.Kind == 'S' && !field.LeftOut)
                     found[field.Name] = Structs[field.Type.Words[0]].Read(new Map(), body, place);
                 else if (!field.LeftOut) found[field.Name] = field.Default;
@@ -546,7 +586,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             int fixedSize, known;
             bool wrong = int.TryParse(name, out fixedSize) ? count != fixedSize
                 : sizes.TryGetValue(name, out known) && known != count;
-            if (wrong) throw ProtocolException.Malformed(place + " has " + count + " where " + name + " is another size");
+            if (wrong)
+                throw ProtocolException.Malformed(place + " has " + count + " where " + name
+                    + " is another size");
             sizes[name] = count;
         }
 
@@ -554,12 +596,16 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             long[] offsets = channel.Array("offsets").ToLongs();
             int pairs = channel.List("tx").Count * channel.List("rx").Count;
-            bool right = offsets.Length == pairs + 1 && offsets[0] == 0 && offsets[pairs] == channel.Array("tau").Shape[0];
+            bool right = offsets.Length == pairs + 1 && offsets[0] == 0
+                && offsets[pairs] == channel.Array("tau").Shape[0];
             for (int i = 0; right && i < pairs; i++) right = offsets[i] <= offsets[i + 1];
-            if (!right) throw ProtocolException.Malformed(place + ".offsets do not count the paths of " + pairs + " pairs");
+            if (!right)
+                throw ProtocolException.Malformed(place + ".offsets do not count the paths of " + pairs
+                    + " pairs");
         }
 
-        private static object ReadField(FieldType type, object value, BodyReader body, string place, Dictionary<string, int> sizes)
+        private static object ReadField(FieldType type, object value, BodyReader body, string place,
+            Dictionary<string, int> sizes)
         {
             switch (type.Kind)
             {
@@ -574,22 +620,30 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 case 'l': case 't':
                     var list = value as List<object>;
                     if (list == null || list.Count < type.Fewest || list.Count > type.Most) break;
-                    return list.Select((item, i) => ReadField(type.Inner, item, body, place + "[" + i + "]", sizes)).ToList();
+                    return list
+                        .Select((item, i) => ReadField(type.Inner, item, body, place + "[" + i + "]", sizes))
+                        .ToList();
                 case 'm':
                     if (!(value is Map)) break;
                     var map = new Map();
-                    foreach (var pair in (Map)value) map[pair.Key] = ReadField(type.Inner, pair.Value, body, place + "." + pair.Key, sizes);
+                    foreach (var pair in (Map)value)
+                    {
+                        string inner = place + "." + pair.Key;
+                        map[pair.Key] = ReadField(type.Inner, pair.Value, body, inner, sizes);
+                    }
                     return map;
                 case 'S':
                     if (!(value is Map)) break;
                     if (type.Words.Length == 1) return Structs[type.Words[0]].Read(value, body, place);
-                    var tagged = type.Words.FirstOrDefault(name => Structs[name].Tag == ((Map)value).Text("type"));
+                    var tagged = type.Words.FirstOrDefault(name =>
+                        Structs[name].Tag == ((Map)value).Text("type"));
                     if (tagged == null) break;
                     return Structs[tagged].Read(value, body, place);
                 case 'a':
                     var array = body.Read(value, place);
                     if (array.Dtype != type.Words[0] || array.Shape.Length != type.Words.Length - 1) break;
-                    for (int i = 0; i < array.Shape.Length; i++) Agree(sizes, type.Words[i + 1], array.Shape[i], place);
+                    for (int i = 0; i < array.Shape.Length; i++)
+                        Agree(sizes, type.Words[i + 1], array.Shape[i], place);
                     return array;
                 default: if (value is string && IsText(type, (string)value)) return value; break;
             }
@@ -609,15 +663,27 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 case 'd': return text.Length == 64 && IsHex(text);
                 case 'D': return text == "" || text.Length == 64 && IsHex(text);
                 case 'n': return text.Length >= 1 && Length(text) <= 128 && IsPrintable(text);
-                case 'p': return Length(text) <= 255 && IsPrintable(text) && !text.Contains("\\")
-                    && text.Split('/').All(segment => segment != "" && segment != "." && segment != "..");
+                case 'p': return IsPath(text);
                 default: return Length(text) >= type.Fewest && Length(text) <= type.Most;
             }
         }
 
+        /// <summary>Whether a text is the name of an asset: a relative path that stays below its folder.</summary>
+        internal static bool IsPath(string text)
+        {
+            return Length(text) <= 255 && IsPrintable(text) && !text.Contains("\\")
+                && text.Split('/').All(segment => segment != "" && segment != "." && segment != "..");
+        }
+
         // Characters as the protocol counts them: code points, and not halves of surrogate pairs.
-        private static int Length(string text) { return text.Count(character => !char.IsLowSurrogate(character)); }
-        private static bool IsHex(string text) { return text.All(c => c >= '0' && c <= '9' || c >= 'a' && c <= 'f'); }
+        private static int Length(string text)
+        {
+            return text.Count(character => !char.IsLowSurrogate(character));
+        }
+        private static bool IsHex(string text)
+        {
+            return text.All(c => c >= '0' && c <= '9' || c >= 'a' && c <= 'f');
+        }
         internal static bool IsPrintable(string text) { return text.All(c => c >= ' ' && c != '\x7f'); }
 
         private static string Shown(object value)
@@ -627,9 +693,10 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return text.Length > 80 ? text.Substring(0, 80) + "…" : text;
         }
 
-        // --- writing: canonical form, in which a field that equals its default is left out ------------------
+        // --- writing: canonical form, in which a field that equals its default is left out -----------------
 
-        /// <summary>Write a struct; fields that are missing have their defaults, keys that it does not have are ignored.</summary>
+        /// <summary>Write a struct; fields that are missing have their defaults, keys that it does not have
+        /// are ignored.</summary>
         public void Write(Stream to, Map map, BodyWriter body)
         {
             var kept = new List<KeyValuePair<string, byte[]>>();
@@ -643,7 +710,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 }
                 var bytes = Written(field.Type, value, body, Name + "." + field.Name);
                 bool standard = !field.Required && !field.LeftOut
-                    && (field.Type.Kind == 'S' ? bytes.Length == 1 && bytes[0] == 0x80 : IsDefault(value, field));
+                    && (field.Type.Kind == 'S' ? bytes.Length == 1 && bytes[0] == 0x80
+                        : IsDefault(value, field));
                 if (!standard) kept.Add(new KeyValuePair<string, byte[]>(field.Name, bytes));
             }
             MessagePack.Head(to, kept.Count + (Tag == null ? 0 : 1), 0x80, 16, 0, 0xde, 0xdf);
@@ -657,13 +725,16 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private static bool IsDefault(object value, Field field)
         {
-            if (field.Type.Kind == 'f') return Convert.ToDouble(value, CultureInfo.InvariantCulture).Equals((double)field.Default + 0.0)
-                || Convert.ToDouble(value, CultureInfo.InvariantCulture) == (double)field.Default;
-            if (field.Type.Kind == 'i') return Convert.ToInt64(value, CultureInfo.InvariantCulture) == (long)field.Default;
+            if (field.Type.Kind == 'f')
+                return Convert.ToDouble(value, CultureInfo.InvariantCulture) == (double)field.Default;
+            if (field.Type.Kind == 'i')
+                return Convert.ToInt64(value, CultureInfo.InvariantCulture) == (long)field.Default;
             if (field.Type.Kind == 't')
-                return ((System.Collections.IEnumerable)value).Cast<object>().Select(item => Convert.ToDouble(item, CultureInfo.InvariantCulture))
+                return ((System.Collections.IEnumerable)value).Cast<object>()
+                    .Select(item => Convert.ToDouble(item, CultureInfo.InvariantCulture))
                     .SequenceEqual(((List<object>)field.Default).Select(item => (double)item));
-            if (field.Type.Kind == 'l' || field.Type.Kind == 'm') return ((System.Collections.ICollection)value).Count == 0;
+            if (field.Type.Kind == 'l' || field.Type.Kind == 'm')
+                return ((System.Collections.ICollection)value).Count == 0;
             return value.Equals(field.Default);
         }
 
@@ -674,7 +745,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             {
                 case 'f':
                     double number = Convert.ToDouble(value, CultureInfo.InvariantCulture);
-                    if (double.IsNaN(number) || double.IsInfinity(number)) throw new ArgumentException(place + " is " + number + "; it has to be finite");
+                    if (double.IsNaN(number) || double.IsInfinity(number))
+                        throw new ArgumentException(place + " is " + number + "; it has to be finite");
                     MessagePack.Write(to, number);
                     break;
                 case 'i': MessagePack.Write(to, Convert.ToInt64(value, CultureInfo.InvariantCulture)); break;
@@ -685,7 +757,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     break;
                 case 'm':
                     MessagePack.Head(to, ((Map)value).Count, 0x80, 16, 0, 0xde, 0xdf);
-                    foreach (var pair in ((Map)value).OrderBy(pair => pair.Key, Comparer<string>.Create(Bytes.Compare)))
+                    foreach (var pair in ((Map)value).OrderBy(pair => pair.Key,
+                        Comparer<string>.Create(Bytes.Compare)))
                     {
                         MessagePack.WriteText(to, pair.Key);
                         Copy(to, Written(type.Inner, pair.Value, body, place));
@@ -693,7 +766,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     break;
                 case 'S':
                     var map = (Map)value;
-                    var name = type.Words.Length == 1 ? type.Words[0] : type.Words.First(word => Structs[word].Tag == map.Text("type"));
+                    var name = type.Words.Length == 1 ? type.Words[0]
+                        : type.Words.First(word => Structs[word].Tag == map.Text("type"));
                     Structs[name].Write(to, map, body);
                     break;
                 case 'a': body.Place((NdArray)value).WriteTo(to); break;
@@ -717,23 +791,31 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             var reference = value as Map;
             object dtype = null, shape = null, offset = null;
-            if (reference == null || !reference.TryGetValue("dtype", out dtype) || !reference.TryGetValue("shape", out shape)
-                || !reference.TryGetValue("offset", out offset) || !(dtype is string) || !(shape is List<object>) || !(offset is long))
+            if (reference == null || !reference.TryGetValue("dtype", out dtype)
+                || !reference.TryGetValue("shape", out shape)
+                || !reference.TryGetValue("offset", out offset) || !(dtype is string)
+                || !(shape is List<object>) || !(offset is long))
                 throw ProtocolException.Malformed(place + " is no reference to an array");
             var sizes = (List<object>)shape;
             int width;
-            if (!NdArray.Sizes.TryGetValue((string)dtype, out width)) throw ProtocolException.Malformed(place + ": no element is a '" + dtype + "'");
-            if (sizes.Count > 6) throw new ProtocolException("limit", place + " has " + sizes.Count + " dimensions; at most 6 may travel");
+            if (!NdArray.Sizes.TryGetValue((string)dtype, out width))
+                throw ProtocolException.Malformed(place + ": no element is a '" + dtype + "'");
+            if (sizes.Count > 6)
+                throw new ProtocolException("limit", place + " has " + sizes.Count
+                    + " dimensions; at most 6 may travel");
             if (sizes.Any(size => !(size is long) || (long)size < 0 || (long)size > int.MaxValue))
                 throw ProtocolException.Malformed(place + ": the shape is no list of sizes");
             // The product of sizes may exceed 64 bits; a body never does.
             double length = sizes.Aggregate((double)width, (product, size) => product * (long)size);
             long begin = (long)offset;
-            if (begin < _end || begin % 8 != 0 || length > _body.Length || begin > _body.Length - (long)length)
-                throw ProtocolException.Malformed(place + ": the array at " + begin + " does not lie in its place of the body");
+            if (begin < _end || begin % 8 != 0 || length > _body.Length
+                || begin > _body.Length - (long)length)
+                throw ProtocolException.Malformed(place + ": the array at " + begin
+                    + " does not lie in its place of the body");
             var data = new byte[(int)length];
             Buffer.BlockCopy(_body, (int)begin, data, 0, data.Length);
-            if ((string)dtype == "|b1" && data.Any(element => element > 1)) throw ProtocolException.Malformed(place + ": a boolean is 0 or 1");
+            if ((string)dtype == "|b1" && data.Any(element => element > 1))
+                throw ProtocolException.Malformed(place + ": a boolean is 0 or 1");
             _end = begin + data.Length;
             return new NdArray((string)dtype, sizes.Select(size => (int)(long)size).ToArray(), data);
         }
@@ -768,7 +850,12 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public readonly byte[] Header, Body;
         public readonly string Digest;
 
-        public Product(byte[] header, byte[] body) { Header = header; Body = body; Digest = DigestOf(header, body); }
+        public Product(byte[] header, byte[] body)
+        {
+            Header = header;
+            Body = body;
+            Digest = DigestOf(header, body);
+        }
 
         public static string DigestOf(byte[] header, byte[] body)
         {
@@ -793,18 +880,23 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>The fields of a message's first part; raises ProtocolException.</summary>
         public static Map DecodeMessage(byte[] header)
         {
-            if (header.Length > MaxHeader) throw new ProtocolException("limit", "the header has " + header.Length + " B; at most " + MaxHeader + " may travel");
+            if (header.Length > MaxHeader)
+                throw new ProtocolException("limit", "the header has " + header.Length + " B; at most "
+                    + MaxHeader + " may travel");
             var map = MessagePack.Unpack(header) as Map;
             if (map == null) throw ProtocolException.Malformed("the header is no map");
             Schema schema;
-            if (!Schema.Messages.TryGetValue(map.Text("type"), out schema)) throw ProtocolException.Malformed("no message is a '" + map.Text("type") + "'");
+            if (!Schema.Messages.TryGetValue(map.Text("type"), out schema))
+                throw ProtocolException.Malformed("no message is a '" + map.Text("type") + "'");
             if (schema.Tag == "HELLO" || schema.Tag == "WELCOME")
             {
                 object version;
                 map.TryGetValue("version", out version);
                 var pair = version as List<object>;
-                if (pair != null && pair.Count == 2 && pair[0] is long && pair[1] is long && (long)pair[0] >= 0 && (long)pair[0] != 1)
-                    throw new ProtocolException("version", "the peer speaks version " + pair[0] + "." + pair[1] + " of the protocol, this client 1.5");
+                if (pair != null && pair.Count == 2 && pair[0] is long && pair[1] is long
+                    && (long)pair[0] >= 0 && (long)pair[0] != 1)
+                    throw new ProtocolException("version", "the peer speaks version " + pair[0] + "."
+                        + pair[1] + " of the protocol, this client 1.5");
             }
             return schema.Read(map, null, schema.Tag);
         }
@@ -813,16 +905,23 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public static void CheckParts(Map message, IList<byte[]> parts)
         {
             string type = message.Text("type");
-            int products = type == "GRANT" ? message.List("inputs").Count(input => ((Map)input).Text("status") != "absent")
+            int products = type == "GRANT"
+                ? message.List("inputs").Count(input => ((Map)input).Text("status") != "absent")
                 : type == "DONE" ? message.List("products").Count : 0;
             int raw = type == "ASSET_DATA" || type == "CHECKPOINT_DONE" || type == "RESTORE" ? 1 : 0;
             if (parts.Count != 1 + 2 * products + raw)
-                throw ProtocolException.Malformed(type + " has " + (parts.Count - 1) + " further parts, and its header announces " + (2 * products + raw));
+                throw ProtocolException.Malformed(type + " has " + (parts.Count - 1)
+                    + " further parts, and its header announces " + (2 * products + raw));
             for (int i = 1; i < 2 * products; i += 2)
-                if (parts[i].Length > MaxHeader) throw new ProtocolException("limit", "a product's header has " + parts[i].Length + " B; at most " + MaxHeader + " may travel");
+                if (parts[i].Length > MaxHeader)
+                    throw new ProtocolException("limit", "a product's header has " + parts[i].Length
+                        + " B; at most " + MaxHeader + " may travel");
             if (type != "ASSET_DATA") return;
-            if (parts[1].Length > MaxAssetChunk) throw new ProtocolException("limit", "ASSET_DATA brings " + parts[1].Length + " B; at most " + MaxAssetChunk + " may travel");
-            if (message.Whole("offset") > message.Whole("size") - parts[1].Length) throw ProtocolException.Malformed("ASSET_DATA reaches beyond the size that it states");
+            if (parts[1].Length > MaxAssetChunk)
+                throw new ProtocolException("limit", "ASSET_DATA brings " + parts[1].Length + " B; at most "
+                    + MaxAssetChunk + " may travel");
+            if (message.Whole("offset") > message.Whole("size") - parts[1].Length)
+                throw ProtocolException.Malformed("ASSET_DATA reaches beyond the size that it states");
         }
 
         public static Product EncodePayload(string topic, Map value)
@@ -836,9 +935,12 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>The fields of a product, with its arrays; raises ProtocolException.</summary>
         public static Map DecodePayload(string topic, byte[] header, byte[] body)
         {
-            if (header.Length > MaxHeader) throw new ProtocolException("limit", "the header has " + header.Length + " B; at most " + MaxHeader + " may travel");
+            if (header.Length > MaxHeader)
+                throw new ProtocolException("limit", "the header has " + header.Length + " B; at most "
+                    + MaxHeader + " may travel");
             Schema schema;
-            if (!Schema.Topics.TryGetValue(topic, out schema)) throw ProtocolException.Malformed("no topic is called '" + topic + "'");
+            if (!Schema.Topics.TryGetValue(topic, out schema))
+                throw ProtocolException.Malformed("no topic is called '" + topic + "'");
             return schema.Read(MessagePack.Unpack(header), new BodyReader(body), topic);
         }
 
@@ -870,19 +972,22 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public static List<byte[]> Split(byte[] frame)
         {
             long count = frame.Length < 4 ? 0 : Bytes.Whole(frame, 0, 4);
-            if (count < 1 || count > MaxParts || frame.Length < 4 * (1 + count)) throw ProtocolException.Malformed("the frame states " + count + " parts");
+            if (count < 1 || count > MaxParts || frame.Length < 4 * (1 + count))
+                throw ProtocolException.Malformed("the frame states " + count + " parts");
             var parts = new List<byte[]>();
             long at = 4 * (1 + count);
             for (int i = 1; i <= count; i++)
             {
                 long length = Bytes.Whole(frame, 4 * i, 4);
-                if (length > frame.Length - at) throw ProtocolException.Malformed("part " + (i - 1) + " of the frame ends past it");
+                if (length > frame.Length - at)
+                    throw ProtocolException.Malformed("part " + (i - 1) + " of the frame ends past it");
                 var part = new byte[length];
                 Buffer.BlockCopy(frame, (int)at, part, 0, (int)length);
                 parts.Add(part);
                 at += length;
             }
-            if (at != frame.Length) throw ProtocolException.Malformed("the frame has bytes after its last part");
+            if (at != frame.Length)
+                throw ProtocolException.Malformed("the frame has bytes after its last part");
             return parts;
         }
     }
@@ -893,28 +998,42 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
     public struct Pose
     {
         public readonly double[] Position, Orientation;
-        public Pose(double[] position, double[] orientation) { Position = position; Orientation = orientation; }
+        public Pose(double[] position, double[] orientation)
+        {
+            Position = position;
+            Orientation = orientation;
+        }
     }
 
     /// <summary>Velocity, and angular velocity [rad/s] that turns by the hand of the axes.</summary>
     public struct Motion
     {
         public readonly double[] Velocity, AngularVelocity;
-        public Motion(double[] velocity, double[] angularVelocity) { Velocity = velocity; AngularVelocity = angularVelocity; }
+        public Motion(double[] velocity, double[] angularVelocity)
+        {
+            Velocity = velocity;
+            AngularVelocity = angularVelocity;
+        }
     }
 
-    /// <summary>Axes and unit of length of an engine, to and from those of the protocol (east, north, up; metres).</summary>
-    /// <example><code>new WorldObject("car", "car", Axes.Unity.PoseToEnu(new Pose(position, orientation)), …)</code></example>
+    /// <summary>Axes and unit of length of an engine, to and from those of the protocol (east, north, up;
+    /// metres).</summary>
+    /// <example><code>new WorldObject("car", "car", Axes.Unity.PoseToEnu(new Pose(position, orientation)),
+    /// …)</code></example>
     public sealed class Axes
     {
         /// <summary>Left-handed centimetres: x east and forward, y south and right, z up.</summary>
-        public static readonly Axes Unreal = new Axes(100, new double[,] { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, 1 } });
+        public static readonly Axes Unreal = new Axes(100,
+            new double[,] { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, 1 } });
         /// <summary>Left-handed metres: x south and right, y up, z east and forward.</summary>
-        public static readonly Axes Unity = new Axes(1, new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { 1, 0, 0 } });
+        public static readonly Axes Unity = new Axes(1,
+            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { 1, 0, 0 } });
         /// <summary>Right-handed metres: x south and right, y up, z west and back.</summary>
-        public static readonly Axes Godot = new Axes(1, new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { -1, 0, 0 } });
+        public static readonly Axes Godot = new Axes(1,
+            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { -1, 0, 0 } });
         /// <summary>North, east, down; bodies forward, right, down.</summary>
-        public static readonly Axes Ned = new Axes(1, new double[,] { { 0, 1, 0 }, { 1, 0, 0 }, { 0, 0, -1 } },
+        public static readonly Axes Ned = new Axes(1,
+            new double[,] { { 0, 1, 0 }, { 1, 0, 0 }, { 0, 0, -1 } },
             new double[,] { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, -1 } });
 
         private readonly double _unit, _hand;
@@ -924,7 +1043,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>Axes of a convention of one's own.</summary>
         /// <param name="unit">Length in the engine of one metre.</param>
         /// <param name="world">Takes a direction in east, north, up to the engine's world axes.</param>
-        /// <param name="body">Takes one in forward, left, up to the engine's body axes; null: the same.</param>
+        /// <param name="body">Takes one in forward, left, up to the engine's body axes; null: the
+        /// same.</param>
         public Axes(double unit, double[,] world, double[,] body = null)
         {
             _unit = unit;
@@ -937,12 +1057,14 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         public Pose PoseToEnu(Pose pose)
         {
-            return new Pose(Back(pose.Position, 1 / _unit), Quaternions.Multiply(Quaternions.Inverse(_left), pose.Orientation, Quaternions.Inverse(_right)));
+            double[] left = Quaternions.Inverse(_left), right = Quaternions.Inverse(_right);
+            return new Pose(Back(pose.Position, 1 / _unit), Quaternions.Multiply(left, pose.Orientation, right));
         }
 
         public Pose PoseFromEnu(Pose pose)
         {
-            return new Pose(Forth(pose.Position, _unit), Quaternions.Multiply(_left, pose.Orientation, _right));
+            var turned = Quaternions.Multiply(_left, pose.Orientation, _right);
+            return new Pose(Forth(pose.Position, _unit), turned);
         }
 
         public Motion MotionToEnu(Motion motion)
@@ -957,25 +1079,32 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private double[] Forth(double[] v, double factor)
         {
-            return Enumerable.Range(0, 3).Select(i => factor * (_world[i, 0] * v[0] + _world[i, 1] * v[1] + _world[i, 2] * v[2]) + 0.0).ToArray();
+            return Enumerable.Range(0, 3)
+                .Select(i => factor * (_world[i, 0] * v[0] + _world[i, 1] * v[1] + _world[i, 2] * v[2]) + 0.0)
+                .ToArray();
         }
 
         private double[] Back(double[] v, double factor)
         {
-            return Enumerable.Range(0, 3).Select(i => factor * (_world[0, i] * v[0] + _world[1, i] * v[1] + _world[2, i] * v[2]) + 0.0).ToArray();
+            return Enumerable.Range(0, 3)
+                .Select(i => factor * (_world[0, i] * v[0] + _world[1, i] * v[1] + _world[2, i] * v[2]) + 0.0)
+                .ToArray();
         }
 
         private static double Determinant(double[,] m)
         {
-            return m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]) - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+            return m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+                - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
                 + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]);
         }
 
-        // The greatest of the four components is found from the diagonal, the others from it: no small divisor.
+        // The greatest of the four components is found from the diagonal, the others from it: no small
+        // divisor.
         private static double[] QuaternionOf(double[,] matrix, double hand)
         {
             Func<int, int, double> m = (i, j) => hand * matrix[i, j];
-            double[] squares = { 1 + m(0, 0) + m(1, 1) + m(2, 2), 1 + m(0, 0) - m(1, 1) - m(2, 2), 1 - m(0, 0) + m(1, 1) - m(2, 2), 1 - m(0, 0) - m(1, 1) + m(2, 2) };
+            double[] squares = { 1 + m(0, 0) + m(1, 1) + m(2, 2), 1 + m(0, 0) - m(1, 1) - m(2, 2),
+                1 - m(0, 0) + m(1, 1) - m(2, 2), 1 - m(0, 0) - m(1, 1) + m(2, 2) };
             double[][] rows =
             {
                 new[] { squares[0], m(2, 1) - m(1, 2), m(0, 2) - m(2, 0), m(1, 0) - m(0, 1) },
@@ -995,29 +1124,38 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             return new[]
             {
-                a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3], a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-                a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1], a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+                a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+                a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+                a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+                a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
             };
         }
 
-        public static double[] Multiply(double[] a, double[] b, double[] c) { return Multiply(Multiply(a, b), c); }
+        public static double[] Multiply(double[] a, double[] b, double[] c)
+        {
+            return Multiply(Multiply(a, b), c);
+        }
         public static double[] Inverse(double[] q) { return new[] { q[0], -q[1], -q[2], -q[3] }; }
 
-        /// <summary>Intrinsic z–y′–x″ [rad]: yaw counter-clockwise, then pitch, positive lowers the nose, then roll.</summary>
+        /// <summary>Intrinsic z–y′–x″ [rad]: yaw counter-clockwise, then pitch, positive lowers the nose,
+        /// then roll.</summary>
         public static double[] FromEuler(double yaw, double pitch = 0, double roll = 0)
         {
-            double cy = Math.Cos(yaw / 2), sy = Math.Sin(yaw / 2), cp = Math.Cos(pitch / 2), sp = Math.Sin(pitch / 2);
+            double cy = Math.Cos(yaw / 2), sy = Math.Sin(yaw / 2), cp = Math.Cos(pitch / 2),
+                sp = Math.Sin(pitch / 2);
             double cr = Math.Cos(roll / 2), sr = Math.Sin(roll / 2);
             return new[]
             {
-                cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr, cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr,
+                cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr,
+                cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr,
             };
         }
     }
 
     // --- Scenery -------------------------------------------------------------------------------------------
 
-    /// <summary>A mesh of the static scenery: vertices [m] in world axes, corners of triangles counter-clockwise from outside.</summary>
+    /// <summary>A mesh of the static scenery: vertices [m] in world axes, corners of triangles
+    /// counter-clockwise from outside.</summary>
     public sealed class SceneryMesh
     {
         public readonly string Name, Material;
@@ -1035,16 +1173,21 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
     {
         internal static readonly string[] Types =
         {
-            "asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete", "floorboard", "glass",
-            "marble", "metal", "plasterboard", "plywood", "vinyl_tile", "wood", "very_dry_ground", "medium_dry_ground", "wet_ground", "vacuum",
+            "asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete",
+            "floorboard", "glass", "marble", "metal", "plasterboard", "plywood", "vinyl_tile", "wood",
+            "very_dry_ground", "medium_dry_ground", "wet_ground", "vacuum",
         };
         public readonly string Name, Type;
         public readonly double Thickness;
 
         public Material(string name, string type, double thickness = 0.2)
         {
-            if (!Types.Contains(type)) throw new ArgumentException("material '" + name + "': no type is '" + type + "'; one of " + string.Join(", ", Types));
-            if (!(thickness > 0)) throw new ArgumentException("material '" + name + "': a thickness of " + thickness + " m; it has to be above 0");
+            if (!Types.Contains(type))
+                throw new ArgumentException("material '" + name + "': no type is '" + type + "'; one of "
+                    + string.Join(", ", Types));
+            if (!(thickness > 0))
+                throw new ArgumentException("material '" + name + "': a thickness of " + thickness
+                    + " m; it has to be above 0");
             Name = name; Type = type; Thickness = thickness;
         }
     }
@@ -1052,7 +1195,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
     /// <summary>Files that a world brings, made in memory.</summary>
     internal sealed class Assets
     {
-        private readonly SortedDictionary<string, byte[]> _files = new SortedDictionary<string, byte[]>(Comparer<string>.Create(Bytes.Compare));
+        private readonly SortedDictionary<string, byte[]> _files =
+            new SortedDictionary<string, byte[]>(Comparer<string>.Create(Bytes.Compare));
         private readonly Dictionary<string, string> _digests = new Dictionary<string, string>();
 
         public void Clear() { _files.Clear(); _digests.Clear(); }
@@ -1061,8 +1205,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         public string Offer(string name, byte[] data)
         {
-            if (name == "" || !Bytes.Utf8(name).All(c => c >= 32 && c != 127 && c != '\\') || name.Split('/').Any(s => s == "" || s == "." || s == ".."))
-                throw new ArgumentException("'" + name + "' is no name of an asset; write a relative path such as objects/car.ply");
+            if (!Schema.IsPath(name))
+                throw new ArgumentException("'" + name
+                    + "' is no name of an asset; write a relative path such as objects/car.ply");
             _files[name] = data;
             _digests[name] = Bytes.Sha256(data);
             return name;
@@ -1072,7 +1217,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             foreach (var triangle in triangles)
                 if (triangle.Length != 3 || triangle.Any(corner => corner < 0 || corner >= vertices.Count))
-                    throw new ArgumentException("mesh '" + name + "': the corners " + string.Join(", ", triangle) + " are not three of its " + vertices.Count + " vertices");
+                    throw new ArgumentException("mesh '" + name + "': the corners "
+                        + string.Join(", ", triangle) + " are not three of its " + vertices.Count
+                        + " vertices");
             var head = Bytes.Utf8("ply\nformat binary_little_endian 1.0\nelement vertex " + vertices.Count
                 + "\nproperty float x\nproperty float y\nproperty float z\nelement face " + triangles.Count
                 + "\nproperty list uchar int vertex_indices\nend_header\n");
@@ -1100,56 +1247,73 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             var low = Enumerable.Range(0, 3).Select(i => vertices.Min(v => v[i])).ToArray();
             var high = Enumerable.Range(0, 3).Select(i => vertices.Max(v => v[i])).ToArray();
-            return vertices.Select(v => Enumerable.Range(0, 3).Select(i => high[i] > low[i] ? (v[i] - low[i]) / (high[i] - low[i]) - 0.5 : 0.0).ToArray()).ToList();
+            Func<double[], int, double> fitted =
+                (v, i) => high[i] > low[i] ? (v[i] - low[i]) / (high[i] - low[i]) - 0.5 : 0.0;
+            return vertices.Select(v => Enumerable.Range(0, 3).Select(i => fitted(v, i)).ToArray()).ToList();
         }
 
-        public void OfferScenery(string name, IEnumerable<SceneryMesh> meshes, IEnumerable<Material> materials)
+        public void OfferScenery(string name, IEnumerable<SceneryMesh> meshes,
+            IEnumerable<Material> materials)
         {
             var xml = new StringBuilder("<scene version=\"2.1.0\">\n");
             var known = new HashSet<string>();
             foreach (var material in materials)
             {
-                if (!known.Add(material.Name)) throw new ArgumentException("material '" + material.Name + "' is there twice");
-                xml.Append("  <bsdf type=\"itu-radio-material\" id=\"mat-" + Escaped(material.Name) + "\">\n    <string name=\"type\" value=\"" + material.Type
-                    + "\"/>\n    <float name=\"thickness\" value=\"" + material.Thickness.ToString("R", CultureInfo.InvariantCulture) + "\"/>\n  </bsdf>\n");
+                if (!known.Add(material.Name))
+                    throw new ArgumentException("material '" + material.Name + "' is there twice");
+                xml.Append("  <bsdf type=\"itu-radio-material\" id=\"mat-" + Escaped(material.Name)
+                    + "\">\n    <string name=\"type\" value=\"" + material.Type
+                    + "\"/>\n    <float name=\"thickness\" value=\""
+                    + material.Thickness.ToString("R", CultureInfo.InvariantCulture)
+                    + "\"/>\n  </bsdf>\n");
             }
             var names = new HashSet<string>();
             foreach (var mesh in meshes)
             {
-                if (!names.Add(mesh.Name)) throw new ArgumentException("mesh '" + mesh.Name + "' is there twice");
-                if (!known.Contains(mesh.Material)) throw new ArgumentException("mesh '" + mesh.Name + "': no material is called '" + mesh.Material + "'");
+                if (!names.Add(mesh.Name))
+                    throw new ArgumentException("mesh '" + mesh.Name + "' is there twice");
+                if (!known.Contains(mesh.Material))
+                    throw new ArgumentException("mesh '" + mesh.Name + "': no material is called '"
+                        + mesh.Material + "'");
                 Offer("scenery/meshes/" + mesh.Name + ".ply", Ply(mesh.Name, mesh.Vertices, mesh.Triangles));
-                xml.Append("  <shape type=\"ply\" id=\"mesh-" + Escaped(mesh.Name) + "\">\n    <string name=\"filename\" value=\"meshes/" + Escaped(mesh.Name)
-                    + ".ply\"/>\n    <boolean name=\"face_normals\" value=\"true\"/>\n    <ref id=\"mat-" + Escaped(mesh.Material) + "\" name=\"bsdf\"/>\n  </shape>\n");
+                xml.Append("  <shape type=\"ply\" id=\"mesh-" + Escaped(mesh.Name)
+                    + "\">\n    <string name=\"filename\" value=\"meshes/" + Escaped(mesh.Name)
+                    + ".ply\"/>\n    <boolean name=\"face_normals\" value=\"true\"/>\n    <ref id=\"mat-"
+                    + Escaped(mesh.Material) + "\" name=\"bsdf\"/>\n  </shape>\n");
             }
             Offer("scenery/" + name + ".xml", Bytes.Utf8(xml.Append("</scene>\n").ToString()));
         }
 
         private static string Escaped(string text)
         {
-            return text.Replace("&", "&amp;").Replace("<", "&lt;").Replace(">", "&gt;").Replace("\"", "&quot;");
+            return text.Replace("&", "&amp;").Replace("<", "&lt;").Replace(">", "&gt;")
+                .Replace("\"", "&quot;");
         }
 
         public List<object> Entries()
         {
-            return _files.Select(file => (object)new Map { { "name", file.Key }, { "digest", _digests[file.Key] }, { "size", (long)file.Value.Length } }).ToList();
+            return _files.Select(file => (object)new Map { { "name", file.Key },
+                { "digest", _digests[file.Key] }, { "size", (long)file.Value.Length } }).ToList();
         }
 
         public string Geometry()
         {
-            return _files.Count == 0 ? "" : Bytes.Sha256(Bytes.Utf8(string.Concat(_files.Keys.Select(name => name + "\0" + _digests[name] + "\0"))));
+            var chain = string.Concat(_files.Keys.Select(name => name + "\0" + _digests[name] + "\0"));
+            return chain == "" ? "" : Bytes.Sha256(Bytes.Utf8(chain));
         }
 
         /// <summary>The file of a digest, or null.</summary>
         public byte[] Find(string digest)
         {
-            return _files.Where(file => _digests[file.Key] == digest).Select(file => file.Value).FirstOrDefault();
+            return _files.Where(file => _digests[file.Key] == digest).Select(file => file.Value)
+                .FirstOrDefault();
         }
     }
 
     // --- The scene of an instant ---------------------------------------------------------------------------
 
-    /// <summary>An object of a frame: pose and velocity of the middle of its box, in east, north, up and metres.</summary>
+    /// <summary>An object of a frame: pose and velocity of the middle of its box, in east, north, up and
+    /// metres.</summary>
     public sealed class WorldObject
     {
         public string Name, Class, Mesh = "";
@@ -1163,7 +1327,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         }
     }
 
-    /// <summary>Makes the product of a frame from its objects, and mounts the scenario's devices on them.</summary>
+    /// <summary>Makes the product of a frame from its objects, and mounts the scenario's devices on
+    /// them.</summary>
     public sealed class SceneBuilder
     {
         private const double LightSpeed = 299792458;
@@ -1181,16 +1346,22 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>Objects of the last frame, those that came first in front.</summary>
         public IList<string> Arrived { get { return _arrived; } set { _arrived = value.ToList(); } }
 
-        public IEnumerable<string> FixedNames { get { return _specs.Where(spec => spec.Text("on") == "").Select(spec => spec.Text("name")); } }
+        public IEnumerable<string> FixedNames
+        {
+            get { return _specs.Where(spec => spec.Text("on") == "").Select(spec => spec.Text("name")); }
+        }
 
-        /// <summary>The scene of a frame; raises ArgumentException where an object is not what a scene may hold.</summary>
+        /// <summary>The scene of a frame; raises ArgumentException where an object is not what a scene may
+        /// hold.</summary>
         public Product Build(IEnumerable<WorldObject> objects)
         {
             var given = objects.ToList();
             foreach (var item in given) Check(item);
             var there = given.OrderBy(item => item.Name, Comparer<string>.Create(Bytes.Compare)).ToList();
             for (int i = 1; i < there.Count; i++)
-                if (there[i].Name == there[i - 1].Name) throw new ArgumentException("object '" + there[i].Name + "' is in the frame twice; give each a name of its own");
+                if (there[i].Name == there[i - 1].Name)
+                    throw new ArgumentException("object '" + there[i].Name
+                        + "' is in the frame twice; give each a name of its own");
             var scene = new Map
             {
                 { "names", there.Select(item => (object)item.Name).ToList() },
@@ -1203,59 +1374,76 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 { "devices", Devices(given) },
             };
             if (there.Any(item => item.AngularVelocity != null))
-                scene["angular_velocity"] = NdArray.Rows(3, there.Select(item => item.AngularVelocity ?? new double[3]).ToList());
+                scene["angular_velocity"] = NdArray.Rows(3,
+                    there.Select(item => item.AngularVelocity ?? new double[3]).ToList());
             return Codec.EncodePayload("scene", scene);
         }
 
         private void Check(WorldObject item)
         {
-            if (string.IsNullOrEmpty(item.Name) || !Schema.IsPrintable(item.Name)) throw new ArgumentException("an object is called '" + item.Name + "'; a name has printable characters");
+            if (string.IsNullOrEmpty(item.Name) || !Schema.IsPrintable(item.Name))
+                throw new ArgumentException("an object is called '" + item.Name
+                    + "'; a name has printable characters");
             string who = "object '" + item.Name + "': ";
-            if (Prefixes.Count > 0 && !Prefixes.Any(prefix => item.Name.StartsWith(prefix, StringComparison.Ordinal)))
-                throw new ArgumentException(who + "no prefix of READY begins its name (" + string.Join(", ", Prefixes) + "); add one in Prepare");
+            if (Prefixes.Count > 0 && !Prefixes.Any(prefix =>
+                item.Name.StartsWith(prefix, StringComparison.Ordinal)))
+                throw new ArgumentException(who + "no prefix of READY begins its name ("
+                    + string.Join(", ", Prefixes) + "); add one in Prepare");
             Numbers(who + "position", item.Position, 3, 1e9);
             Numbers(who + "orientation", item.Orientation, 4, 2);
             double norm = Math.Sqrt(item.Orientation.Sum(part => part * part));
-            if (Math.Abs(norm - 1) > 0.001) throw new ArgumentException(who + "the quaternion has the norm " + norm + "; normalise it");
+            if (Math.Abs(norm - 1) > 0.001)
+                throw new ArgumentException(who + "the quaternion has the norm " + norm + "; normalise it");
             Numbers(who + "velocity", item.Velocity, 3, LightSpeed);
             Numbers(who + "dimensions", item.Dimensions, 3, 1e5);
-            if (item.Dimensions.Any(side => side <= 0)) throw new ArgumentException(who + "dimensions are " + string.Join(", ", item.Dimensions) + "; each has to be above 0 m");
+            if (item.Dimensions.Any(side => side <= 0))
+                throw new ArgumentException(who + "dimensions are " + string.Join(", ", item.Dimensions)
+                    + "; each has to be above 0 m");
             if (item.AngularVelocity != null) Numbers(who + "angular velocity", item.AngularVelocity, 3, 1e9);
-            if (item.Mesh != "" && HasMesh != null && !HasMesh(item.Mesh)) throw new ArgumentException(who + "the mesh '" + item.Mesh + "' was not offered; call OfferMesh in Prepare");
+            if (item.Mesh != "" && HasMesh != null && !HasMesh(item.Mesh))
+                throw new ArgumentException(who + "the mesh '" + item.Mesh
+                    + "' was not offered; call OfferMesh in Prepare");
         }
 
         private static void Numbers(string what, double[] values, int count, double most)
         {
             if (values == null || values.Length != count || values.Any(value => !(Math.Abs(value) <= most)))
-                throw new ArgumentException(what + " is " + (values == null ? "null" : string.Join(", ", values)) + "; it needs " + count + " numbers within ±" + most);
+                throw new ArgumentException(what + " is " + (values == null ? "null"
+                    : string.Join(", ", values)) + "; it needs " + count + " numbers within ±" + most);
         }
 
         private List<object> Devices(List<WorldObject> given)
         {
             var there = given.ToDictionary(item => item.Name);
             var known = new HashSet<string>(_arrived);
-            _arrived = _arrived.Where(there.ContainsKey).Concat(given.Select(item => item.Name).Where(name => !known.Contains(name))).ToList();
+            _arrived = _arrived.Where(there.ContainsKey).Concat(given.Select(item => item.Name)
+                .Where(name => !known.Contains(name))).ToList();
             var found = new List<Map>();
             foreach (var spec in _specs)
                 if (spec.Text("on") == "") found.Add(Device(spec, null));
-                else found.AddRange(_arrived.Where(name => Matches(spec.Text("on"), name)).Take((int)spec.Whole("count")).Select(name => Device(spec, there[name])));
-            return found.OrderBy(device => device.Text("name"), Comparer<string>.Create(Bytes.Compare)).Cast<object>().ToList();
+                else found.AddRange(_arrived.Where(name => Matches(spec.Text("on"), name))
+                    .Take((int)spec.Whole("count")).Select(name => Device(spec, there[name])));
+            return found.OrderBy(device => device.Text("name"), Comparer<string>.Create(Bytes.Compare))
+                .Cast<object>().ToList();
         }
 
         private static double Radians(double degrees) { return degrees * (Math.PI / 180); }
 
         private static Map Device(Map spec, WorldObject parent)
         {
-            var turned = Quaternions.FromEuler(Radians(spec.Number("yaw_deg")), Radians(spec.Number("pitch_deg")), Radians(spec.Number("roll_deg")));
+            var turned = Quaternions.FromEuler(Radians(spec.Number("yaw_deg")),
+                Radians(spec.Number("pitch_deg")), Radians(spec.Number("roll_deg")));
             var position = spec.Numbers("position_m");
             var made = new Map { { "type", spec.Text("kind") }, { "name", spec.Text("name") } };
             if (parent != null)
             {
                 made["name"] = parent.Name + "/" + spec.Text("name");
                 made["parent"] = parent.Name;
-                position[2] += spec.Text("mount") == "roof" ? parent.Dimensions[2] / 2 : spec.Text("mount") == "floor" ? -parent.Dimensions[2] / 2 : 0;
+                position[2] += spec.Text("mount") == "roof" ? parent.Dimensions[2] / 2
+                    : spec.Text("mount") == "floor" ? -parent.Dimensions[2] / 2 : 0;
                 object keeps;
-                if (spec.TryGetValue("keeps_heading", out keeps) && (bool)keeps) turned = Quaternions.Multiply(Quaternions.Inverse(parent.Orientation), turned);
+                if (spec.TryGetValue("keeps_heading", out keeps) && (bool)keeps)
+                    turned = Quaternions.Multiply(Quaternions.Inverse(parent.Orientation), turned);
             }
             made["position"] = position;
             made["orientation"] = turned;
@@ -1289,20 +1477,29 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             var array = new Map();
             foreach (var pair in given) array[pair.Key] = pair.Value;
             // A path on the broker's machine here, the name of an asset in a scene.
-            if (given.Text("pattern_file") != "") array["pattern_file"] = "patterns/" + given.Text("pattern_file").Split('/').Last();
+            if (given.Text("pattern_file") != "")
+                array["pattern_file"] = "patterns/" + given.Text("pattern_file").Split('/').Last();
             return array;
         }
 
-        /// <summary>Whether a name matches <c>on</c> of a device: the name itself, or a pattern with * ? [abc] [!abc].</summary>
-        public static bool Matches(string pattern, string name) { return pattern == name || Matches(pattern, 0, name, 0); }
+        /// <summary>Whether a name matches <c>on</c> of a device: the name itself, or a pattern with * ?
+        /// [abc] [!abc].</summary>
+        public static bool Matches(string pattern, string name)
+        {
+            return pattern == name || Matches(pattern, 0, name, 0);
+        }
 
         private static bool Matches(string pattern, int p, string name, int n)
         {
             for (; p < pattern.Length; p++, n++)
             {
-                if (pattern[p] == '*') return Enumerable.Range(n, name.Length - n + 1).Any(from => Matches(pattern, p + 1, name, from));
+                if (pattern[p] == '*')
+                    return Enumerable.Range(n, name.Length - n + 1)
+                        .Any(from => Matches(pattern, p + 1, name, from));
                 if (n >= name.Length) return false;
-                int close = pattern[p] == '[' ? pattern.IndexOf(']', Math.Min(pattern.Length, p + (p + 1 < pattern.Length && pattern[p + 1] == '!' ? 3 : 2))) : -1;
+                int close = pattern[p] == '[' ? pattern.IndexOf(']',
+                    Math.Min(pattern.Length, p + (p + 1 < pattern.Length && pattern[p + 1] == '!' ? 3 : 2)))
+                    : -1;
                 if (close >= 0)
                 {
                     if (!InSet(pattern.Substring(p + 1, close - p - 1), name[n])) return false;
@@ -1317,7 +1514,11 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             bool inverted = set[0] == '!', found = false;
             for (int i = inverted ? 1 : 0; i < set.Length; i++)
-                if (i + 2 < set.Length && set[i + 1] == '-') { found |= set[i] <= character && character <= set[i + 2]; i += 2; }
+                if (i + 2 < set.Length && set[i + 1] == '-')
+                {
+                    found |= set[i] <= character && character <= set[i + 2];
+                    i += 2;
+                }
                 else found |= set[i] == character;
             return found != inverted;
         }
@@ -1330,7 +1531,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
     {
         /// <summary><c>beam</c>, <c>waypoint</c>, <c>velocity</c> or <c>schedule</c>.</summary>
         public string Type;
-        /// <summary>Object of a waypoint or velocity; its position [m] and greatest speed [m/s], or velocity [m/s].</summary>
+        /// <summary>Object of a waypoint or velocity; its position [m] and greatest speed [m/s], or velocity
+        /// [m/s].</summary>
         public string Object = "";
         public double[] Position, Velocity;
         public double Speed;
@@ -1344,11 +1546,14 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             return action.List("commands").Cast<Map>().Select(map => new Command
             {
-                Type = map.Text("type"), Object = map.Text("object"), Tx = map.Text("tx"), Rx = map.Text("rx"), Carrier = map.Text("carrier"),
+                Type = map.Text("type"), Object = map.Text("object"), Tx = map.Text("tx"),
+                Rx = map.Text("rx"), Carrier = map.Text("carrier"),
                 Position = map.ContainsKey("position") ? map.Numbers("position") : null,
                 Velocity = map.ContainsKey("velocity") ? map.Numbers("velocity") : null,
-                Speed = map.ContainsKey("speed") ? map.Number("speed") : 0, AtOnce = map.ContainsKey("at_once") && map.Flag("at_once"),
-                TxBeam = map.ContainsKey("tx_beam") ? map.Whole("tx_beam") : 0, RxBeam = map.ContainsKey("rx_beam") ? map.Whole("rx_beam") : 0,
+                Speed = map.ContainsKey("speed") ? map.Number("speed") : 0,
+                AtOnce = map.ContainsKey("at_once") && map.Flag("at_once"),
+                TxBeam = map.ContainsKey("tx_beam") ? map.Whole("tx_beam") : 0,
+                RxBeam = map.ContainsKey("rx_beam") ? map.Whole("rx_beam") : 0,
             }).ToList();
         }
     }
@@ -1365,19 +1570,24 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public static List<LinkUser> All(Map link)
         {
             Func<string, double[]> numbers = name => link.Array(name).ToDoubles();
-            double[] path = numbers("has_path"), los = numbers("los"), y = numbers("abs_y"), snr = numbers("snr");
-            double[] efficiency = numbers("spectral_efficiency"), rate = numbers("bit_rate"), reward = numbers("reward");
+            double[] path = numbers("has_path"), los = numbers("los"), y = numbers("abs_y"),
+                snr = numbers("snr");
+            double[] efficiency = numbers("spectral_efficiency"), rate = numbers("bit_rate"),
+                reward = numbers("reward");
             long[] txBeam = link.Array("tx_beam").ToLongs(), rxBeam = link.Array("rx_beam").ToLongs();
             string[] tx = link.Texts("tx"), rx = link.Texts("rx"), carrier = link.Texts("carrier");
             return tx.Select((_, i) => new LinkUser
             {
-                Tx = tx[i], Rx = rx[i], Carrier = carrier[i], HasPath = path[i] != 0, Los = los[i] != 0, TxBeam = txBeam[i], RxBeam = rxBeam[i],
-                AbsY = y[i], Snr = snr[i], SpectralEfficiency = efficiency[i], BitRate = rate[i], Reward = reward[i],
+                Tx = tx[i], Rx = rx[i], Carrier = carrier[i], HasPath = path[i] != 0, Los = los[i] != 0,
+                TxBeam = txBeam[i], RxBeam = rxBeam[i],
+                AbsY = y[i], Snr = snr[i], SpectralEfficiency = efficiency[i], BitRate = rate[i],
+                Reward = reward[i],
             }).ToList();
         }
     }
 
-    /// <summary>One path of a channel: delay [s], directions (zenith, azimuth) [rad], and per carrier its amplitude and Doppler shift [Hz].</summary>
+    /// <summary>One path of a channel: delay [s], directions (zenith, azimuth) [rad], and per carrier its
+    /// amplitude and Doppler shift [Hz].</summary>
     public sealed class ChannelPath
     {
         public string Tx, Rx;
@@ -1385,18 +1595,24 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public double[] Aod, Aoa;
         /// <summary>For each carrier the real part, the imaginary part and the Doppler shift.</summary>
         public double[] Real, Imaginary, Doppler;
-        /// <summary>1 reflection, 2 diffraction, 3 scattering, 4 transmission, from TX to RX; and where [m].</summary>
+        /// <summary>1 reflection, 2 diffraction, 3 scattering, 4 transmission, from TX to RX; and where
+        /// [m].</summary>
         public long[] Interactions;
         public double[][] Points;
 
-        /// <summary>The paths of a decoded product of <c>channel</c>, pair by pair; matrices are in the Map.</summary>
+        /// <summary>The paths of a decoded product of <c>channel</c>, pair by pair; matrices are in the
+        /// Map.</summary>
         public static List<ChannelPath> All(Map channel)
         {
             string[] tx = channel.Texts("tx"), rx = channel.Texts("rx");
-            long[] offsets = channel.Array("offsets").ToLongs(), kinds = channel.Array("interactions").ToLongs();
-            double[] a = channel.Array("a").ToDoubles(), tau = channel.Array("tau").ToDoubles(), doppler = channel.Array("doppler").ToDoubles();
-            double[] aod = channel.Array("aod").ToDoubles(), aoa = channel.Array("aoa").ToDoubles(), points = channel.Array("points").ToDoubles();
-            int paths = tau.Length, carriers = channel.List("carriers").Count, depth = channel.Array("interactions").Shape[1];
+            long[] offsets = channel.Array("offsets").ToLongs(),
+                kinds = channel.Array("interactions").ToLongs();
+            double[] a = channel.Array("a").ToDoubles(), tau = channel.Array("tau").ToDoubles(),
+                doppler = channel.Array("doppler").ToDoubles();
+            double[] aod = channel.Array("aod").ToDoubles(), aoa = channel.Array("aoa").ToDoubles(),
+                points = channel.Array("points").ToDoubles();
+            int paths = tau.Length, carriers = channel.List("carriers").Count,
+                depth = channel.Array("interactions").Shape[1];
             var found = new List<ChannelPath>();
             for (int pair = 0; pair < tx.Length * rx.Length; pair++)
                 for (int p = (int)offsets[pair]; p < offsets[pair + 1]; p++)
@@ -1406,12 +1622,16 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     found.Add(new ChannelPath
                     {
                         Tx = tx[pair / rx.Length], Rx = rx[pair % rx.Length], Tau = tau[path],
-                        Aod = new[] { aod[2 * path], aod[2 * path + 1] }, Aoa = new[] { aoa[2 * path], aoa[2 * path + 1] },
+                        Aod = new[] { aod[2 * path], aod[2 * path + 1] },
+                        Aoa = new[] { aoa[2 * path], aoa[2 * path + 1] },
                         Real = Enumerable.Range(0, carriers).Select(c => a[2 * (c * paths + path)]).ToArray(),
-                        Imaginary = Enumerable.Range(0, carriers).Select(c => a[2 * (c * paths + path) + 1]).ToArray(),
-                        Doppler = Enumerable.Range(0, carriers).Select(c => doppler[c * paths + path]).ToArray(),
+                        Imaginary = Enumerable.Range(0, carriers)
+                            .Select(c => a[2 * (c * paths + path) + 1]).ToArray(),
+                        Doppler = Enumerable.Range(0, carriers)
+                            .Select(c => doppler[c * paths + path]).ToArray(),
                         Interactions = met.Select(i => kinds[i]).ToArray(),
-                        Points = met.Select(i => new[] { points[3 * i], points[3 * i + 1], points[3 * i + 2] }).ToArray(),
+                        Points = met.Select(i => new[] { points[3 * i], points[3 * i + 1],
+                            points[3 * i + 2] }).ToArray(),
                     });
                 }
             return found;
@@ -1437,7 +1657,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             _arrived = arrived;
             _sender = new Thread(Send) { IsBackground = true, Name = "caviar-send" };
-            new Thread(() => Live(endpoint, token, patience)) { IsBackground = true, Name = "caviar-receive" }.Start();
+            new Thread(() => Live(endpoint, token, patience)) { IsBackground = true,
+                Name = "caviar-receive" }.Start();
         }
 
         /// <summary>Why the connection ended.</summary>
@@ -1453,7 +1674,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         public void Close()
         {
             _outbox.CompleteAdding();
-            if (_sender.ThreadState != ThreadState.Unstarted && !_sender.ThreadState.HasFlag(ThreadState.Unstarted)) _sender.Join(ClosingMs);
+            if (_sender.ThreadState != ThreadState.Unstarted
+            && !_sender.ThreadState.HasFlag(ThreadState.Unstarted))
+                _sender.Join(ClosingMs);
             Abort();
         }
 
@@ -1490,7 +1713,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             {
                 _socket = new ClientWebSocket();
                 _socket.Options.KeepAliveInterval = Timeout.InfiniteTimeSpan;
-                if (!string.IsNullOrEmpty(token)) _socket.Options.SetRequestHeader("Authorization", "Bearer " + token);
+                if (!string.IsNullOrEmpty(token))
+                    _socket.Options.SetRequestHeader("Authorization", "Bearer " + token);
                 try
                 {
                     _socket.ConnectAsync(endpoint, _abort.Token).GetAwaiter().GetResult();
@@ -1499,7 +1723,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 catch (Exception problem)
                 {
                     _socket.Dispose();
-                    if (_abort.IsCancellationRequested || DateTime.UtcNow > until) throw new IOException("cannot reach " + endpoint + ": " + problem.GetBaseException().Message);
+                    if (_abort.IsCancellationRequested || DateTime.UtcNow > until)
+                        throw new IOException("cannot reach " + endpoint + ": "
+                            + problem.GetBaseException().Message);
                     _abort.Token.WaitHandle.WaitOne(RetryMs);
                 }
             }
@@ -1514,7 +1740,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 var got = _socket.ReceiveAsync(piece, _abort.Token).GetAwaiter().GetResult();
                 if (got.MessageType == WebSocketMessageType.Close)
                 {
-                    Problem = "the gateway closed the connection, code " + (int)(got.CloseStatus ?? 0) + " " + got.CloseStatusDescription;
+                    Problem = "the gateway closed the connection, code " + (int)(got.CloseStatus ?? 0) + " "
+                        + got.CloseStatusDescription;
                     return;
                 }
                 message.Write(piece.Array, 0, got.Count);
@@ -1530,8 +1757,10 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             try
             {
                 foreach (var frame in _outbox.GetConsumingEnumerable())
-                    _socket.SendAsync(new ArraySegment<byte>(frame), WebSocketMessageType.Binary, true, _abort.Token).GetAwaiter().GetResult();
-                _socket.CloseOutputAsync(WebSocketCloseStatus.NormalClosure, "", _abort.Token).GetAwaiter().GetResult();
+                    _socket.SendAsync(new ArraySegment<byte>(frame), WebSocketMessageType.Binary, true,
+                        _abort.Token).GetAwaiter().GetResult();
+                _socket.CloseOutputAsync(WebSocketCloseStatus.NormalClosure, "",
+                    _abort.Token).GetAwaiter().GetResult();
             }
             catch (Exception problem)
             {
@@ -1553,7 +1782,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         public Heart(Uri endpoint, string token, Map welcome, string name)
         {
-            _thread = new Thread(() => Beat(endpoint, token, welcome, name)) { IsBackground = true, Name = "caviar-heart" };
+            _thread = new Thread(() => Beat(endpoint, token, welcome, name)) { IsBackground = true,
+            Name = "caviar-heart" };
             _thread.Start();
         }
 
@@ -1570,7 +1800,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             int period = (int)Math.Max(1, welcome.Whole("heartbeat_ns") / 1000000);
             var liveness = TimeSpan.FromMilliseconds(welcome.Whole("liveness_ns") / 1e6);
             var wire = new Wire(endpoint, token, liveness.TotalSeconds, new AutoResetEvent(false));
-            wire.Send(Codec.Join(Codec.EncodeMessage("ATTACH", new Map { { "epoch", welcome["epoch"] }, { "attempt", welcome["attempt"] }, { "name", name } })));
+            wire.Send(Codec.Join(Codec.EncodeMessage("ATTACH",
+                new Map { { "epoch", welcome["epoch"] }, { "attempt", welcome["attempt"] },
+                { "name", name } })));
             var heard = DateTime.UtcNow;
             for (long sequence = 0; Lost == ""; sequence++)
             {
@@ -1583,8 +1815,12 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     if (refusal != "") Lost = refusal;
                 }
                 if (wire.Over) Lost = "the heartbeat connection is lost: " + wire.Problem;
-                else if (DateTime.UtcNow - heard > liveness) Lost = "the broker is silent, for " + liveness.TotalSeconds.ToString(CultureInfo.InvariantCulture) + " s";
-                else wire.Send(Codec.Join(Codec.EncodeMessage("HEARTBEAT", new Map { { "sequence", sequence }, { "progress", Interlocked.Read(ref _progress) }, { "phase", Phase } })));
+                else if (DateTime.UtcNow - heard > liveness)
+                    Lost = "the broker is silent, for " + liveness.TotalSeconds.ToString(
+                        CultureInfo.InvariantCulture) + " s";
+                else wire.Send(Codec.Join(Codec.EncodeMessage("HEARTBEAT",
+                    new Map { { "sequence", sequence }, { "progress", Interlocked.Read(ref _progress) },
+                    { "phase", Phase } })));
             }
             if (Lost == "") wire.Close();
             else wire.Abort();
@@ -1595,7 +1831,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             try
             {
                 var message = Codec.DecodeMessage(Codec.Split(frame)[0]);
-                return message.Text("type") == "ERROR" || message.Text("type") == "REFUSE" ? message.Text("code") + ": " + message.Text("message") : "";
+                return message.Text("type") == "ERROR" || message.Text("type") == "REFUSE"
+                    ? message.Text("code") + ": " + message.Text("message") : "";
             }
             catch (ProtocolException) { return ""; } // noise: the next heartbeat asks again
         }
@@ -1612,7 +1849,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private const int DigestedBytes = 16 << 10;
         private readonly AutoResetEvent _arrived = new AutoResetEvent(false);
         private readonly Assets _assets = new Assets();
-        private readonly Queue<KeyValuePair<Map, List<byte[]>>> _grants = new Queue<KeyValuePair<Map, List<byte[]>>>();
+        private readonly Queue<KeyValuePair<Map, List<byte[]>>> _grants = new Queue<KeyValuePair<Map,
+            List<byte[]>>>();
         private readonly Dictionary<long, byte[]> _answers = new Dictionary<long, byte[]>();
         private readonly Dictionary<string, List<Map>> _products = new Dictionary<string, List<Map>>();
         private Uri _endpoint;
@@ -1626,19 +1864,22 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private long _rejoinNs, _epoch, _attempt, _episode, _t0, _previous, _newest;
         private bool _stepped;
 
-        /// <summary>A topic that the world wants to see: <c>action</c>, <c>link</c>, <c>channel</c>, …</summary>
+        /// <summary>A topic that the world wants to see: <c>action</c>, <c>link</c>, <c>channel</c>,
+        /// …</summary>
         protected struct Input
         {
             public string Topic;
             public string[] Parts;
         }
 
-        // --- what a world overrides -------------------------------------------------------------------------
+        // --- what a world overrides ------------------------------------------------------------------------
 
-        /// <summary>Load, offer meshes and scenery, and add to Prefixes; Settings and Scenario are there.</summary>
+        /// <summary>Load, offer meshes and scenery, and add to Prefixes; Settings and Scenario are
+        /// there.</summary>
         protected virtual void Prepare() { }
 
-        /// <summary>Go to the first state. Everything random follows from the seed, SeedEpisode and the frame.</summary>
+        /// <summary>Go to the first state. Everything random follows from the seed, SeedEpisode and the
+        /// frame.</summary>
         /// <param name="t0">Time of frame 0 in the run [s]; Step counts from it.</param>
         protected virtual void Reset(long seed, double t0) { }
 
@@ -1648,19 +1889,21 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <param name="commands">Of agents in the frame before, where Listen("action") was called.</param>
         protected abstract IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands);
 
-        /// <summary>The state after the last frame; empty where frames follow from time, seed and settings alone.</summary>
+        /// <summary>The state after the last frame; empty where frames follow from time, seed and settings
+        /// alone.</summary>
         protected virtual byte[] Save() { return new byte[0]; }
 
         /// <summary>Take over what Save returned.</summary>
         protected virtual void Restore(byte[] state) { }
 
-        // --- what a world may use ---------------------------------------------------------------------------
+        // --- what a world may use --------------------------------------------------------------------------
 
         public string Name { get; private set; }
         /// <summary>Of the world, from the scenario; and what concerns all services.</summary>
         public Map Settings { get; private set; }
         public Map Scenario { get; private set; }
-        /// <summary>Prefixes of the names of objects; those of fixed devices are added by themselves.</summary>
+        /// <summary>Prefixes of the names of objects; those of fixed devices are added by
+        /// themselves.</summary>
         public readonly List<string> Prefixes = new List<string>();
         public long Frame { get; private set; }
         public long Episode { get { return _episode; } }
@@ -1677,21 +1920,32 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private readonly List<Input> _inputs = new List<Input>();
 
-        /// <summary>Ask for a topic, of the frame before, before Connect; the run does not wait for it.</summary>
-        public void Listen(string topic, params string[] parts) { _inputs.Add(new Input { Topic = topic, Parts = parts }); }
+        /// <summary>Ask for a topic, of the frame before, before Connect; the run does not wait for
+        /// it.</summary>
+        public void Listen(string topic, params string[] parts)
+        {
+            _inputs.Add(new Input { Topic = topic, Parts = parts });
+        }
 
         /// <summary>Decoded products of a topic in this frame, one for each source that has one.</summary>
-        public IList<Map> Products(string topic) { List<Map> found; return _products.TryGetValue(topic, out found) ? found : new List<Map>(); }
+        public IList<Map> Products(string topic)
+        {
+            List<Map> found;
+            return _products.TryGetValue(topic, out found) ? found : new List<Map>();
+        }
 
         /// <summary>Bring the mesh of objects; the name of its asset, for WorldObject.Mesh.</summary>
-        /// <param name="vertices">In body axes (x forward, y left, z up) and any unit: they are fitted into the unit box.</param>
+        /// <param name="vertices">In body axes (x forward, y left, z up) and any unit: they are fitted into
+        /// the unit box.</param>
         public string OfferMesh(string name, IList<double[]> vertices, IList<int[]> triangles)
         {
-            return _assets.Offer("objects/" + name + ".ply", Assets.Ply(name, Assets.InUnitBox(vertices), triangles));
+            return _assets.Offer("objects/" + name + ".ply",
+                Assets.Ply(name, Assets.InUnitBox(vertices), triangles));
         }
 
         /// <summary>Bring the static scenery: a mesh of a material each.</summary>
-        public void OfferScenery(IEnumerable<SceneryMesh> meshes, IEnumerable<Material> materials, string name = "world")
+        public void OfferScenery(IEnumerable<SceneryMesh> meshes, IEnumerable<Material> materials,
+            string name = "world")
         {
             _assets.OfferScenery(name, meshes, materials);
         }
@@ -1699,14 +1953,15 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>Bring any other file, such as <c>patterns/NAME.csv</c>.</summary>
         public string OfferFile(string name, byte[] data) { return _assets.Offer(name, data); }
 
-        // --- life -------------------------------------------------------------------------------------------
+        // --- life ------------------------------------------------------------------------------------------
 
         /// <summary>Begin to join the run; returns at once.</summary>
         /// <param name="endpoint"><c>ws://HOST:PORT/ws</c>, the gateway of <c>caviar run --http</c>.</param>
         /// <param name="token">Of the service, where the broker has tokens.</param>
         public void Connect(string endpoint, string name, string token = null)
         {
-            if (_state != State.Over) throw new InvalidOperationException("the world '" + Name + "' takes part in a run already");
+            if (_state != State.Over)
+                throw new InvalidOperationException("the world '" + Name + "' takes part in a run already");
             _endpoint = new Uri(endpoint);
             _token = token;
             Name = name;
@@ -1715,7 +1970,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             Join(Patience);
         }
 
-        /// <summary>Handle what came, at most one frame; false once the world has left. Never waits.</summary>
+        /// <summary>Handle what came, at most one frame; false once the world has left. Never
+        /// waits.</summary>
         public bool Poll()
         {
             if (_state == State.Over) return false;
@@ -1725,7 +1981,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 return true;
             }
             byte[] frame;
-            while (_state != State.Over && _wire != null && _grants.Count == 0 && _wire.TryReceive(out frame)) Receive(frame);
+            while (_state != State.Over && _wire != null && _grants.Count == 0 && _wire.TryReceive(out frame))
+                Receive(frame);
             if (_state == State.Over || _wire == null) return _state != State.Over;
             if (_grants.Count > 0) Answer();
             else if (_wire.Over) Lose(_wire.Problem);
@@ -1734,7 +1991,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return _state != State.Over;
         }
 
-        /// <summary>Poll until the world has left, for programs without a loop of their own; the exit status.</summary>
+        /// <summary>Poll until the world has left, for programs without a loop of their own; the exit
+        /// status.</summary>
         public int Run(string endpoint, string name, string token = null)
         {
             Connect(endpoint, name, token);
@@ -1747,7 +2005,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return ExitStatus;
         }
 
-        /// <summary>Leave the run: call it where the engine closes. The run may wait for the world to come back.</summary>
+        /// <summary>Leave the run: call it where the engine closes. The run may wait for the world to come
+        /// back.</summary>
         public void Close() { if (_state != State.Over) Leave(0, "closed"); }
 
         private void Join(double patience)
@@ -1758,24 +2017,32 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _wire = new Wire(_endpoint, _token, patience, _arrived);
             var inputs = _inputs.Select(input => (object)new Map
             {
-                { "topic", input.Topic }, { "lag", 1L }, { "required", false }, { "parts", input.Parts.Cast<object>().ToList() },
+                { "topic", input.Topic }, { "lag", 1L }, { "required", false },
+                { "parts", input.Parts.Cast<object>().ToList() },
             }).ToList();
             Send("HELLO", new Map
             {
-                { "version", new List<object> { 1L, 5L } }, { "name", Name }, { "role", "world" }, { "inputs", inputs },
-                { "outputs", new List<object> { "scene" } }, { "capabilities", new List<object> { "assets", "episodes", "checkpoint" } },
+                { "version", new List<object> { 1L, 5L } }, { "name", Name }, { "role", "world" },
+                { "inputs", inputs },
+                { "outputs", new List<object> { "scene" } },
+                { "capabilities", new List<object> { "assets", "episodes", "checkpoint" } },
                 { "implementation", Implementation }, { "max_in_flight", 4L },
             });
         }
 
-        /// <summary>The connection or the broker is lost: come back within the time that WELCOME gave, or end.</summary>
+        /// <summary>The connection or the broker is lost: come back within the time that WELCOME gave, or
+        /// end.</summary>
         private void Lose(string why)
         {
             if (_state != State.Connecting) _rejoinUntil = DateTime.UtcNow.AddMilliseconds(_rejoinNs / 1e6);
             bool first = _epoch == 0;
             Disconnect();
             if (first || DateTime.UtcNow >= _rejoinUntil) { End(1, why); return; }
-            if (_state != State.Connecting) { Log(Name + ": " + why + "; trying to come back"); _pause = 0.1; }
+            if (_state != State.Connecting)
+            {
+                Log(Name + ": " + why + "; trying to come back");
+                _pause = 0.1;
+            }
             _state = State.Connecting;
             _pause = Math.Min(1, 2 * _pause);
             _retryAt = DateTime.UtcNow.AddSeconds(_pause);
@@ -1793,7 +2060,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             if (_heart != null) _heart.Stop();
             _heart = null;
-            if (_wire != null && _epoch > 0 && _state != State.Connecting) Send("BYE", With(new Map { { "reason", reason } }));
+            if (_wire != null && _epoch > 0 && _state != State.Connecting)
+                Send("BYE", With(new Map { { "reason", reason } }));
             if (_wire != null) _wire.Close();
             _wire = null;
             End(status, reason);
@@ -1808,7 +2076,10 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             Log(Name + ": " + reason);
         }
 
-        private void Send(string type, Map fields, params byte[][] parts) { _wire.Send(Framed(type, fields, parts)); }
+        private void Send(string type, Map fields, params byte[][] parts)
+        {
+            _wire.Send(Framed(type, fields, parts));
+        }
 
         private static byte[] Framed(string type, Map fields, params byte[][] parts)
         {
@@ -1817,14 +2088,23 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private void Error(string code, string message, string of = "", string subject = "")
         {
-            Send("ERROR", new Map { { "code", code }, { "message", message }, { "of", of }, { "subject", subject } });
+            Send("ERROR", new Map { { "code", code }, { "message", message }, { "of", of },
+                { "subject", subject } });
         }
 
-        private Map With(Map fields) { fields["epoch"] = _epoch; fields["attempt"] = _attempt; return fields; }
+        private Map With(Map fields)
+        {
+            fields["epoch"] = _epoch;
+            fields["attempt"] = _attempt;
+            return fields;
+        }
 
-        private bool IsMine(Map message) { return message.Whole("epoch") == _epoch && message.Whole("attempt") == _attempt; }
+        private bool IsMine(Map message)
+        {
+            return message.Whole("epoch") == _epoch && message.Whole("attempt") == _attempt;
+        }
 
-        // --- messages ---------------------------------------------------------------------------------------
+        // --- messages --------------------------------------------------------------------------------------
 
         private void Receive(byte[] frame)
         {
@@ -1844,9 +2124,18 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             }
             string type = message.Text("type");
             if (_heart != null) _heart.Progress();
-            if (type == "SHUTDOWN" && _state != State.Connecting) { Leave(0, message.Text("reason")); return; }
+            if (type == "SHUTDOWN" && _state != State.Connecting)
+            {
+                Leave(0, message.Text("reason"));
+                return;
+            }
             if (type == "REFUSE" && _state == State.Connecting) { Refused(message); return; }
-            if (type == "STALE" || type == "ERROR") { Log(Name + ": " + type + " " + message.Text("code") + message.Text("of") + " " + message.Text("message")); return; }
+            if (type == "STALE" || type == "ERROR")
+            {
+                Log(Name + ": " + type + " " + message.Text("code") + message.Text("of") + " "
+                    + message.Text("message"));
+                return;
+            }
             if (type == "CANCEL") return; // advice: the answer is due all the same
             if (type == "ASSET_GET" && _state > State.Joined) { Serve(message); return; }
             bool due = type == "WELCOME" ? _state == State.Connecting : IsDue(type, message);
@@ -1876,7 +2165,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 case "RESET": OnReset(message); break;
                 case "GRANT": _grants.Enqueue(new KeyValuePair<Map, List<byte[]>>(message, parts)); break;
                 case "EPISODE_END": _state = State.Ready; break;
-                case "CHECKPOINT": Send("CHECKPOINT_DONE", With(new Map { { "episode", _episode }, { "frame", message["frame"] } }), Saved()); break;
+                case "CHECKPOINT": Send("CHECKPOINT_DONE", With(new Map { { "episode", _episode },
+                    { "frame", message["frame"] } }), Saved()); break;
                 case "RESTORE": Restored(parts[1]); Send("READY", With(new Map())); break;
             }
         }
@@ -1899,7 +2189,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             Scenario = message.Child("scenario");
             object devices;
             Scenario.TryGetValue("devices", out devices);
-            _scene = new SceneBuilder(((List<object>)devices ?? new List<object>()).Cast<Map>()) { HasMesh = _assets.Has };
+            _scene = new SceneBuilder(((List<object>)devices ?? new List<object>())
+                .Cast<Map>()) { HasMesh = _assets.Has };
             _heart = new Heart(_endpoint, _token, message, Name);
             _state = State.Joined;
         }
@@ -1911,10 +2202,13 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _assets.Clear();
             Prefixes.Clear();
             Prepare();
-            foreach (var prefix in Prefixes.Concat(_scene.FixedNames).Distinct().OrderBy(text => text, Comparer<string>.Create(Bytes.Compare)))
+            foreach (var prefix in Prefixes.Concat(_scene.FixedNames).Distinct()
+                .OrderBy(text => text, Comparer<string>.Create(Bytes.Compare)))
                 _scene.Prefixes.Add(prefix);
-            if (_assets.Entries().Count > 0) Send("ASSET_OFFER", With(new Map { { "assets", _assets.Entries() } }));
-            Send("READY", With(new Map { { "geometry", _assets.Geometry() }, { "prefixes", _scene.Prefixes } }));
+            if (_assets.Entries().Count > 0)
+                Send("ASSET_OFFER", With(new Map { { "assets", _assets.Entries() } }));
+            Send("READY", With(new Map { { "geometry", _assets.Geometry() },
+                { "prefixes", _scene.Prefixes } }));
             _state = State.Ready;
         }
 
@@ -1922,10 +2216,16 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             byte[] data = _assets.Find(get.Text("digest"));
             long offset = get.Whole("offset");
-            if (data == null || offset > data.Length) { Error("unknown-asset", "no asset has this digest, or it ends before", "ASSET_GET", get.Text("digest")); return; }
+            if (data == null || offset > data.Length)
+            {
+                Error("unknown-asset", "no asset has this digest, or it ends before", "ASSET_GET",
+                    get.Text("digest"));
+                return;
+            }
             var piece = new byte[Math.Min(Codec.MaxAssetChunk, data.Length - offset)];
             Buffer.BlockCopy(data, (int)offset, piece, 0, piece.Length);
-            Send("ASSET_DATA", new Map { { "digest", get["digest"] }, { "offset", offset }, { "size", (long)data.Length } }, piece);
+            Send("ASSET_DATA", new Map { { "digest", get["digest"] }, { "offset", offset },
+                { "size", (long)data.Length } }, piece);
         }
 
         private void OnReset(Map message)
@@ -1944,7 +2244,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             Send("RESET_DONE", With(new Map { { "episode", _episode } }));
         }
 
-        // --- frames -----------------------------------------------------------------------------------------
+        // --- frames ----------------------------------------------------------------------------------------
 
         private void Answer()
         {
@@ -1953,7 +2253,12 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             long frame = grant.Whole("frame");
             if (!_answers.TryGetValue(frame, out answer))
             {
-                if (frame < _newest) { _grants.Dequeue(); Error("unexpected", "frame " + frame + " comes after frame " + _newest, "GRANT"); return; }
+                if (frame < _newest)
+                {
+                    _grants.Dequeue();
+                    Error("unexpected", "frame " + frame + " comes after frame " + _newest, "GRANT");
+                    return;
+                }
                 answer = Answered(grant, _grants.Peek().Value);
                 if (answer == null) return; // the world has not finished: the grant stays in front
                 _answers[frame] = answer;
@@ -1982,8 +2287,11 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 _previous = now;
                 _stepped = true;
                 var entry = new Map { { "topic", "scene" }, { "digest", product.Digest } };
-                var measured = new Map { { "step", watch.ElapsedTicks * (1000000000L / System.Diagnostics.Stopwatch.Frequency) } };
-                return Framed("DONE", With(new Map { { "episode", _episode }, { "frame", Frame }, { "products", new List<object> { entry } }, { "measured", measured } }), product.Header, product.Body);
+                var measured = new Map { { "step", watch.ElapsedTicks * (
+                    1000000000L / System.Diagnostics.Stopwatch.Frequency) } };
+                return Framed("DONE", With(new Map { { "episode", _episode }, { "frame", Frame },
+                    { "products", new List<object> { entry } }, { "measured", measured } }), product.Header,
+                    product.Body);
             }
             catch (Exception problem) { return FaultOf(Frame, phase, problem, culprit); }
         }
@@ -1992,14 +2300,17 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             _products.Clear();
             int at = 1;
-            foreach (var input in grant.List("inputs").Cast<Map>().Where(input => input.Text("status") != "absent"))
+            foreach (var input in grant.List("inputs").Cast<Map>()
+                .Where(input => input.Text("status") != "absent"))
             {
                 byte[] header = parts[at++], body = parts[at++];
-                string topic = input.Text("topic"), source = input.Text("source"), digest = input.Text("digest");
+                string topic = input.Text("topic"), source = input.Text("source"),
+                    digest = input.Text("digest");
                 try
                 {
                     var decoded = Codec.DecodePayload(topic, header, body);
-                    if (digest != "" && header.Length + body.Length <= DigestedBytes && Product.DigestOf(header, body) != digest)
+                    if (digest != "" && header.Length + body.Length <= DigestedBytes
+                        && Product.DigestOf(header, body) != digest)
                         throw ProtocolException.Malformed("the bytes do not have the digest of their DONE");
                     List<Map> list;
                     if (!_products.TryGetValue(topic, out list)) _products[topic] = list = new List<Map>();
@@ -2008,7 +2319,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 catch (ProtocolException problem)
                 {
                     culprit = source;
-                    throw new InvalidDataException(topic + " of " + source + " in frame " + Frame + ": " + problem.Message, problem);
+                    throw new InvalidDataException(topic + " of " + source + " in frame " + Frame + ": "
+                        + problem.Message, problem);
                 }
             }
         }
@@ -2023,18 +2335,20 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             Log(Name + ": " + phase + ": " + problem.Message);
             return Framed("FAULT", With(new Map
             {
-                { "episode", _episode }, { "frame", frame }, { "phase", phase }, { "message", problem.Message.Split('\n')[0] },
+                { "episode", _episode }, { "frame", frame }, { "phase", phase },
+                { "message", problem.Message.Split('\n')[0] },
                 { "detail", problem.ToString() }, { "culprit", culprit },
             }));
         }
 
-        // --- state that outlives the process ----------------------------------------------------------------
+        // --- state that outlives the process ---------------------------------------------------------------
 
         private byte[] Saved()
         {
             var head = MessagePack.Pack(new Map
             {
-                { "arrived", _scene.Arrived.Cast<object>().ToList() }, { "previous", _previous }, { "stepped", _stepped }, { "newest", _newest },
+                { "arrived", _scene.Arrived.Cast<object>().ToList() }, { "previous", _previous },
+                    { "stepped", _stepped }, { "newest", _newest },
             });
             var length = new byte[4];
             Bytes.PutWhole(length, 0, 4, head.Length);
@@ -2044,7 +2358,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private void Restored(byte[] state)
         {
             int at = StateMark.Length + 4;
-            if (state.Length < at || !state.Take(StateMark.Length).SequenceEqual(StateMark)) throw new InvalidDataException("this is no state of a world of this library");
+            if (state.Length < at || !state.Take(StateMark.Length).SequenceEqual(StateMark))
+                throw new InvalidDataException("this is no state of a world of this library");
             long length = Bytes.Whole(state, StateMark.Length, 4);
             if (length > state.Length - at) throw new InvalidDataException("the state ends too early");
             var head = (Map)MessagePack.Unpack(state.Skip(at).Take((int)length).ToArray());
@@ -2056,7 +2371,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         }
     }
 
-    /// <summary>SIGTERM, where the runtime lets a program see it: .NET by itself, Mono with Mono.Posix.</summary>
+    /// <summary>SIGTERM, where the runtime lets a program see it: .NET by itself, Mono with
+    /// Mono.Posix.</summary>
     internal sealed class Termination
     {
         private volatile bool _set;
@@ -2071,15 +2387,19 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             var found = new Termination();
             try
             {
-                var posix = Assembly.Load("Mono.Posix, Version=4.0.0.0, Culture=neutral, PublicKeyToken=0738eb9f132ed756");
+                var posix = Assembly.Load(
+                    "Mono.Posix, Version=4.0.0.0, Culture=neutral, PublicKeyToken=0738eb9f132ed756");
                 var type = posix.GetType("Mono.Unix.UnixSignal");
                 found._isSet = type.GetProperty("IsSet");
-                found._signal = (WaitHandle)Activator.CreateInstance(type, Enum.ToObject(posix.GetType("Mono.Unix.Native.Signum"), 15));
+                found._signal = (WaitHandle)Activator.CreateInstance(type,
+                    Enum.ToObject(posix.GetType("Mono.Unix.Native.Signum"), 15));
             }
             catch (Exception problem) when (problem is IOException || problem is BadImageFormatException)
             {
-                // .NET raises ProcessExit at SIGTERM, and ends when its handlers return: BYE goes out meanwhile.
-                AppDomain.CurrentDomain.ProcessExit += (sender, arguments) => { found._set = true; found._left.WaitOne(1000); };
+                // .NET raises ProcessExit at SIGTERM, and ends when its handlers return: BYE goes out
+                // meanwhile.
+                AppDomain.CurrentDomain.ProcessExit += (sender, arguments) =>
+                    { found._set = true; found._left.WaitOne(1000); };
             }
             return found;
         }

@@ -20,12 +20,19 @@ internal sealed class Street : World
         Prefixes.AddRange(new[] { "car", "uav", "van" });
         // A wedge: x forward, y left, z up, in any unit.
         double[][] wedge = { V(-1, -1, 0), V(1, -1, 0), V(1, 1, 0), V(-1, 1, 0), V(-1, -1, 1), V(-1, 1, 1) };
-        _mesh = OfferMesh("car", wedge, new[] { T(0, 3, 2), T(0, 2, 1), T(0, 1, 4), T(3, 5, 2), T(0, 4, 5), T(0, 5, 3), T(1, 2, 5), T(1, 5, 4) });
+        int[][] sides =
+        {
+            T(0, 3, 2), T(0, 2, 1), T(0, 1, 4), T(3, 5, 2), T(0, 4, 5), T(0, 5, 3), T(1, 2, 5), T(1, 5, 4),
+        };
+        _mesh = OfferMesh("car", wedge, sides);
         double[][] ground = { V(-60, -60, 0), V(60, -60, 0), V(60, 60, 0), V(-60, 60, 0) };
         double[][] wall = { V(30, 30, 0), V(30, -30, 0), V(30, -30, 12), V(30, 30, 12) };
         int[][] square = { T(0, 1, 2), T(0, 2, 3) };
         OfferScenery(
-            new[] { new SceneryMesh("ground", ground, square, "asphalt"), new SceneryMesh("wall", wall, square, "brick") },
+            new[]
+            {
+                new SceneryMesh("ground", ground, square, "asphalt"), new SceneryMesh("wall", wall, square, "brick"),
+            },
             new[] { new Material("asphalt", "concrete"), new Material("brick", "brick", 0.3) });
     }
 
@@ -37,24 +44,30 @@ internal sealed class Street : World
 
     protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
     {
-        foreach (var command in commands.Where(command => command.Type == "velocity" && command.Object == "uav"))
-            _wanted = command.Velocity;
+        foreach (var command in commands)
+            if (command.Type == "velocity" && command.Object == "uav") _wanted = command.Velocity;
         var velocity = _wanted ?? V(3 * Math.Cos(0.4 * t), 3 * Math.Sin(0.4 * t), 0);
         _uav = _uav.Zip(velocity, (x, v) => x + v * (t - previous)).ToArray();
 
         double turning = Speed / Radius, angle = turning * t, heading = angle + Math.PI / 2;
+        var place = V(Radius * Math.Cos(angle), Radius * Math.Sin(angle), 0.75);
         var objects = new List<WorldObject>
         {
-            new WorldObject("car", "car", V(Radius * Math.Cos(angle), Radius * Math.Sin(angle), 0.75), V(4.5, 1.8, 1.5))
+            new WorldObject("car", "car", place, V(4.5, 1.8, 1.5))
             {
-                Orientation = Quaternions.FromEuler(heading), Mesh = _mesh, AngularVelocity = V(0, 0, turning),
+                Orientation = Quaternions.FromEuler(heading), Mesh = _mesh,
+                AngularVelocity = V(0, 0, turning),
                 Velocity = V(Speed * Math.Cos(heading), Speed * Math.Sin(heading), 0),
             },
             new WorldObject("uav", "uav", _uav, V(0.6, 0.6, 0.25)) { Velocity = velocity },
         };
         double passing = t % 10 - 2; // of the van: it is there from 2 s until 7 s of every 10 s
         if (passing >= 0 && passing < 5)
-            objects.Add(new WorldObject("van", "truck", V(-40 + 16 * passing, 26, 1.25), V(5.5, 2.1, 2.5)) { Velocity = V(16, 0, 0) });
+        {
+            var van = new WorldObject("van", "truck", V(-40 + 16 * passing, 26, 1.25), V(5.5, 2.1, 2.5));
+            van.Velocity = V(16, 0, 0);
+            objects.Add(van);
+        }
         return objects;
     }
 
@@ -65,7 +78,8 @@ internal sealed class Street : World
 
     protected override void Restore(byte[] state)
     {
-        var numbers = Enumerable.Range(0, state.Length / 8).Select(i => BitConverter.ToDouble(state, 8 * i)).ToArray();
+        var numbers = Enumerable.Range(0, state.Length / 8)
+            .Select(i => BitConverter.ToDouble(state, 8 * i)).ToArray();
         _uav = numbers.Take(3).ToArray();
         _wanted = numbers.Length == 6 ? numbers.Skip(3).ToArray() : null;
     }

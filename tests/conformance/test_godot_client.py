@@ -114,7 +114,6 @@ func _init():
 	car.name = "Car"
 	car.translation = Vector3(3, 100, -20)
 	car.linear_velocity = Vector3(0, 0, -10)
-	car.linear_damp = 0
 	node.add_child(car)
 	node.tracked = [NodePath("Car")]
 	root.add_child(node)
@@ -147,7 +146,8 @@ def test_the_node_of_its_page_tells_where_physics_move_a_body(godot: str, tmp_pa
     first, last = scenes[0], scenes[-1]
     assert first is not None
     assert last is not None
-    assert last.velocity[0, 0] == pytest.approx(10, rel=1e-3)
+    # The air of Godot slows the body down.
+    assert 0 < last.velocity[0, 0] < first.velocity[0, 0] <= 10
     assert last.velocity[0, 2] < first.velocity[0, 2] <= 0
 
 

@@ -1,6 +1,6 @@
-// What the tests ask of Caviar.cs: `Check.exe vectors FILE` and `Check.exe axes FILE`, `Check.exe scene FILE`.
+// What the tests ask of Caviar.cs: Check.exe KIND FILE
 //
-// Each line of the file is a case, its fields divided by tabs, and each line of the output is the answer to it.
+// Each line of the file is a case, its fields divided by tabs, and each line of the output is its answer.
 using System;
 using System.Collections.Generic;
 using System.Globalization;
@@ -14,13 +14,16 @@ internal static class Check
     {
         var answers = new Dictionary<string, Func<string[], string>>
         {
-            { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted }, { "match", Match }, { "mesh", Mesh },
+            { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted },
+            { "match", Match }, { "mesh", Mesh },
             { "users", Users }, { "paths", Paths }, { "commands", Commands },
         };
-        foreach (var line in File.ReadAllLines(arguments[1])) Console.WriteLine(answers[arguments[0]](line.Split('\t')));
+        foreach (var line in File.ReadAllLines(arguments[1]))
+            Console.WriteLine(answers[arguments[0]](line.Split('\t')));
     }
 
-    // kind, topic, header, body, further parts (hex or #LENGTH): "ok HEADER BODY" of what is written again, or the code.
+    // kind, topic, header, body, further parts (hex or #LENGTH): "ok HEADER BODY" of what is written again,
+    // or the code.
     private static string Vector(string[] fields)
     {
         byte[] header = Hex(fields[2]), body = Hex(fields[3]);
@@ -34,10 +37,14 @@ internal static class Check
             }
             var message = Codec.DecodeMessage(header);
             var parts = new List<byte[]> { header };
-            if (fields[4] != "") parts.AddRange(fields[4].Split(',').Select(part => part.StartsWith("#") ? new byte[int.Parse(part.Substring(1))] : Hex(part)));
+            if (fields[4] != "")
+                parts.AddRange(fields[4].Split(',').Select(part => part.StartsWith("#")
+                    ? new byte[int.Parse(part.Substring(1))] : Hex(part)));
             Codec.CheckParts(message, parts);
-            if (!Codec.Split(Codec.Join(parts.ToArray())).Select(Hex).SequenceEqual(parts.Select(Hex))) return "other parts in a frame";
-            return "ok\t" + Hex(Codec.EncodeMessage(message.Text("type"), message)) + "\t" + (parts.Sum(part => part.Length) < 4096 ? Hex(Codec.Join(parts.ToArray())) : "");
+            if (!Codec.Split(Codec.Join(parts.ToArray())).Select(Hex).SequenceEqual(parts.Select(Hex)))
+                return "other parts in a frame";
+            return "ok\t" + Hex(Codec.EncodeMessage(message.Text("type"), message)) + "\t"
+                + (parts.Sum(part => part.Length) < 4096 ? Hex(Codec.Join(parts.ToArray())) : "");
         }
         catch (ProtocolException problem) { return problem.Code; }
     }
@@ -45,13 +52,17 @@ internal static class Check
     private static string Elements(string[] fields)
     {
         return string.Join("\t", Codec.DecodeArrays(Hex(fields[0]), Hex(fields[1]))
-            .Select(array => Text(array.ToDoubles()) + ";" + (array.Dtype.Contains("i") || array.Dtype.Contains("u") ? string.Join(" ", array.ToLongs()) : "")));
+            .Select(array => Text(array.ToDoubles()) + ";"
+                + (array.Dtype.Contains("i") || array.Dtype.Contains("u") ? string.Join(" ", array.ToLongs())
+                : "")));
     }
 
-    // engine, position, orientation, velocity, angular velocity in ENU: the same in the engine's axes, and back.
+    // engine, position, orientation, velocity, angular velocity in ENU: the same in the engine's axes, and
+    // back.
     private static string Converted(string[] fields)
     {
-        var engines = new Dictionary<string, Axes> { { "unreal", Axes.Unreal }, { "unity", Axes.Unity }, { "godot", Axes.Godot }, { "ned", Axes.Ned } };
+        var engines = new Dictionary<string, Axes> { { "unreal", Axes.Unreal }, { "unity", Axes.Unity },
+            { "godot", Axes.Godot }, { "ned", Axes.Ned } };
         var axes = engines[fields[0]];
         double[][] numbers = fields.Skip(1).Select(Numbers).ToArray();
         var pose = axes.PoseFromEnu(new Pose(numbers[0], numbers[1]));
@@ -67,17 +78,20 @@ internal static class Check
 
     private static SceneBuilder _builder;
 
-    // welcome HEADER, then a line a frame: name|class|position|orientation|velocity|dimensions, divided by tabs.
+    // welcome HEADER, then a line a frame: name|class|position|orientation|velocity|dimensions, divided by
+    // tabs.
     private static string Mounted(string[] fields)
     {
         if (fields[0] == "welcome")
         {
-            _builder = new SceneBuilder(Codec.DecodeMessage(Hex(fields[1])).Child("scenario").List("devices").Cast<Map>());
+            _builder = new SceneBuilder(Codec.DecodeMessage(Hex(fields[1])).Child("scenario").List("devices")
+                .Cast<Map>());
             return "";
         }
         try
         {
-            var product = _builder.Build(fields.Select(field => field.Split('|')).Select(words => new WorldObject(words[0], words[1], Numbers(words[2]), Numbers(words[5]))
+            var product = _builder.Build(fields.Select(field => field.Split('|'))
+                .Select(words => new WorldObject(words[0], words[1], Numbers(words[2]), Numbers(words[5]))
             {
                 Orientation = Numbers(words[3]), Velocity = Numbers(words[4]),
             }));
@@ -90,27 +104,40 @@ internal static class Check
     private static string Users(string[] fields)
     {
         return string.Join("\t", LinkUser.All(Codec.DecodePayload("link", Hex(fields[0]), Hex(fields[1])))
-            .Select(user => user.Tx + " " + user.Rx + " " + user.Carrier + " " + Text(new[] { user.AbsY, user.Snr, user.TxBeam, user.RxBeam })));
+            .Select(user => user.Tx + " " + user.Rx + " " + user.Carrier + " "
+                + Text(new[] { user.AbsY, user.Snr, user.TxBeam, user.RxBeam })));
     }
 
     private static string Paths(string[] fields)
     {
-        return string.Join("\t", ChannelPath.All(Codec.DecodePayload("channel", Hex(fields[0]), Hex(fields[1])))
-            .Select(path => path.Tx + " " + path.Rx + " " + Text(new[] { path.Tau }.Concat(path.Aod).Concat(path.Real).Concat(path.Imaginary).Concat(path.Doppler)
-                .Concat(path.Interactions.Select(kind => (double)kind)).Concat(path.Points.SelectMany(point => point)).ToArray())));
+        return string.Join("\t", ChannelPath.All(Codec.DecodePayload("channel", Hex(fields[0]),
+            Hex(fields[1])))
+            .Select(path => path.Tx + " " + path.Rx + " "
+                + Text(new[] { path.Tau }.Concat(path.Aod).Concat(path.Real).Concat(path.Imaginary)
+                .Concat(path.Doppler)
+                .Concat(path.Interactions.Select(kind => (double)kind))
+                    .Concat(path.Points.SelectMany(point => point)).ToArray())));
     }
 
     private static string Commands(string[] fields)
     {
         return string.Join("\t", Command.All(Codec.DecodePayload("action", Hex(fields[0]), Hex(fields[1])))
-            .Select(command => command.Type + " " + (command.Object == "" ? command.Tx : command.Object) + " " + Text(new[] { command.TxBeam, command.Speed }.Concat(command.Position ?? command.Velocity ?? new double[0]).ToArray())));
+            .Select(command => command.Type + " " + (command.Object == "" ? command.Tx : command.Object)
+                + " " + Text(new[] { command.TxBeam, command.Speed }.Concat(command.Position
+                ?? command.Velocity ?? new double[0]).ToArray())));
     }
 
-    private static string Match(string[] fields) { return SceneBuilder.Matches(fields[0], fields[1]).ToString(); }
+    private static string Match(string[] fields)
+    {
+        return SceneBuilder.Matches(fields[0], fields[1]).ToString();
+    }
 
     private sealed class Still : World
     {
-        protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands) { return null; }
+        protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
+        {
+            return null;
+        }
     }
 
     // A wrong mesh or material: the message of the error.
@@ -118,14 +145,19 @@ internal static class Check
     {
         try
         {
-            if (fields[0] == "material") new Material(fields[1], fields[2], double.Parse(fields[3], CultureInfo.InvariantCulture));
-            else new Still().OfferMesh(fields[1], new[] { new double[3], new double[3], new double[3] }, new[] { Numbers(fields[2]).Select(n => (int)n).ToArray() });
+            if (fields[0] == "material")
+                new Material(fields[1], fields[2], double.Parse(fields[3], CultureInfo.InvariantCulture));
+            else new Still().OfferMesh(fields[1], new[] { new double[3], new double[3], new double[3] },
+                new[] { Numbers(fields[2]).Select(n => (int)n).ToArray() });
             return "ok";
         }
         catch (ArgumentException problem) { return problem.Message; }
     }
 
-    private static string Text(double[] numbers) { return string.Join(" ", numbers.Select(number => number.ToString("R", CultureInfo.InvariantCulture))); }
+    private static string Text(double[] numbers)
+    {
+        return string.Join(" ", numbers.Select(number => number.ToString("R", CultureInfo.InvariantCulture)));
+    }
     private static double[] Numbers(string text) { return text.Split(' ').Select(Number).ToArray(); }
     private static double Number(string word)
     {
@@ -133,6 +165,13 @@ internal static class Check
         return double.Parse(word, CultureInfo.InvariantCulture);
     }
 
-    private static string Hex(byte[] bytes) { return string.Concat(bytes.Select(value => value.ToString("x2"))); }
-    private static byte[] Hex(string text) { return Enumerable.Range(0, text.Length / 2).Select(i => Convert.ToByte(text.Substring(2 * i, 2), 16)).ToArray(); }
+    private static string Hex(byte[] bytes)
+    {
+        return string.Concat(bytes.Select(value => value.ToString("x2")));
+    }
+    private static byte[] Hex(string text)
+    {
+        return Enumerable.Range(0, text.Length / 2).Select(i =>
+            Convert.ToByte(text.Substring(2 * i, 2), 16)).ToArray();
+    }
 }

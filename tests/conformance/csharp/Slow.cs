@@ -11,7 +11,8 @@ internal sealed class Slow : World
     protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
     {
         if (++_ticks % 3 != 0) return null;
-        return new[] { new WorldObject(Frame < 5 ? "car" : "lorry", "car", new[] { t, _ticks, 0.75 }, new[] { 4.5, 1.8, 1.5 }) };
+        return new[] { new WorldObject(Frame < 5 ? "car" : "lorry", "car", new[] { t, _ticks, 0.75 },
+            new[] { 4.5, 1.8, 1.5 }) };
     }
 
     private static int Main(string[] arguments) { return new Slow().Run(arguments[0], arguments[1]); }
