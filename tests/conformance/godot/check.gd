@@ -1,7 +1,8 @@
 extends SceneTree
 # What the tests ask of the add-on: godot3-server -s check.gd KIND FILE ANSWERS
 #
-# Each line of the file is a case, its fields divided by tabs, and each line of the answers is the answer to it.
+# Each line of the file is a case, its fields divided by tabs, and each line of the answers is the answer
+# to it.
 
 const Axes = preload("res://addons/caviar/caviar_axes.gd")
 const Codec = preload("res://addons/caviar/caviar_codec.gd")
@@ -74,10 +75,11 @@ func ask_axes(fields):
 	return join(found)
 
 
-# A node's transform in single precision: position and quaternion in ENU of a Transform that look_at made.
+# x, y, z and the quaternion of a node that is scaled by 2: its pose in ENU.
 func ask_transform(fields):
 	var p = numbers(fields[0])
-	var transform = Transform(Basis(Quat(p[3], p[4], p[5], p[6])).scaled(Vector3(2, 2, 2)), Vector3(p[0], p[1], p[2]))
+	var basis = Basis(Quat(p[3], p[4], p[5], p[6])).scaled(Vector3(2, 2, 2))
+	var transform = Transform(basis, Vector3(p[0], p[1], p[2]))
 	var pose = Axes.new("godot").transform_to_enu(transform)
 	return join([text(pose["position"]), text(pose["orientation"])])
 
@@ -94,7 +96,9 @@ func ask_mounts(fields):
 		item["velocity"] = numbers(words[4])
 		objects.append(item)
 	var product = builder.build(objects)
-	return join([product["header"].hex_encode(), product["body"].hex_encode()]) if product != null else builder.problem
+	if product == null:
+		return builder.problem
+	return join([product["header"].hex_encode(), product["body"].hex_encode()])
 
 
 func ask_match(fields):
@@ -121,7 +125,8 @@ func ask_users(fields):
 func ask_paths(fields):
 	var found = []
 	for path in Products.paths(codec.decode_payload("channel", bytes(fields[0]), bytes(fields[1]))):
-		var values = [path["tau"]] + path["aod"] + path["real"] + path["imaginary"] + path["doppler"] + path["interactions"]
+		var values = [path["tau"]] + path["aod"] + path["real"] + path["imaginary"] + path["doppler"]
+		values += path["interactions"]
 		for point in path["points"]:
 			values += point
 		found.append("%s %s %s" % [path["tx"], path["rx"], text(values)])

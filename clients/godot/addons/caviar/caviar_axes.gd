@@ -1,4 +1,5 @@
-# Axes and units of engines, to and from those of the protocol: east, north, up; bodies forward, left, up; metres.
+# Axes and units of engines, to and from those of the protocol: east, north, up in metres; bodies have x
+# forward, y left, z up.
 #
 #     var axes = Axes.new("godot")
 #     var pose = axes.pose_to_enu(position, orientation)  # arrays of floats: [x, y, z], [w, x, y, z]
@@ -51,7 +52,8 @@ func motion_from_enu(velocity, angular_velocity = [0.0, 0.0, 0.0]):
 
 # {position, orientation} in the protocol's axes of a node's global transform, whatever its scale.
 func transform_to_enu(transform):
-	var columns = [transform.basis.x.normalized(), transform.basis.y.normalized(), transform.basis.z.normalized()]
+	var basis = transform.basis
+	var columns = [basis.x.normalized(), basis.y.normalized(), basis.z.normalized()]
 	var matrix = []
 	for i in range(3):
 		matrix.append([columns[0][i], columns[1][i], columns[2][i]])

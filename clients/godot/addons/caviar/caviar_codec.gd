@@ -10,7 +10,8 @@ const MAX_HEADER = 1 << 20
 const MAX_PARTS = 513
 const MAX_ASSET_CHUNK = 4 << 20
 const WIDTHS = {
-	"|b1": 1, "|u1": 1, "|i1": 1, "<u2": 2, "<i4": 4, "<i8": 8, "<u8": 8, "<f4": 4, "<f8": 8, "<c8": 8, "<c16": 16
+	"|b1": 1, "|u1": 1, "|i1": 1, "<u2": 2, "<i4": 4, "<i8": 8, "<u8": 8,
+	"<f4": 4, "<f8": 8, "<c8": 8, "<c16": 16,
 }
 
 var schema = Schema.new()
@@ -78,7 +79,7 @@ static func rows(columns, values):
 	return made
 
 
-# --- reading structs: types are checked, defaults filled in, arrays taken from the body ------------------------
+# --- reading structs: types are checked, defaults filled in, arrays taken from the body ---------------------
 
 
 func _read_struct(struct, value, place):
@@ -162,7 +163,9 @@ func _read_field(type, value, place, sizes):
 		return _read_array(type, value, place, sizes)
 	else:
 		right = kind == TYPE_STRING and _is_text(type, value)
-	return value if right else _malformed("%s is not what its field holds: %s" % [place, str(value).substr(0, 80)])
+	if right:
+		return value
+	return _malformed("%s is not what its field holds: %s" % [place, str(value).substr(0, 80)])
 
 
 # The struct that a value is: the only one, or that of its tag; empty where it is none.
@@ -256,7 +259,7 @@ func _reference(value, place):
 	return found
 
 
-# --- writing structs: canonical form, in which a field that equals its default is left out ---------------------
+# --- writing structs: canonical form, in which a field that equals its default is left out ------------------
 
 
 func _written_struct(struct, map):
@@ -349,7 +352,7 @@ func _placed_array(array):
 	return to.data_array
 
 
-# --- messages and products -------------------------------------------------------------------------------------
+# --- messages and products ----------------------------------------------------------------------------------
 
 
 func encode_message(type, fields):

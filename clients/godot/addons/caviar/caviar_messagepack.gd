@@ -66,7 +66,7 @@ static func product_digest(header, body):
 	return sha256([length.data_array, header, body])
 
 
-# --- writing MessagePack --------------------------------------------------------------------------------------
+# --- writing MessagePack ------------------------------------------------------------------------------------
 
 
 func pack(value):
@@ -159,7 +159,7 @@ static func _write_int(to, value):
 		to.put_64(value)
 
 
-# --- reading MessagePack --------------------------------------------------------------------------------------
+# --- reading MessagePack ------------------------------------------------------------------------------------
 
 
 # One value that fills all bytes; null with a code where it does not.

@@ -16,8 +16,9 @@ static func users(link):
 	return found
 
 
-# The paths of a product of `channel`, pair by pair: tx, rx, tau [s], aod and aoa as [zenith, azimuth] [rad]; for each
-# carrier real and imaginary part of its amplitude and its doppler [Hz]; interactions and their points [m].
+# The paths of a product of `channel`, pair by pair: tx, rx, tau [s], aod and aoa as [zenith, azimuth]
+# [rad]; for each carrier real and imaginary part of its amplitude and its doppler [Hz]; interactions and
+# their points [m].
 static func paths(channel):
 	var a = channel["a"].to_floats()
 	var tau = channel["tau"].to_floats()

@@ -1,6 +1,6 @@
 # The product of a frame from its objects, with the scenario's devices mounted on them.
 #
-# An object is a dictionary, as `object` makes it. What is wrong with one is said by `problem`, of the last `build`.
+# An object is a dictionary, as `object` makes it. `problem` says what was wrong with one in the last `build`.
 
 const Axes = preload("caviar_axes.gd")
 const Codec = preload("caviar_codec.gd")
@@ -151,7 +151,8 @@ static func _radians(degrees):
 
 
 static func _device(spec, parent):
-	var turned = Axes.from_euler(_radians(spec["yaw_deg"]), _radians(spec["pitch_deg"]), _radians(spec["roll_deg"]))
+	var yaw = _radians(spec["yaw_deg"])
+	var turned = Axes.from_euler(yaw, _radians(spec["pitch_deg"]), _radians(spec["roll_deg"]))
 	var position = spec["position_m"].duplicate()
 	var made = {"type": spec["kind"], "name": spec["name"]}
 	if parent != null:

@@ -4,8 +4,8 @@
 
 const Codec = preload("caviar_codec.gd")
 const MATERIALS = [
-	"asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete", "floorboard",
-	"glass", "marble", "metal", "plasterboard", "plywood", "vinyl_tile", "wood", "very_dry_ground",
+	"asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete",
+	"floorboard", "glass", "marble", "metal", "plasterboard", "plywood", "vinyl_tile", "wood", "very_dry_ground",
 	"medium_dry_ground", "wet_ground", "vacuum",
 ]
 
@@ -44,14 +44,16 @@ func offer_mesh(name, vertices, triangles):
 	return offer("objects/%s.ply" % name, _ply(name, _in_unit_box(vertices), triangles))
 
 
-# meshes: [{name, vertices, triangles, material}]; materials: [{name, type, thickness}] (thickness [m], 0.2 if left out).
+# meshes: [{name, vertices, triangles, material}]; materials: [{name, type, thickness}], thickness 0.2 m if
+# left out.
 func offer_scenery(meshes, materials, name = "world"):
 	var xml = "<scene version=\"2.1.0\">\n"
 	var known = {}
 	for material in materials:
 		var thickness = material.get("thickness", 0.2) + 0.0
 		if not material["type"] in MATERIALS:
-			_wrong("material '%s': no type is '%s'; one of %s" % [material["name"], material["type"], str(MATERIALS)])
+			var why = "material '%s': no type is '%s'; one of %s"
+			_wrong(why % [material["name"], material["type"], str(MATERIALS)])
 		if not thickness > 0:
 			_wrong("material '%s': a thickness of %s m; it has to be above 0" % [material["name"], str(thickness)])
 		if known.has(material["name"]):
@@ -92,7 +94,8 @@ func _ply(name, vertices, triangles):
 		data.put_u8(3)
 		for i in range(3):
 			if triangle.size() != 3 or triangle[i] < 0 or triangle[i] >= vertices.size():
-				_wrong("mesh '%s': the corners %s are not three of its %d vertices" % [name, str(triangle), vertices.size()])
+				var why = "mesh '%s': the corners %s are not three of its %d vertices"
+				_wrong(why % [name, str(triangle), vertices.size()])
 				return data.data_array
 			data.put_32(int(triangle[i]))
 	return data.data_array

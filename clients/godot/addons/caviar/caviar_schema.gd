@@ -103,7 +103,8 @@ func _add_struct(words):
 		var colon = words[i].find(":")
 		var equals = words[i].find("=", colon)
 		var text = words[i].substr(colon + 1, (equals if equals >= 0 else words[i].length()) - colon - 1)
-		var field = {"name": words[i].substr(0, colon), "type": _type(text), "required": equals < 0, "left_out": false}
+		var field = {"name": words[i].substr(0, colon), "type": _type(text), "required": equals < 0}
+		field["left_out"] = false
 		if equals >= 0:
 			var standard = words[i].substr(equals + 1, words[i].length() - equals - 1)
 			field.left_out = standard == "?"
@@ -116,7 +117,8 @@ func _type(text):
 	var open = text.find("(")
 	var head = text.substr(1, (open if open >= 0 else text.length()) - 1)
 	var inner = text.substr(open + 1, text.length() - open - 2) if open >= 0 else ""
-	if text[0] != "D" and "ABCDEFGHIJKLMNOPQRSTUVWXYZ".find(text[0]) >= 0 or text.length() > 1 and text[0] == "D":
+	# Structs have names with a capital; D alone is a digest or empty.
+	if text != "D" and text[0] == text[0].to_upper() and text[0] != "*":
 		made.kind = "S"
 		made["words"] = text.split("/")
 	elif text[0] == "l" or text[0] == "t" or text[0] == "m":

@@ -1,4 +1,4 @@
-# A WebSocket of Godot 3, and what else has another name in Godot 4. caviar_socket_4.gd is the same for Godot 4.
+# A WebSocket of Godot 3, and what else has another name in Godot 4, for which caviar_socket_4.gd is.
 
 var _client = WebSocketClient.new()
 var _queue = []

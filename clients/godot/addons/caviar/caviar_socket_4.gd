@@ -1,4 +1,4 @@
-# A WebSocket of Godot 4, and what else has another name in Godot 3. caviar_socket_3.gd is the same for Godot 3.
+# A WebSocket of Godot 4, and what else has another name in Godot 3, for which caviar_socket_3.gd is.
 
 var _peer = WebSocketPeer.new()
 var _queue = []

@@ -65,7 +65,7 @@ func _init():
 	_socket_script = load(Codec.new().get_script().resource_path.get_base_dir() + "/caviar_socket_%d.gd" % major)
 
 
-# --- what a world overrides -----------------------------------------------------------------------------------
+# --- what a world overrides ---------------------------------------------------------------------------------
 
 
 # Load, offer meshes and scenery, and add to prefixes; settings and scenario are there.
@@ -73,12 +73,14 @@ func prepare():
 	pass
 
 
-# Go to the first state. Everything random follows from the seed, seed_episode and the frame. t0: of frame 0 [s].
+# Go to the first state. Everything random follows from the seed, seed_episode and the frame. t0: of frame 0
+# [s].
 func reset(_seed, _t0_s):
 	pass
 
 
-# The objects at t [s of the episode]; previous is the time of the frame completed last, t itself for the first one.
+# The objects at t [s of the episode]; previous is the time of the frame completed last, t itself for the
+# first.
 func step(_t, _previous_t, _commands):
 	return []
 
@@ -92,7 +94,7 @@ func restore(_bytes):
 	pass
 
 
-# --- what a world may use -------------------------------------------------------------------------------------
+# --- what a world may use -----------------------------------------------------------------------------------
 
 
 func object(object_name, kind, position, dimensions):
@@ -111,7 +113,7 @@ func offer_file(file_name, bytes):
 	return _scenery.offer(file_name, bytes)
 
 
-# Numbers, texts, lists and dictionaries as bytes, for `save`, and back, for `restore`; floats are kept exactly.
+# Numbers, texts, lists and dictionaries as bytes, for `save`, and back, for `restore`; floats stay exact.
 func var_to_state(value):
 	return _codec.pack(value)
 
@@ -126,7 +128,7 @@ func fail(why):
 		_fault = why
 
 
-# --- life -----------------------------------------------------------------------------------------------------
+# --- life ---------------------------------------------------------------------------------------------------
 
 
 # Begin to join the run; returns at once. url: ws://HOST:PORT/ws, the gateway of `caviar run --http`.
@@ -267,7 +269,7 @@ func _mine(fields):
 	return fields
 
 
-# --- messages -------------------------------------------------------------------------------------------------
+# --- messages -----------------------------------------------------------------------------------------------
 
 
 func _receive(bytes):
@@ -404,7 +406,7 @@ func _on_reset(fields):
 	_send("RESET_DONE", _mine({"episode": episode}))
 
 
-# --- frames ---------------------------------------------------------------------------------------------------
+# --- frames -------------------------------------------------------------------------------------------------
 
 
 func _answer():
@@ -438,7 +440,7 @@ func _answered(grant, parts):
 	if typeof(objects) == TYPE_STRING and objects == WAIT:
 		return null
 	if typeof(objects) != TYPE_ARRAY:
-		fail("step returned %s; it has to return a list of objects (an error of the script is above)" % str(objects))
+		fail("step returned %s and no list of objects; an error of the script is above" % str(objects))
 	if _fault != "":
 		return _fault_frame(frame, "step", "")
 	var product = _scene.build(objects)
@@ -481,7 +483,7 @@ func _fault_frame(number, phase, culprit):
 	return _frame("FAULT", _mine(fields))
 
 
-# --- state that outlives the process ---------------------------------------------------------------------------
+# --- state that outlives the process ------------------------------------------------------------------------
 
 
 func _saved():
