@@ -306,7 +306,7 @@ def check_conformance(command: str, folder: Path) -> None:
     ]
     done = subprocess.run(
         [sys.executable, "-m", "caviar_clients", "conform", *words, "--command", command],
-        env=environment("conform"), capture_output=True, text=True, timeout=120, check=False,
+        env=environment("conform"), capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert verdicts.exists(), done.stdout + done.stderr
     found = {entry["case"]: entry for entry in json.loads(verdicts.read_text("utf-8"))["verdicts"]}
