@@ -1643,7 +1643,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
     /// <summary>One WebSocket with threads of its own: nothing here ever blocks the caller.</summary>
     internal sealed class Wire
     {
-        private const int RetryMs = 500, ClosingMs = 1000;
+        private const int RetryMs = 500, ClosingMs = 1000, HandshakeMs = 10000;
         private readonly ConcurrentQueue<byte[]> _inbox = new ConcurrentQueue<byte[]>();
         private readonly BlockingCollection<byte[]> _outbox = new BlockingCollection<byte[]>();
         private readonly CancellationTokenSource _abort = new CancellationTokenSource();
@@ -1717,7 +1717,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     _socket.Options.SetRequestHeader("Authorization", "Bearer " + token);
                 try
                 {
-                    _socket.ConnectAsync(endpoint, _abort.Token).GetAwaiter().GetResult();
+                    // Without a limit a handshake that a busy gateway lost would be waited for until the end.
+                    if (!_socket.ConnectAsync(endpoint, _abort.Token).Wait(HandshakeMs))
+                        throw new TimeoutException("no answer to the handshake within " + HandshakeMs + " ms");
                     return;
                 }
                 catch (Exception problem)
