@@ -1,0 +1,177 @@
+// What the tests ask of Caviar.cs: Check.exe KIND FILE
+//
+// Each line of the file is a case, its fields divided by tabs, and each line of the output is its answer.
+using System;
+using System.Collections.Generic;
+using System.Globalization;
+using System.IO;
+using System.Linq;
+using Caviar;
+
+internal static class Check
+{
+    private static void Main(string[] arguments)
+    {
+        var answers = new Dictionary<string, Func<string[], string>>
+        {
+            { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted },
+            { "match", Match }, { "mesh", Mesh },
+            { "users", Users }, { "paths", Paths }, { "commands", Commands },
+        };
+        foreach (var line in File.ReadAllLines(arguments[1]))
+            Console.WriteLine(answers[arguments[0]](line.Split('\t')));
+    }
+
+    // kind, topic, header, body, further parts (hex or #LENGTH): "ok HEADER BODY" of what is written again,
+    // or the code.
+    private static string Vector(string[] fields)
+    {
+        byte[] header = Hex(fields[2]), body = Hex(fields[3]);
+        try
+        {
+            if (fields[0] == "arrays") { Codec.DecodeArrays(header, body); return "ok"; }
+            if (fields[0] == "payload")
+            {
+                var product = Codec.EncodePayload(fields[1], Codec.DecodePayload(fields[1], header, body));
+                return "ok\t" + Hex(product.Header) + "\t" + Hex(product.Body) + "\t" + product.Digest;
+            }
+            var message = Codec.DecodeMessage(header);
+            var parts = new List<byte[]> { header };
+            if (fields[4] != "")
+                parts.AddRange(fields[4].Split(',').Select(part => part.StartsWith("#")
+                    ? new byte[int.Parse(part.Substring(1))] : Hex(part)));
+            Codec.CheckParts(message, parts);
+            if (!Codec.Split(Codec.Join(parts.ToArray())).Select(Hex).SequenceEqual(parts.Select(Hex)))
+                return "other parts in a frame";
+            return "ok\t" + Hex(Codec.EncodeMessage(message.Text("type"), message)) + "\t"
+                + (parts.Sum(part => part.Length) < 4096 ? Hex(Codec.Join(parts.ToArray())) : "");
+        }
+        catch (ProtocolException problem) { return problem.Code; }
+    }
+
+    private static string Elements(string[] fields)
+    {
+        return string.Join("\t", Codec.DecodeArrays(Hex(fields[0]), Hex(fields[1]))
+            .Select(array => Text(array.ToDoubles()) + ";"
+                + (array.Dtype.Contains("i") || array.Dtype.Contains("u") ? string.Join(" ", array.ToLongs())
+                : "")));
+    }
+
+    // engine, position, orientation, velocity, angular velocity in ENU: the same in the engine's axes, and
+    // back.
+    private static string Converted(string[] fields)
+    {
+        var engines = new Dictionary<string, Axes> { { "unreal", Axes.Unreal }, { "unity", Axes.Unity },
+            { "godot", Axes.Godot }, { "ned", Axes.Ned } };
+        var axes = engines[fields[0]];
+        double[][] numbers = fields.Skip(1).Select(Numbers).ToArray();
+        var pose = axes.PoseFromEnu(new Pose(numbers[0], numbers[1]));
+        var motion = axes.MotionFromEnu(new Motion(numbers[2], numbers[3]));
+        var poseBack = axes.PoseToEnu(pose);
+        var motionBack = axes.MotionToEnu(motion);
+        return string.Join("\t", new[]
+        {
+            pose.Position, pose.Orientation, motion.Velocity, motion.AngularVelocity,
+            poseBack.Position, poseBack.Orientation, motionBack.Velocity, motionBack.AngularVelocity,
+        }.Select(Text));
+    }
+
+    private static SceneBuilder _builder;
+
+    // welcome HEADER, then a line a frame: name|class|position|orientation|velocity|dimensions, divided by
+    // tabs.
+    private static string Mounted(string[] fields)
+    {
+        if (fields[0] == "welcome")
+        {
+            _builder = new SceneBuilder(Codec.DecodeMessage(Hex(fields[1])).Child("scenario").List("devices")
+                .Cast<Map>());
+            return "";
+        }
+        try
+        {
+            var product = _builder.Build(fields.Select(field => field.Split('|'))
+                .Select(words => new WorldObject(words[0], words[1], Numbers(words[2]), Numbers(words[5]))
+            {
+                Orientation = Numbers(words[3]), Velocity = Numbers(words[4]),
+            }));
+            return Hex(product.Header) + "\t" + Hex(product.Body);
+        }
+        catch (ArgumentException problem) { return problem.Message; }
+    }
+
+    // header, body: a field for each user, path or command.
+    private static string Users(string[] fields)
+    {
+        return string.Join("\t", LinkUser.All(Codec.DecodePayload("link", Hex(fields[0]), Hex(fields[1])))
+            .Select(user => user.Tx + " " + user.Rx + " " + user.Carrier + " "
+                + Text(new[] { user.AbsY, user.Snr, user.TxBeam, user.RxBeam })));
+    }
+
+    private static string Paths(string[] fields)
+    {
+        return string.Join("\t", ChannelPath.All(Codec.DecodePayload("channel", Hex(fields[0]),
+            Hex(fields[1])))
+            .Select(path => path.Tx + " " + path.Rx + " "
+                + Text(new[] { path.Tau }.Concat(path.Aod).Concat(path.Real).Concat(path.Imaginary)
+                .Concat(path.Doppler)
+                .Concat(path.Interactions.Select(kind => (double)kind))
+                    .Concat(path.Points.SelectMany(point => point)).ToArray())));
+    }
+
+    private static string Commands(string[] fields)
+    {
+        return string.Join("\t", Command.All(Codec.DecodePayload("action", Hex(fields[0]), Hex(fields[1])))
+            .Select(command => command.Type + " " + (command.Object == "" ? command.Tx : command.Object)
+                + " " + Text(new[] { command.TxBeam, command.Speed }.Concat(command.Position
+                ?? command.Velocity ?? new double[0]).ToArray())));
+    }
+
+    private static string Match(string[] fields)
+    {
+        return SceneBuilder.Matches(fields[0], fields[1]).ToString();
+    }
+
+    private sealed class Still : World
+    {
+        protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
+        {
+            return null;
+        }
+    }
+
+    // A wrong mesh or material: the message of the error.
+    private static string Mesh(string[] fields)
+    {
+        try
+        {
+            if (fields[0] == "material")
+                new Material(fields[1], fields[2], double.Parse(fields[3], CultureInfo.InvariantCulture));
+            else new Still().OfferMesh(fields[1], new[] { new double[3], new double[3], new double[3] },
+                new[] { Numbers(fields[2]).Select(n => (int)n).ToArray() });
+            return "ok";
+        }
+        catch (ArgumentException problem) { return problem.Message; }
+    }
+
+    private static string Text(double[] numbers)
+    {
+        return string.Join(" ", numbers.Select(number => number.ToString("R", CultureInfo.InvariantCulture)));
+    }
+    private static double[] Numbers(string text) { return text.Split(' ').Select(Number).ToArray(); }
+    private static double Number(string word)
+    {
+        if (word[0] == 'x') return BitConverter.Int64BitsToDouble(Convert.ToInt64(word.Substring(1), 16));
+        return double.Parse(word, CultureInfo.InvariantCulture);
+    }
+
+    private static string Hex(byte[] bytes)
+    {
+        return string.Concat(bytes.Select(value => value.ToString("x2")));
+    }
+    private static byte[] Hex(string text)
+    {
+        return Enumerable.Range(0, text.Length / 2).Select(i =>
+            Convert.ToByte(text.Substring(2 * i, 2), 16)).ToArray();
+    }
+}

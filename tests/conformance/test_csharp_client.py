@@ -1,0 +1,119 @@
+"""The C# client library, compiled and run by Mono: vectors, conformance, a whole run, and a killed world."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import engine_worlds as worlds
+import pytest
+from scenarios_support import ROOT
+
+pytestmark = pytest.mark.slow
+
+CSHARP = ROOT / "clients" / "csharp"
+CHECK = Path(__file__).parent / "csharp" / "Check.cs"
+SCENARIO = CSHARP / "world.toml"
+LONGEST = 80
+"""Lines of code that the reference world may have."""
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with World.exe and Check.exe; skips by name where Mono is missing."""
+    for program in ("mcs", "mono"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed (Debian: mono-mcs, mono-runtime, libmono-posix4.0-cil)")
+    folder = tmp_path_factory.mktemp("csharp")
+    for source in (CSHARP / "World.cs", CHECK, CHECK.with_name("Slow.cs")):
+        # Unity 2020 has C# 8; mcs ends at 7.2.
+        command = ["mcs", "-langversion:7.2", "-warnaserror", f"-out:{folder / source.stem}.exe"]
+        done = subprocess.run(
+            [*command, source, CSHARP / "Caviar.cs"], capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def command(build: Path) -> list[str]:
+    return ["mono", str(build / "World.exe")]
+
+
+@pytest.fixture
+def ask(build: Path, tmp_path: Path) -> worlds.Ask:
+    def asked(kind: str, lines: Sequence[str]) -> list[str]:
+        cases = tmp_path / "cases.txt"
+        cases.write_text("\n".join(lines) + "\n", "utf-8")
+        done = subprocess.run(
+            ["mono", build / "Check.exe", kind, cases],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.removesuffix("\n").split("\n")
+
+    return asked
+
+
+def test_its_schema_is_that_of_the_protocol() -> None:
+    assert worlds.schema_is_current(CSHARP / "Caviar.cs")
+
+
+def test_the_reference_world_is_short() -> None:
+    lines = (CSHARP / "World.cs").read_text("utf-8").splitlines()
+    assert sum(bool(line.strip()) and not line.strip().startswith("//") for line in lines) <= LONGEST
+
+
+def test_vectors_are_read_written_and_refused(ask: worlds.Ask) -> None:
+    worlds.check_vectors(ask)
+    worlds.check_arrays(ask)
+
+
+def test_poses_are_converted_to_the_axes_of_engines_and_back(ask: worlds.Ask) -> None:
+    worlds.check_axes(ask)
+
+
+def test_devices_are_mounted_as_the_vectors_say(ask: worlds.Ask) -> None:
+    worlds.check_mounts(ask)
+    worlds.check_matches(ask)
+
+
+def test_wrong_objects_and_scenery_are_refused(ask: worlds.Ask) -> None:
+    worlds.check_wrong_objects(ask)
+    worlds.check_wrong_scenery(ask)
+
+
+def test_links_channels_and_actions_are_decoded(ask: worlds.Ask) -> None:
+    worlds.check_decoders(ask)
+
+
+def test_the_programs_of_its_page_compile(build: Path, tmp_path: Path) -> None:
+    stub = CHECK.with_name("UnityStub.cs")
+    for name, *more in (("Street.cs",), ("CaviarStreet.cs", stub)):
+        source = worlds.block_of(ROOT / "docs" / "howto" / "csharp-client.md", name, tmp_path)
+        command = ["mcs", "-langversion:7.2", "-target:library", f"-out:{tmp_path / name}.dll"]
+        done = subprocess.run(
+            [*command, source, *more, CSHARP / "Caviar.cs"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_reference_world_fails_no_case_of_the_kit(command: list[str], tmp_path: Path) -> None:
+    worlds.check_conformance(" ".join([*command, "{endpoint}", "{name}"]), tmp_path)
+
+
+def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path, tmp_path: Path) -> None:
+    worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
+
+
+def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
+    command: list[str], tmp_path: Path
+) -> None:
+    digest, directory = worlds.whole_run(SCENARIO, tmp_path / "whole", command)
+    worlds.check_recording(directory)
+    worlds.check_kill(SCENARIO, tmp_path / "killed", command, digest)
