@@ -150,7 +150,7 @@ def judged(node: str, script: str, role: str, *names: str) -> list[Verdict]:
     return conform(
         "tcp://127.0.0.1:0",
         command=shlex.join([node, str(CLIENT / script), "{endpoint}", "{name}"]),
-        rules=Rules(name="mine", role=role),
+        rules=Rules(name="mine", role=role, timeout_s=15.0),
         names=names,
         front=lambda endpoint: gateway_in_front(endpoint, "127.0.0.1:0", told.append),
     )
