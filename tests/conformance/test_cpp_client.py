@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import zmq
 from cpp_programs import CPP, PROBE, STRICT, WORLD, compiled, program_folder
-from scenarios_support import environment, eventually, recorded_below, running
+from scenarios_support import ROOT, environment, eventually, recorded_below, running
 
 from caviar_broker.control.socket import ask
 from caviar_clients.conform import conform
@@ -331,3 +331,15 @@ def test_killed_and_started_again_it_goes_on_with_the_same_digest(world: Path, t
 def wait_for_frames(run: Run) -> None:
     """Wait until as many frames are recorded as the world has to have done when it is killed."""
     eventually(lambda: recorded_below(run.out) >= KILLED_AFTER, WITHIN_S, "frames are recorded")
+
+
+@pytest.mark.exhaustive
+def test_the_first_world_of_the_guide_plays_the_scenario_of_the_guide(folder: Path, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "howto" / "cpp-client.md").read_text("utf-8")
+    files = dict(re.findall(r"^```\w+\n(?://|#) (street\.\w+)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE))
+    for name, content in files.items():
+        (tmp_path / name).write_text(content, "utf-8")
+    program = compiled("g++", tmp_path / "street.cpp", folder, "-std=c++17", "-O2")
+    with waiting_run(tmp_path / "street.toml", tmp_path) as run, run.world(program) as process:
+        assert len(run.digest()) == 64
+        assert process.wait(WITHIN_S) == 0
