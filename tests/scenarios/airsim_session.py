@@ -59,6 +59,8 @@ def square(port):
 
 def sensors(port):
     client = ready(port)
+    client.moveToPositionAsync(0, 0, -2, 8).get()
+    client.rotateToYawAsync(90).get()  # along the street
     client.simPause(True)
     kinds = airsim.ImageType
     answers = client.simGetImages(
@@ -127,13 +129,17 @@ def errors(port):
     return {"errors": found, "nowhere": str(nowhere), "objects": client.simListSceneObjects("ua.*")}
 
 
-def calls(port):
-    """Two clients at once, a thousand calls each."""
+def warm(port):
+    return calls(port, 100)
+
+
+def calls(port, rounds=500):
+    """Two clients at once, with two calls each in a round."""
     first, second = ready(port), connected(port)
     first.simPause(True)
     motion = first.moveToPositionAsync(15, 0, -6, 1)
     seen = []
-    for number in range(500):
+    for number in range(rounds):
         seen.append(first.getMultirotorState().timestamp)
         second.simGetVehiclePose()
         first.simGetCollisionInfo()

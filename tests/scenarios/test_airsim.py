@@ -98,7 +98,7 @@ class Session:
     def script(self, name: str) -> dict[str, Any]:
         """What a script of `airsim_session` found."""
         command = [self.python, HERE / "airsim_session.py", str(self.port), name]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
         return found
@@ -156,7 +156,7 @@ def test_the_script_of_the_page_runs_as_it_is_printed(session: Session, tmp_path
     assert script.count("MultirotorClient()") == 1
     program = tmp_path / "script.py"
     program.write_text(script.replace("MultirotorClient()", f"MultirotorClient(port={session.port})"))
-    done = subprocess.run([session.python, program], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run([session.python, program], capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 0, done.stderr
     x, y, z = (float(value) for value in re.findall(r"_val': (\S+?)[,}]", done.stdout))
     assert (x, y, z) == pytest.approx((0.0, 0.0, -6.0), abs=1.0)
@@ -194,8 +194,8 @@ def test_a_call_that_is_not_offered_or_not_possible_says_so(session: Session) ->
 
 
 def test_two_clients_at_once_make_thousands_of_calls_without_a_leak(session: Session) -> None:
-    expected = {"sorted": True, "frames": 11, "done": False, "control": [True, True]}
-    assert session.script("calls") == expected  # caches fill, and the allocator's pools
+    expected = {"sorted": True, "done": False, "control": [True, True]}
+    assert session.script("warm") == {**expected, "frames": 3}  # caches fill, and the allocator's pools
     before = session.memory_mib()
-    assert session.script("calls") == expected
+    assert session.script("calls") == {**expected, "frames": 11}
     assert session.memory_mib() - before < 2.0
