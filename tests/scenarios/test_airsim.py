@@ -150,6 +150,7 @@ def test_it_flies_a_square_and_all_else_that_it_is_asked_for(session: Session) -
     assert found["landed"]
 
 
+@pytest.mark.exhaustive
 def test_the_script_of_the_page_runs_as_it_is_printed(session: Session, tmp_path: Path) -> None:
     """But for the port, of which the tests have one of their own."""
     ((_, script),) = [block for block in blocks(ROOT / "docs/howto/airsim.md") if block[0] == "python"]
