@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector, multiply
 
 _HALF = 0.5**0.5
+_Rows: TypeAlias = tuple[Vector, Vector, Vector]
 
 
 class Motion(NamedTuple):
@@ -49,8 +51,8 @@ class EngineAxes:
     """
 
     name: str
-    world: tuple[Vector, Vector, Vector]
-    body: tuple[Vector, Vector, Vector]
+    world: _Rows
+    body: _Rows
     unit: float = 1.0
 
     def from_enu(self, pose: Pose) -> Pose:
@@ -64,7 +66,7 @@ class EngineAxes:
         """
         return Pose(
             _scaled(self.unit, self._to_world(pose.position)),
-            _conjugated(pose.orientation, np.array(self.world), np.array(self.body)),
+            _conjugated(pose.orientation, self.world, self.body),
         )
 
     def to_enu(self, pose: Pose) -> Pose:
@@ -77,9 +79,8 @@ class EngineAxes:
             >>> UNITY.to_enu(Pose((-2.0, 3.0, 1.0), (1.0, 0.0, 0.0, 0.0))).position
             (1.0, 2.0, 3.0)
         """
-        world, body = np.array(self.world).T, np.array(self.body).T
-        position = _scaled(1.0 / self.unit, _vector(world @ pose.position))
-        return Pose(position, _conjugated(pose.orientation, world, body))
+        position = _scaled(1.0 / self.unit, _vector(np.array(self.world).T @ pose.position))
+        return Pose(position, _conjugated(pose.orientation, _transposed(self.world), _transposed(self.body)))
 
     def motion_from_enu(self, motion: Motion) -> Motion:
         """Convert velocities from ENU, m/s and rad/s.
@@ -143,16 +144,27 @@ ENGINES = {axes.name: axes for axes in (UNREAL, UNITY, GODOT, NED)}
 """By name."""
 
 
-def _conjugated(q: Sequence[float], world: Float64Array, body: Float64Array) -> UnitQuaternion:
+def _conjugated(q: Sequence[float], world: _Rows, body: _Rows) -> UnitQuaternion:
     """Orientation in other axes: W·R·Bᵀ as a quaternion, w ≥ 0.
 
     With W = s·P and B = s·Q, where P and Q are rotations and s = ±1 is their determinant, it is P·R·Qᵀ: the
     sign cancels.
     """
-    hand = float(round(np.linalg.det(world)))
-    w, x, y, z = multiply(multiply(_quaternion(hand * world), q), _inverse(_quaternion(hand * body)))
+    w, x, y, z = multiply(multiply(_turn(world), q), _inverse(_turn(body)))
     sign = -1.0 if w < 0.0 else 1.0
     return (sign * w, sign * x, sign * y, sign * z)
+
+
+@lru_cache
+def _turn(rows: _Rows) -> UnitQuaternion:
+    """The rotation that is left of axes without their reflection; it takes 0.1 ms to find."""
+    matrix = np.array(rows)
+    return _quaternion(round(float(np.linalg.det(matrix))) * matrix)
+
+
+def _transposed(rows: _Rows) -> _Rows:
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    return ((a, d, g), (b, e, h), (c, f, i))
 
 
 def _quaternion(matrix: Float64Array) -> UnitQuaternion:
