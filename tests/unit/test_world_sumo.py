@@ -21,8 +21,9 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
+from caviar_services.world.sumo import SumoSettings, SumoWorld
 from caviar_services.world.sumo_process import check_file, load_libsumo
+from caviar_services.world.sumo_steps import step_length_ms
 
 pytestmark = [
     pytest.mark.slow,
