@@ -245,6 +245,7 @@ SINCE: dict[str, str] = {
     "ChannelOptions.absorption_db_per_km": "1.1",
     "ChannelOptions.detail": "1.1",
     "ChannelOptions.foliage": "1.4",
+    "ChannelOptions.blockage": "1.6",
     "Welcome.rejoin_ns": "1.3",
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",

@@ -8,8 +8,8 @@ and loses
 
 D1 and D2 are the distances from the ends of the path to an edge and r that between the ends, in the side view
 for the upper and lower edge (h1, h2), in the top view for the others (w1, w2). All signs are + in a view in
-which the screen is in the way; where it is not, the edge of the shorter way D1 + D2 has −, so that L tends to 0
-away from the screen. Losses [dB] of several screens are added.
+which the screen is in the way; where it is not, the edge of the shorter way D1 + D2 has −, so that L tends
+to 0 away from the screen. Losses [dB] of several screens are added.
 
 What the report leaves open is fixed so: a screen stands across the path, as in the model of METIS (D1.4,
 "METIS channel models", 2015, section 6) that the report took over, and is as wide as the person looks from
@@ -70,13 +70,14 @@ def check_screens(
     for name in settings.classes:
         if name not in without_body:
             raise ValueError(
-                f"human_blockage makes screens of the class {name!r}, whose traced bodies would block the same "
-                f"paths again; write without_body = [{name!r}], or leave human_blockage out"
+                f"human_blockage makes screens of the class {name!r}, whose traced bodies would block the "
+                f"same paths again; write without_body = [{name!r}], or leave human_blockage out"
             )
         for setting, keys in others.items():
             if name in keys:
                 raise ValueError(
-                    f"{name!r} is a screen of human_blockage and stands in {setting}, too; leave it out of one"
+                    f"{name!r} is a screen of human_blockage and stands in {setting}, too; leave it out of "
+                    "one of them"
                 )
 
 
@@ -183,10 +184,8 @@ class HumanBlockage:
         side = along[:, :2] / level[:, None]
         to = self._feet[screen] - start
         # In the top view: how far along the wave the screen stands, and how far to its left.
-        at, left = (
-            to[:, 0] * side[:, 0] + to[:, 1] * side[:, 1],
-            to[:, 1] * side[:, 0] - to[:, 0] * side[:, 1],
-        )
+        at = to[:, 0] * side[:, 0] + to[:, 1] * side[:, 1]
+        left = to[:, 1] * side[:, 0] - to[:, 0] * side[:, 1]
         counts = (at > reach[0] * level) & (at < reach[1] * level)
         width, height = self._seen(screen, side)
         far = whole * level
@@ -259,8 +258,9 @@ def _edges(one: _Point, other: _Point, end: _Point) -> tuple[Float64Array, Float
 
 def _knife(k: Float64Array, first: Float64Array, second: Float64Array) -> Float64Array:
     """F of two edges, added; detours as of `_edges`, k = π/λ [1/m], Shape ``[C, 1]``."""
-    found: Float64Array = sum(
+    one, other = (
         np.sign(detour) * np.arctan(np.pi / 2 * np.sqrt(k * np.abs(detour))) / np.pi
         for detour in (first, second)
     )
+    found: Float64Array = one + other
     return found
