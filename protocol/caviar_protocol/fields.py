@@ -278,6 +278,9 @@ SINCE: dict[str, str] = {
     "Link.block_errors": "1.5",
     "PathCommand": "1.6",
     "AttitudeCommand": "1.6",
+    "DriveCommand": "1.6",
+    "RoadStop": "1.6",
+    "SignalCommand": "1.6",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

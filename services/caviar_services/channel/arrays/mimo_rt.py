@@ -25,8 +25,8 @@ from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.clearance import with_near_pairs
 from caviar_services.channel.propagation.foliage import Foliage
-from caviar_services.channel.propagation.human_blockage import HumanBlockage
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+from caviar_services.channel.propagation.human_blockage import HumanBlockage
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table

@@ -94,7 +94,7 @@ class HumanBlockage:
         >>> start, end = np.array([[0.0, 0.0, 1.5]]), np.array([[10.0, 0.0, 1.5]])
         >>> factor = model.amplitude_factor(start, np.zeros((1, 0, 3)), end, np.zeros((1, 0), np.uint8))
         >>> (-20 * np.log10(factor)).round(1).tolist()
-        [[9.4]]
+        [[9.9]]
     """
 
     def __init__(self, settings: HumanBlockageSettings, carriers: Sequence[Carrier]) -> None:
