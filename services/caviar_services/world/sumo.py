@@ -19,6 +19,7 @@ from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
 from caviar_services.world.people import People
+from caviar_services.world.sumo_commands import Commanded, carry_out
 from caviar_services.world.sumo_conventions import Heading, Placement, body_pose, heading, object_class
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
 from caviar_services.world.sumo_states import TrafficStates
@@ -88,6 +89,8 @@ class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Objects of the last frame, those that came first in front."""
     traffic: str
     """Digest of all vehicles and persons there."""
+    commanded: tuple[Commanded, ...] = ()
+    """What agents have commanded since frame 0."""
 
 
 class SumoWorld(World[SumoSettings]):
@@ -126,6 +129,7 @@ class SumoWorld(World[SumoSettings]):
         self._vehicles: dict[str, _Kind] = {}
         self._persons: dict[str, _Kind] = {}
         self._people = People(self._step_ms / 1000.0)
+        self._commanded: list[Commanded] = []
         if settings.between_episodes_s is not None:
             check_spacing(settings.between_episodes_s, self._step_ms)
         if not settings.net and not settings.config:
@@ -186,6 +190,7 @@ class SumoWorld(World[SumoSettings]):
     def _begin_here(self, simulation: Simulation) -> None:
         """Count steps from here on; nothing turns, and people are where SUMO has them."""
         self._steps, self._angles = 0, {}
+        self._commanded = []
         self._people.clear()
         self._walk(simulation)
 
@@ -255,17 +260,25 @@ class SumoWorld(World[SumoSettings]):
 
     def checkpoint(self) -> bytes:
         """How far it went, and where that led."""
-        state = _State(steps=self._steps, arrived=self._mounts.arrived, traffic=self._traffic())
+        state = _State(
+            steps=self._steps,
+            arrived=self._mounts.arrived,
+            traffic=self._traffic(),
+            commanded=tuple(self._commanded),
+        )
         return saved(self, 1, state)
 
     def restore(self, state: bytes) -> None:
-        """Go the same way again, in steps as small as before.
+        """Go the same way again, in steps as small as before and with the same commands.
 
         Raises `RunError` where it led elsewhere: files or SUMO have changed.
         """
         was = restored(self, 1, _State, state)
         simulation = self._started()
+        self._commanded = list(was.commanded)
+        commanded = {entry.step: entry.commands for entry in was.commanded}
         while self._steps < was.steps:
+            carry_out(simulation.api, commanded.get(self._steps, ()), self._prefix)
             self._step(simulation)
             self._walk(simulation)
             if self._steps % _REPORT_EVERY == 0:
