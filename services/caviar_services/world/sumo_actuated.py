@@ -70,8 +70,8 @@ class ActuatedSumoWorld(SumoWorld):
         if frame.number > 0 and not self._knows_past:
             raise RunError(
                 f"world {self.run.name!r} came back in frame {frame.number}: what agents had commanded is "
-                "lost with the process that knew it; have states saved (run.checkpoint_frames above 0), and start "
-                "the run again"
+                "lost with the process that knew it; have states saved (run.checkpoint_frames above 0), "
+                "and start the run again"
             )
         self._knows_past = True
         actions = frame.payloads("action", Action)
