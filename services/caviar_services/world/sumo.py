@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
