@@ -15,6 +15,8 @@ from caviar_protocol.errors import PayloadError, suggestion
 from caviar_protocol.topics import Action, DriveCommand, RoadStop, SignalCommand
 from caviar_protocol.topics.link import Command, MotionCommand, TrafficCommand
 
+_WorldCommand = MotionCommand | TrafficCommand
+
 # How long SUMO looks for room on a lane that it is to change to [s]; the command again prolongs it.
 _LANE_S = 5.0
 
@@ -49,7 +51,7 @@ def traffic_commands(
     owners: dict[str, str] = {}
     for agent, action in actions.items():
         for command in action.commands:
-            if not isinstance(command, MotionCommand | TrafficCommand):
+            if not isinstance(command, _WorldCommand):
                 continue
             name = command.signal if isinstance(command, SignalCommand) else command.object
             if not name.startswith(prefix):

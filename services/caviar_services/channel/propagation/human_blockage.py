@@ -117,7 +117,7 @@ class HumanBlockage:
         rows = [i for i, cls in enumerate(scene.classes) if cls in self._settings.classes]
         size = scene.dimensions[rows].reshape(-1, 3)
         feet = scene.position[rows].reshape(-1, 3) - np.array([0.0, 0.0, 0.5]) * size
-        axes = np.array([rotation_matrix(tuple(scene.orientation[i]))[:, 0] for i in rows]).reshape(-1, 3)
+        axes = np.array([rotation_matrix(scene.orientation[i].tolist())[:, 0] for i in rows]).reshape(-1, 3)
         self.put(feet, size, np.arctan2(axes[:, 1], axes[:, 0]))
 
     def put(self, feet: Float64Array, size: Float64Array, yaw: Float64Array) -> None:

@@ -137,7 +137,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
     @property
     def _losses(self) -> tuple[Foliage | HumanBlockage, ...]:
         """What paths lose in beside what they meet."""
-        return tuple(loss for loss in (self.foliage, self.blockage) if loss is not None)
+        found: list[Foliage | HumanBlockage] = []
+        if self.foliage is not None:
+            found.append(self.foliage)
+        if self.blockage is not None:
+            found.append(self.blockage)
+        return tuple(found)
 
     def enclosing(self, position: Float64Array) -> str:
         """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from.
