@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import logging
 import math
 import signal
 import subprocess
@@ -34,6 +35,7 @@ pytestmark = [
 ]
 
 Make = Callable[..., SumoWorld]
+_LOG = logging.getLogger(__name__)
 
 FRESH_PROCESS = """
 import hashlib, sys
@@ -524,7 +526,7 @@ def moved(scene: Scene, before: Scene) -> Iterator[tuple[float, float]]:
     ],
 )
 def test_no_person_exceeds_3_m_s_or_turns_about_in_a_step_unless_the_report_says_so(
-    make: Make, repository: Path, model: str, person_steps: int, record_property: Callable[..., None]
+    make: Make, repository: Path, model: str, person_steps: int
 ) -> None:
     """Beside it what SUMO itself would have shown: its jumps and turns are counted."""
     folder = repository / "deploy" / "caviar_scenarios" / "crossing"
@@ -546,8 +548,8 @@ def test_no_person_exceeds_3_m_s_or_turns_about_in_a_step_unless_the_report_says
         before, frame = scene, frame + 1
     assert fast <= counts[PLACED]
     assert turned <= counts[PLACED]
-    # In the report of `pytest --junit-xml`; the page people-and-traffic has these figures.
-    record_property("people", f"{model}: {steps} person-steps in {frame} frames, {fast} fast, {dict(counts)}")
+    # Shown with --log-cli-level=INFO; the page people-and-traffic has these figures.
+    _LOG.info(f"{model}: {steps} person-steps in {frame} frames, {dict(counts)}")
 
 
 def test_people_walk_on_in_another_process_as_they_would_have(make: Make, repository: Path) -> None:
