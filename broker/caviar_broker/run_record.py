@@ -45,7 +45,7 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
     read = msgspec.structs.replace(scenario, source=Source())  # a run is resumed with what was read
     used = {spec.use for spec in scenario.services.values()}
     libraries = [*LIBRARIES]
-    libraries += TRAFFIC if "sumo" in used else ()
+    libraries += TRAFFIC if used & {"sumo", "sumo-actuated"} else ()
     libraries += TRACING if used & _tracers() else ()
     found = {
         "python": platform.python_version(),

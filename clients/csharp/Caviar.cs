@@ -381,7 +381,7 @@ Lidar object_names:l(s) scans:l(LidarScan)
 Camera images:l(CameraImage)
 Depth images:l(DepthImage)
 Segmentation object_names:l(s) material_names:l(s)=[] images:l(SegmentationImage)
-Action commands:l(BeamChoice/WaypointCommand/VelocityCommand/UserSchedule)
+Action commands:l(BeamChoice/WaypointCommand/VelocityCommand/UserSchedule/PathCommand/AttitudeCommand/DriveCommand/SignalCommand)
 Link tx:l(s) rx:l(s) carrier:l(s) has_path:a(|b1,U) los:a(|b1,U) tx_beam:a(<i4,U) rx_beam:a(<i4,U) abs_y:a(<f8,U) top_tx_beam:a(<i4,U,K) top_rx_beam:a(<i4,U,K) top_abs_y:a(<f8,U,K) baseline_abs_y:a(<f8,U) aod_azimuth:a(<f8,U) aoa_azimuth:a(<f8,U) snr:a(<f8,U) snr_best:a(<f8,U) spectral_efficiency:a(<f8,U) bit_rate:a(<f8,U) reward:a(<f8,U) buffered:a(<f8,U)=? no_path:i0=0 serving:a(|b1,U)=? arrived:a(<i8,U)=? sent:a(<i8,U)=? dropped:a(<i8,U)=? delivered:a(<i8,U)=? delay:a(<f8,U)=? waiting:a(<f8,U)=? sinr:a(<f8,U)=? throughput:a(<f8,U)=? blocks:a(<i8,U)=? block_errors:a(<i8,U)=?
 Hello:HELLO version:t2(i0) name:n role:e(world,channel,sensors,link,agent,recorder) inputs:l256(Input)=[] outputs:l256(n)=[] capabilities:l256(s1..128)=[] implementation:s='' max_in_flight:i1..64=1 host:s='' pid:i0=0
 Welcome:WELCOME version:t2(i0) run:s epoch:i1 attempt:i1 capabilities:l256(s1..128)=[] heartbeat_ns:i1 liveness_ns:i1 seed:i0=0 settings:m(*)={} scenario:m(*)={} rejoin_ns:i0=0
@@ -408,7 +408,7 @@ Error:ERROR code:s1..128 message:s of:s='' subject:s=''
 Attach:ATTACH epoch:i1 attempt:i1 name:s1..128
 Heartbeat:HEARTBEAT sequence:i0 progress:i0=0 phase:s='' grace_ns:i0=0
 HeartbeatAck:HEARTBEAT_ACK sequence:i0
-ChannelOptions los:b=true reflection:b=false refraction:b=false diffraction:b=false scattering:b=false max_depth:i0=0 samples:i0=0 materials_outside:l(s)=[] absorption_db_per_km:l(f0)=[] detail:s='' foliage:l(s)=[]
+ChannelOptions los:b=true reflection:b=false refraction:b=false diffraction:b=false scattering:b=false max_depth:i0=0 samples:i0=0 materials_outside:l(s)=[] absorption_db_per_km:l(f0)=[] detail:s='' foliage:l(s)=[] blockage:l(s)=[]
 Carrier name:s frequency_hz:f<0 bandwidth_hz:f<0=100000000.0 subcarriers:i0..65536=0 subcarrier_spacing_hz:f0=0.0 taps:i0..65536=0 slots:i1..65536=1 slot_duration_s:f0=0.0
 ChannelMatrix carrier:i0 tx:i0 rx:i0 h:a(<c16,Nr,Nt)
 ChannelResponse carrier:i0 tx:i0 rx:i0 h:a(<c8,S,K,Nr,Nt)
@@ -426,6 +426,10 @@ BeamChoice:beam tx:s rx:s tx_beam:i0 rx_beam:i0=0 carrier:s=''
 WaypointCommand:waypoint object:s position:t3(f) speed:f<0 at_once:b=false
 VelocityCommand:velocity object:s velocity:t3(f)
 UserSchedule:schedule tx:s rx:s
+PathCommand:path object:s points:l(t3(f)) speed:f<0
+AttitudeCommand:attitude object:s orientation:t4(f) thrust:f0
+DriveCommand:drive object:s speed:f0=? lane:i0=? route:l(s)=[] stop:RoadStop=?
+SignalCommand:signal signal:s phase:i0 duration:f<0=?
 Input topic:n lag:i0..1=0 required:b=true parts:l256(s1..128)=[]
 Demand topic:s1..128 parts:l256(s1..128)=[]
 GrantInput topic:s1..128 source:s1..128 status:e(fresh,held,absent,late) frame:i-1=-1 t_ns:i=0 age:i0=0 fidelity:s='' digest:D='' cause:s=''
@@ -433,6 +437,7 @@ Report source:s1..128 decisions:m(s)={} measured:m(i0)={} counts:m(i0)={}
 ProductHeader topic:s1..128 digest:d fidelity:s=''
 AntennaArray rows:i1..1024=1 columns:i1..1024=1 vertical_spacing:f<0=0.5 horizontal_spacing:f<0=0.5 pattern:e(iso,dipole,hw_dipole,tr38901)='iso' polarization:e(V,H,-45,+45,RHCP,LHCP,VH,cross,circular)='V' pattern_file:s='' panels:l(Panel)=[]
 OccupancyGrid origin:t3(f) cell:t3(f) occupancy:a(|i1,X,Y,Z)
+RoadStop road:s position:f0 duration:f0 lane:i0=0
 Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.0
 =Scene N:names,classes,assets
 =Channel C:carriers

@@ -245,6 +245,7 @@ SINCE: dict[str, str] = {
     "ChannelOptions.absorption_db_per_km": "1.1",
     "ChannelOptions.detail": "1.1",
     "ChannelOptions.foliage": "1.4",
+    "ChannelOptions.blockage": "1.6",
     "Welcome.rejoin_ns": "1.3",
     "Prepare.prefixes": "1.3",
     "Fault.culprit": "1.3",
@@ -277,6 +278,9 @@ SINCE: dict[str, str] = {
     "Link.block_errors": "1.5",
     "PathCommand": "1.6",
     "AttitudeCommand": "1.6",
+    "DriveCommand": "1.6",
+    "RoadStop": "1.6",
+    "SignalCommand": "1.6",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

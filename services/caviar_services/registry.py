@@ -32,6 +32,7 @@ from caviar_services.service import NoSettings, Service
 
 BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
+    "world:sumo-actuated": "caviar_services.world.sumo_actuated:ActuatedSumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
     "world:airsim": "caviar_services.world.airsim:AirSimWorld",

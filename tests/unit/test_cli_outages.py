@@ -57,6 +57,16 @@ def test_paths_that_were_dropped_are_warned_of() -> None:
     assert ReportTally().warnings() == []
 
 
+def test_people_who_are_shown_elsewhere_at_once_are_warned_of() -> None:
+    """Jumps that a body walked are counted in the reports, and need no warning."""
+    moved = ReportTally()
+    for count in (0, 1, 2):
+        counts = {"person-jumps": 5, "persons-put-elsewhere": count}
+        moved.add(0, [Report(source="traffic", counts=counts)])
+    (warning,) = moved.warnings()
+    assert warning.startswith("traffic shows people elsewhere at once 3 times: SUMO put them farther away")
+
+
 def test_a_key_that_is_for_nothing_in_any_frame_is_warned_of() -> None:
     unmatched = ReportTally()
     names = [{"unmatched/object_materials.sing": 1, "unmatched/object_materials.bus": 1},

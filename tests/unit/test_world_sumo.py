@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import logging
 import math
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -21,8 +23,10 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.sumo import SumoSettings, SumoWorld, step_length_ms
+from caviar_services.world.people import PLACED
+from caviar_services.world.sumo import SumoSettings, SumoWorld
 from caviar_services.world.sumo_process import check_file, load_libsumo
+from caviar_services.world.sumo_steps import step_length_ms
 
 pytestmark = [
     pytest.mark.slow,
@@ -31,11 +35,13 @@ pytestmark = [
 ]
 
 Make = Callable[..., SumoWorld]
+_LOG = logging.getLogger(__name__)
 
 FRESH_PROCESS = """
 import hashlib, sys
 from caviar_protocol.codec import encode_payload
 from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.people import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
 
 folder, seed = sys.argv[1], int(sys.argv[2])
@@ -60,6 +66,7 @@ import os, signal, sys
 from pathlib import Path
 from caviar_protocol.codec import encode_payload
 from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.people import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
 
 folder, scratch, first, last, kill = sys.argv[1], Path(sys.argv[2]), *map(int, sys.argv[3:])
@@ -488,6 +495,76 @@ def test_a_configuration_file_is_run_and_settings_go_before_it(
 
     assert len(names((), 60.0)) > 5
     assert names(str(mine), 1.0) == ("traffic.mine",)
+
+
+# --- people ----------------------------------------------------------------------------------
+
+CROSSING = {"net": "crossing.net.xml", "routes": "crossing.rou.xml", "additional": "crossing.add.xml"}
+
+
+def moved(scene: Scene, before: Scene) -> Iterator[tuple[float, float]]:
+    """How far each person of two scenes was moved [m], and by what it was turned [rad]."""
+    for i, name in enumerate(scene.names):
+        if scene.classes[i] == "pedestrian" and name in before.names:
+            j = before.names.index(name)
+            yaws = [euler_from_quaternion(q)[0] for q in (before.orientation[j], scene.orientation[i])]
+            far = float(np.linalg.norm(scene.position[i] - before.position[j]))
+            if far <= 3.0:  # who is put elsewhere is no walk; the report counts it
+                assert scene.velocity[i] == pytest.approx(
+                    (scene.position[i] - before.position[j]) / 0.1, abs=1e-6
+                )
+            yield far, abs(math.remainder(yaws[1] - yaws[0], 2 * math.pi))
+
+
+@pytest.mark.parametrize(
+    ("model", "person_steps"),
+    [
+        ("striping", 6_000),
+        pytest.param("striping", 41_000, marks=pytest.mark.exhaustive),
+        pytest.param("jupedsim", 41_000, marks=pytest.mark.exhaustive),
+        pytest.param("nonInteracting", 41_000, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_no_person_exceeds_3_m_s_or_turns_about_in_a_step_unless_the_report_says_so(
+    make: Make, repository: Path, model: str, person_steps: int
+) -> None:
+    """Beside it what SUMO itself would have shown: its jumps and turns are counted."""
+    folder = repository / "deploy" / "caviar_scenarios" / "crossing"
+    files = {key: str(folder / name) for key, name in CROSSING.items()}
+    world = make(**files, begin_s=60.0, options=("--pedestrian.model", model))
+    world.reset(0, 3, 0)
+    steps = frame = fast = turned = 0
+    counts: Counter[str] = Counter()
+    before: Scene | None = None
+    while steps < person_steps:
+        made = world.step(Frame(episode=0, number=frame, t_ns=frame * T_SAM_NS, previous=frame - 1))
+        scene = made.products["scene"]
+        assert isinstance(scene, Scene)
+        counts.update({key: count for key, count in made.counts.items() if key.startswith("person")})
+        for far, turn in moved(scene, before) if before is not None else ():
+            steps += 1
+            fast += far > 0.3
+            turned += turn > math.pi / 2
+        before, frame = scene, frame + 1
+    assert fast <= counts[PLACED]
+    assert turned <= counts[PLACED]
+    # Shown with --log-cli-level=INFO; the page people-and-traffic has these figures.
+    _LOG.info(f"{model}: {steps} person-steps in {frame} frames, {dict(counts)}")
+
+
+def test_people_walk_on_in_another_process_as_they_would_have(make: Make, repository: Path) -> None:
+    """Where bodies are behind their persons is part of the state."""
+    folder = repository / "deploy" / "caviar_scenarios" / "crossing"
+    files = {key: str(folder / name) for key, name in CROSSING.items()}
+    world = make(**files, begin_s=30.0)
+    scenes(world, 7, 60)
+    state = world.checkpoint()
+    expected = [wire_bytes(scene_at(world, k)) for k in range(60, 80)]
+    again = make(**files, begin_s=30.0)
+    again.reset(0, 7, 0)
+    again.restore(state)
+    assert again.checkpoint() == state
+    assert [wire_bytes(scene_at(again, k)) for k in range(60, 80)] == expected
 
 
 # --- states ------------------------------------------------------------------------------------

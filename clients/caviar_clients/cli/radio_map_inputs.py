@@ -103,7 +103,7 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
 
     Raises:
         RunError: The run has no channel that traces rays.
-        ScenarioError: The channel has foliage, which a map leaves out.
+        ScenarioError: The channel has foliage or people who are screens, which a map leaves out.
     """
     refused = []
     for name, spec in scenes.services.items():
@@ -126,6 +126,10 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
                 raise place.at("foliage").error(
                     "radio maps have no volumes that attenuate; map a scenario without foliage, and without "
                     "the pieces of scenery and objects that are"
+                )
+            if settings.human_blockage is not None:
+                raise place.at("human_blockage").error(
+                    "radio maps have no people who are screens; map a scenario without human_blockage"
                 )
             return cls(settings, run), scenes.assets
         if issubclass(cls, FreeSpaceChannel) and isinstance(settings, FreeSpaceSettings):

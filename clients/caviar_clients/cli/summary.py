@@ -28,6 +28,7 @@ from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX
 STATE = "state:"
 """Begins the name of a decision that is no choice, but what a service knew when the episode began."""
 
+_PUT_ELSEWHERE = "persons-put-elsewhere"
 _CAUSES = {cause.count_name: cause for cause in Cause}
 _DROPPED = "dropped"
 # What a count means that every frame of a run has, by the count's name or what that begins with.
@@ -227,6 +228,12 @@ class ReportTally:
                 dropped.append(
                     f"{source} dropped {paths} with values that are not finite, in "
                     f"{counted(frames, 'frame')}: what its model computes is wrong there"
+                )
+            elif name == _PUT_ELSEWHERE and frames:
+                times = counted(self._sums[source, name], "time")
+                dropped.append(
+                    f"{source} shows people elsewhere at once {times}: SUMO put them farther away than they "
+                    "walk; see its option --pedestrian.model"
                 )
             # A channel that joined late has reported of fewer frames than there are.
             elif name.startswith(UNMATCHED_PREFIX) and frames == self._reported[source]:

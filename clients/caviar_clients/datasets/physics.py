@@ -269,7 +269,8 @@ def _line_of_sight(
             yield Finding(*place, rx, name, _angles(expected), _angles(got))
     for c, carrier in enumerate(channel.carriers):
         ratio = 20 * math.log10(max(abs(channel.a[c, path]), 1e-300) / max(abs(free.a[c, line]), 1e-300))
-        lossy = bool(channel.options.foliage or channel.options.absorption_db_per_km)
+        options = channel.options
+        lossy = bool(options.foliage or options.blockage or options.absorption_db_per_km)
         is_wrong = ratio > GAIN_DB or (ratio < -GAIN_DB and not lossy)
         if is_wrong and abs(free.a[c, line]) > 1e-30:
             expected_db = 20 * math.log10(abs(free.a[c, line]))

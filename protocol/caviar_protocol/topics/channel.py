@@ -106,6 +106,8 @@ class ChannelOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
     foliage: tuple[str, ...] = ()
     """What attenuates as foliage (ITU-R P.833), by kind and carrier, as ``tree*@v: 2.1 dB/m, at most 40 dB
     (measured)``; empty: nothing."""
+    blockage: tuple[str, ...] = ()
+    """People that are screens (3GPP TR 38.901, model B) and no bodies, by class; empty: none."""
 
 
 class ChannelMatrix(Payload, frozen=True, kw_only=True, omit_defaults=True):

@@ -127,10 +127,76 @@ class AttitudeCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     thrust: Annotated[float, quantity("m/s2", "over the mass, along the body's z", ge=0)]
 
 
-MotionCommand = WaypointCommand | VelocityCommand | PathCommand | AttitudeCommand
-"""Commands of which the actuator is ``motion:<object>``."""
+class RoadStop(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Where a vehicle stops, and for how long.
 
-Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule | PathCommand | AttitudeCommand
+    Example:
+        >>> RoadStop(road="east2", position=40.0, duration=10.0).lane
+        0
+    """
+
+    road: str
+    """Name of the road in the world's network."""
+    position: Annotated[float, quantity("m", "along the road, of the front of the vehicle", ge=0)]
+    duration: Annotated[float, quantity("s", "from when it stands", ge=0)]
+    lane: Annotated[int, quantity("1", "from the outermost one", ge=0)] = 0
+
+
+class DriveCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="drive"):
+    """Drive a vehicle on its network of roads. The actuator is ``motion:<object>``.
+
+    Worlds need not know it.
+
+    Example:
+        >>> DriveCommand(object="traffic.bus", speed=0.0).route  # it brakes, and stays on its route
+        ()
+    """
+
+    object: str
+    """Vehicle to be driven."""
+    speed: Annotated[float, quantity("m/s", "as far as traffic allows", ge=0)] | None = None
+    """Until the next command for the vehicle; absent: as the world's own driver chooses."""
+    lane: Annotated[int, quantity("1", "to change to, from the outermost one", ge=0)] | None = None
+    """Absent: as the world's own driver chooses."""
+    route: tuple[str, ...] = ()
+    """Roads from the one on which it is to its destination; empty: as before."""
+    stop: RoadStop | None = None
+    """To be made on the route; absent: none is added."""
+
+
+class SignalCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="signal"):
+    """Switch traffic lights to a phase of their program. The actuator is ``signal:<signal>``.
+
+    Worlds need not know it.
+
+    Example:
+        >>> SignalCommand(signal="traffic.junction", phase=2).duration is None  # that of the program
+        True
+    """
+
+    signal: str
+    """Name of the lights, with the prefix of the world."""
+    phase: Annotated[int, quantity("1", "index into the program", ge=0)]
+    duration: Annotated[float, quantity("s", "from now on", gt=0)] | None = None
+    """After it the program continues; absent: that of the phase."""
+
+
+MotionCommand = WaypointCommand | VelocityCommand | PathCommand | AttitudeCommand
+"""Commands that move an object freely; the actuator is ``motion:<object>``."""
+
+TrafficCommand = DriveCommand | SignalCommand
+"""Commands for traffic on a network of roads."""
+
+Command = (
+    BeamChoice
+    | WaypointCommand
+    | VelocityCommand
+    | UserSchedule
+    | PathCommand
+    | AttitudeCommand
+    | DriveCommand
+    | SignalCommand
+)
 
 
 class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):

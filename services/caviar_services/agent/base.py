@@ -24,7 +24,7 @@ from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 # What actuators other than beams begin with; a name without any of these is that of a receiver.
-_OTHER_ACTUATORS = ("motion:", "schedule:")
+_OTHER_ACTUATORS = ("motion:", "schedule:", "signal:")
 
 _FORM = "BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=…, rx_beam=…)"
 

@@ -22,7 +22,14 @@ from caviar_protocol.messages import Input
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.scene_validation import UNIT_TOLERANCE
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler, rotated
-from caviar_protocol.topics import Action, AttitudeCommand, PathCommand, VelocityCommand, WaypointCommand
+from caviar_protocol.topics import (
+    Action,
+    AttitudeCommand,
+    DriveCommand,
+    PathCommand,
+    VelocityCommand,
+    WaypointCommand,
+)
 from caviar_protocol.topics.link import MotionCommand
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
@@ -291,6 +298,11 @@ class FlightWorld(TrajectoryWorld):
         found: dict[str, tuple[str, MotionCommand]] = {}
         for agent, action in frame.payloads("action", Action).items():
             for command in action.commands:
+                if isinstance(command, DriveCommand) and command.object in self._flown:
+                    raise PayloadError(
+                        f"agent {agent!r} sends DriveCommand to {command.object!r}, which flies; "
+                        "send waypoints"
+                    )
                 if not isinstance(command, MotionCommand):
                     continue
                 name = command.object

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
@@ -15,16 +16,16 @@ from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import Vector
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.shapes import SHAPES
-from caviar_services.service import Preparation, Prepared, RunInfo
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
-from caviar_services.world.sumo_conventions import Placement, body_pose, heading, object_class
+from caviar_services.world.people import People
+from caviar_services.world.sumo_commands import Commanded, carry_out
+from caviar_services.world.sumo_conventions import Heading, Placement, body_pose, heading, object_class
 from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
 from caviar_services.world.sumo_states import TrafficStates
+from caviar_services.world.sumo_steps import check_spacing, step_length_ms
 
 _NS_PER_MS = 1_000_000
-# SUMO's car-following models are made for steps up to one second.
-_LONGEST_STEP_MS = 1000
-
 # A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.
 _JUMP_DEG = 90.0
 
@@ -88,13 +89,16 @@ class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Objects of the last frame, those that came first in front."""
     traffic: str
     """Digest of all vehicles and persons there."""
+    commanded: tuple[Commanded, ...] = ()
+    """What agents have commanded since frame 0."""
 
 
 class SumoWorld(World[SumoSettings]):
     """Traffic of a SUMO network.
 
     Every frame shows the vehicles and persons that are in the network; a person inside a
-    vehicle is not shown, nor a vehicle that SUMO is moving elsewhere (teleporting).
+    vehicle is not shown, nor a vehicle that SUMO is moving elsewhere (teleporting). People stand upright and
+    walk smoothly after the places where SUMO has them (`people`).
 
     Args:
         settings: Files of SUMO, its step, where the network lies, and classes of objects.
@@ -124,6 +128,8 @@ class SumoWorld(World[SumoSettings]):
         self._angles: dict[str, float] = {}
         self._vehicles: dict[str, _Kind] = {}
         self._persons: dict[str, _Kind] = {}
+        self._people = People(self._step_ms / 1000.0)
+        self._commanded: list[Commanded] = []
         if settings.between_episodes_s is not None:
             check_spacing(settings.between_episodes_s, self._step_ms)
         if not settings.net and not settings.config:
@@ -169,8 +175,8 @@ class SumoWorld(World[SumoSettings]):
             if not states.file(episode).exists():
                 states.make(episode + 1, self._passed)
             simulation.start(states.arguments(episode))
-            self._angles = {}
             self._take_over(simulation)
+            self._begin_here(simulation)
             return
         simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
         # Compared in milliseconds, to half a step: SUMO adds its steps up in floating point.
@@ -179,8 +185,23 @@ class SumoWorld(World[SumoSettings]):
             self._step(simulation)
             if self._steps % _REPORT_EVERY == 0:
                 self.run.progress(f"fill the roads: {simulation.api.simulation.getTime():.0f} s", 0.0)
-        self._steps = 0
-        self._angles = {}
+        self._begin_here(simulation)
+
+    def _begin_here(self, simulation: Simulation) -> None:
+        """Count steps from here on; nothing turns, and people are where SUMO has them."""
+        self._steps, self._angles = 0, {}
+        self._commanded = []
+        self._people.clear()
+        self._walk(simulation)
+
+    def step(self, frame: Frame) -> StepResult:
+        """See `World.step`; the report counts what SUMO did with people that no person does.
+
+        Args:
+            frame: The frame.
+        """
+        made = super().step(frame)
+        return replace(made, counts={**made.counts, **self._people.taken_counts()})
 
     def traffic_states(self, seed: int) -> TrafficStates | None:
         """The saved states of the traffic that all episodes share; None where each has its own.
@@ -226,30 +247,40 @@ class SumoWorld(World[SumoSettings]):
             raise RunError(f"world {self.run.name!r} was granted t = {elapsed_ns} ns after a later instant")
         while self._steps < steps:
             self._step(simulation)
+            self._walk(simulation)
         return self._objects()
 
     def _objects(self) -> list[ObjectState]:
         """As they are now."""
         simulation = self._started()
         return [
-            *self._states(simulation.api.vehicle, self._vehicles, simulation.api),
-            *self._states(simulation.api.person, self._persons, simulation.api),
+            *self._vehicle_states(simulation.api.vehicle, simulation.api),
+            *self._person_states(simulation.api.person),
         ]
 
     def checkpoint(self) -> bytes:
         """How far it went, and where that led."""
-        state = _State(steps=self._steps, arrived=self._mounts.arrived, traffic=self._traffic())
+        state = _State(
+            steps=self._steps,
+            arrived=self._mounts.arrived,
+            traffic=self._traffic(),
+            commanded=tuple(self._commanded),
+        )
         return saved(self, 1, state)
 
     def restore(self, state: bytes) -> None:
-        """Go the same way again, in steps as small as before.
+        """Go the same way again, in steps as small as before and with the same commands.
 
         Raises `RunError` where it led elsewhere: files or SUMO have changed.
         """
         was = restored(self, 1, _State, state)
         simulation = self._started()
+        self._commanded = list(was.commanded)
+        commanded = {entry.step: entry.commands for entry in was.commanded}
         while self._steps < was.steps:
+            carry_out(simulation.api, commanded.get(self._steps, ()), self._prefix)
             self._step(simulation)
+            self._walk(simulation)
             if self._steps % _REPORT_EVERY == 0:
                 self.run.progress(f"the same traffic again: step {self._steps} of {was.steps}", 0.0)
         if self._traffic() != was.traffic:
@@ -257,6 +288,7 @@ class SumoWorld(World[SumoSettings]):
                 f"world {self.run.name!r} has other traffic {was.steps} steps after frame 0 than it had "
                 "before it was started again: its files, or SUMO, have changed; start the run again"
             )
+        self._people.taken_counts()  # of frames that were reported
         # Which objects came first follows from all frames before, which are not computed again.
         self._mounts.clear(was.arrived)
 
@@ -313,16 +345,23 @@ class SumoWorld(World[SumoSettings]):
         kind = object_class(domain.getTypeID(name), domain.getVehicleClass(name), self.settings.classes)
         return _Kind(kind, (domain.getLength(name), domain.getWidth(name), domain.getHeight(name)))
 
-    def _states(self, domain: Any, known: dict[str, _Kind], api: Any) -> Iterator[ObjectState]:
-        present = set(domain.getIDList())
-        for name in [name for name in known if name not in present]:
-            del known[name]
-        # `known` keeps the order of departure, which `getIDList` does not have.
-        for name, (kind, dimensions) in known.items():
+    def _walk(self, simulation: Simulation) -> None:
+        """Let people walk after the places where SUMO has them now."""
+        persons, seen = simulation.api.person, []
+        for name in persons.getIDList():
+            place = persons.getPosition3D(name)
+            if persons.getVehicle(name) or place[0] == simulation.api.INVALID_DOUBLE_VALUE:
+                continue
+            # `yaw = 90° − angle`, within SUMO's own axes.
+            yaw = heading(persons.getAngle(name), 0.0, Placement()).yaw
+            self._people.step(name, place, yaw, persons.getSpeed(name))
+            seen.append(name)
+        self._people.keep(seen)
+
+    def _vehicle_states(self, domain: Any, api: Any) -> Iterator[ObjectState]:
+        for name, (kind, dimensions) in _present(self._vehicles, domain.getIDList()):
             bumper = domain.getPosition3D(name)
             if bumper[0] == api.INVALID_DOUBLE_VALUE:  # on its way elsewhere, by no road
-                continue
-            if domain is api.person and domain.getVehicle(name):
                 continue
             angle = domain.getAngle(name)
             towards = heading(angle, domain.getSlope(name), self._placement)
@@ -336,72 +375,44 @@ class SumoWorld(World[SumoSettings]):
                 orientation=pose.orientation,
                 velocity=(speed * fx, speed * fy, speed * fz),
                 dimensions=dimensions,
-                yaw_rate=self._yaw_rate(name, angle) if domain is api.vehicle else 0.0,
+                yaw_rate=self._yaw_rate(name, angle),
+            )
+
+    def _person_states(self, domain: Any) -> Iterator[ObjectState]:
+        turn = self._placement.yaw
+        c, s = math.cos(turn), math.sin(turn)
+        for name, (kind, dimensions) in _present(self._persons, domain.getIDList()):
+            if name not in self._people:  # rides in a vehicle
+                continue
+            body = self._people.body(name)
+            vx, vy, vz = body.velocity
+            # The middle of the body is where SUMO has the person: a length of 0 has no front. Models of
+            # pedestrians do not agree on whether it is the front, half a length of 0.2 m away.
+            towards = Heading(body.yaw + turn, 0.0)
+            pose = body_pose(body.position, towards, 0.0, dimensions[2], self._placement)
+            yield ObjectState(
+                name=self._prefix + name,
+                kind=kind,
+                position=pose.position,
+                orientation=pose.orientation,
+                velocity=(c * vx - s * vy, s * vx + c * vy, vz),
+                dimensions=dimensions,
+                yaw_rate=turning(body.yaw_rate),
             )
 
     def _yaw_rate(self, vehicle: str, angle: float) -> float:
-        """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. A person turns on the
-        spot, from one step to the next, and so does a vehicle that SUMO puts elsewhere: these have none."""
+        """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. One that SUMO puts
+        elsewhere has none."""
         turned = math.remainder(angle - self._angles.get(vehicle, angle), 360.0)
         return turning(-math.radians(turned) * 1000.0 / self._step_ms) if abs(turned) < _JUMP_DEG else 0.0
 
 
-def step_length_ms(sampling_period_ns: int, step_ms: int | None) -> int:
-    """Choose SUMO's step for a sampling period. SUMO steps whole milliseconds.
-
-    Args:
-        sampling_period_ns: Sampling period of the run [ns].
-        step_ms: The step that is asked for [ms]; None: the sampling period.
-
-    Returns:
-        [ms]
-
-    Raises:
-        ScenarioError: The sampling period is no whole number of steps; says what to write.
-
-    Example:
-        >>> step_length_ms(100_000_000, None), step_length_ms(100_000_000, 20)
-        (100, 20)
-    """
-    period_ms, rest = divmod(sampling_period_ns, _NS_PER_MS)
-    if rest:
-        near = " or ".join(str(ms * _NS_PER_MS) for ms in (period_ms, period_ms + 1) if ms)
-        raise ScenarioError(
-            f"SUMO steps whole milliseconds, and {sampling_period_ns} ns is none; write {near}",
-            key="run.sampling_period_ns",
-        )
-    step = period_ms if step_ms is None else step_ms
-    if (step_ms is None and period_ms > _LONGEST_STEP_MS) or not 1 <= step <= period_ms or period_ms % step:
-        fitting = max(
-            n for n in range(1, min(period_ms, max(step, 1), _LONGEST_STEP_MS) + 1) if period_ms % n == 0
-        )
-        raise ScenarioError(
-            f"a step of {step} ms does not fit the sampling period of {period_ms} ms; "
-            f"write step_ms = {fitting}",
-            key="settings.step_ms",
-        )
-    return step
-
-
-def check_spacing(between_episodes_s: float, step_ms: int) -> None:
-    """Check that episodes can begin so far apart in one traffic.
-
-    Args:
-        between_episodes_s: From the beginning of an episode to that of the next [s].
-        step_ms: SUMO's step [ms].
-
-    Raises:
-        ScenarioError: It is not a whole number of steps, or none at all.
-
-    Example:
-        >>> check_spacing(30.0, 100)
-    """
-    ms = between_episodes_s * 1000.0
-    if not 0 < ms < math.inf or abs(ms / step_ms - round(ms / step_ms)) > 1e-6:
-        raise ScenarioError(
-            f"{between_episodes_s} s is not a whole number of SUMO's steps of {step_ms} ms, at least one",
-            key="settings.between_episodes_s",
-        )
+def _present(known: dict[str, _Kind], present: Sequence[str]) -> list[tuple[str, _Kind]]:
+    """Forget what has left. What is there stays in the order of departure, which `getIDList` lacks."""
+    names = set(present)
+    for name in [name for name in known if name not in names]:
+        del known[name]
+    return list(known.items())
 
 
 def _tuple(files: Files) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.clearance import with_near_pairs
 from caviar_services.channel.propagation.foliage import Foliage
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+from caviar_services.channel.propagation.human_blockage import HumanBlockage
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table
@@ -42,7 +43,7 @@ class ElementTracer:
         wavelengths: Of the carriers [m].
         lanes: Candidates that are tested together at most.
         los: Whether straight paths count.
-        foliage: Of the frame; None: there is none.
+        losses: What paths lose in, of the frame: foliage, people.
     """
 
     def __init__(
@@ -53,9 +54,9 @@ class ElementTracer:
         wavelengths: Float64Array,
         lanes: int,
         los: bool,
-        foliage: Foliage | None = None,
+        losses: Sequence[Foliage | HumanBlockage] = (),
     ) -> None:
-        self._foliage = foliage
+        self._losses = losses
         self._tracer = tracer
         self._scene = scene
         self._velocity = velocity
@@ -140,8 +141,8 @@ class ElementTracer:
         )
         los = np.zeros(len(ends), np.bool_)
         table, _ = with_near_pairs(table, los, *places, self._wavelengths, self._scene.surfaces)
-        if self._foliage is not None:
-            table = self._foliage.attenuated(table, *path_ends(table.pair, *places))
+        for loss in self._losses:
+            table = loss.attenuated(table, *path_ends(table.pair, *places))
         return table if self._los else table.take((table.types != 0).any(1))
 
     def _amplitudes(

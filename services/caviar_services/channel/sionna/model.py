@@ -29,6 +29,7 @@ from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.clearance import with_near_pairs
 from caviar_services.channel.propagation.foliage import Foliage
+from caviar_services.channel.propagation.human_blockage import HumanBlockage
 from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
@@ -97,6 +98,10 @@ class SionnaChannel(PathModel[SionnaSettings]):
             others = {"without_body": settings.without_body, "object_materials": settings.object_materials}
             self.foliage = Foliage(settings.foliage, run.carriers, run.settings_place, others)
             self._keys["foliage"] = self.foliage.keys
+        self.blockage: HumanBlockage | None = None
+        """People as screens; None: they are bodies."""
+        if settings.human_blockage is not None:
+            self.blockage = HumanBlockage(settings.human_blockage, run.carriers)
         # Names and classes of the last frame's objects, and which keys match none: both seldom change.
         self._known_unmatched: tuple[object, dict[str, int]] = (None, {})
         self._samples = settings.launched_samples()
@@ -118,6 +123,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             materials_outside=tuple(use.brief(self.run.carriers[use.carrier].name) for use in self._outside),
             detail=self._detail,
             foliage=() if self.foliage is None else self.foliage.briefs,
+            blockage=() if self.blockage is None else self.blockage.briefs,
         )
 
     @property
@@ -127,6 +133,16 @@ class SionnaChannel(PathModel[SionnaSettings]):
     @property
     def room(self) -> Mapping[str, int]:
         return self._room
+
+    @property
+    def _losses(self) -> tuple[Foliage | HumanBlockage, ...]:
+        """What paths lose in beside what they meet."""
+        found: list[Foliage | HumanBlockage] = []
+        if self.foliage is not None:
+            found.append(self.foliage)
+        if self.blockage is not None:
+            found.append(self.blockage)
+        return tuple(found)
 
     def enclosing(self, position: Float64Array) -> str:
         """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from.
@@ -304,8 +320,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         # Another service of an embedded run may have set another variant.
         self._activate()
         _refuse_buried(scene, self.settings.without_body, self.foliage)
-        if self.foliage is not None:
-            self.foliage.move(scene)
+        for loss in self._losses:
+            loss.move(scene)
         finder, antennas = self._finder, (transmitters, receivers)
         names, velocity = finder.place(scene)
         self._names = names
@@ -321,9 +337,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
         straight = (table.types == 0).all(1)
         los[table.pair[straight if table.hidden is None else straight & ~table.hidden]] = True
         table, too_close = with_near_pairs(table, los, *antennas, finder.wavelengths, self._scene.surfaces)
-        # After the near pairs, whose lines of sight foliage dims, too.
-        if self.foliage is not None:
-            table = self.foliage.attenuated(table, *path_ends(table.pair, *antennas))
+        # After the near pairs, whose lines of sight foliage and people dim, too.
+        for loss in self._losses:
+            table = loss.attenuated(table, *path_ends(table.pair, *antennas))
         if not self.settings.los:
             table = table.take((table.types != 0).any(1))
         return Found(
@@ -363,11 +379,11 @@ class SionnaChannel(PathModel[SionnaSettings]):
         pairs: int,
         weight: Float64Array | float = 1.0,
     ) -> Float64Array:
-        """Weighted power of paths between each pair, with what foliage leaves of them."""
+        """Weighted power of paths between each pair, with what foliage and people leave of them."""
         transfer = traced.transfer
-        if self.foliage is not None:
+        for loss in self._losses:
             start, end = path_ends(pair, *antennas)
-            factor = self.foliage.amplitude_factor(start, traced.points, end, traced.types)
+            factor = loss.amplitude_factor(start, traced.points, end, traced.types)
             transfer = transfer * factor[..., None, None]
         power = weight * (np.abs(transfer) ** 2).sum((0, 2, 3))
         return np.bincount(pair, weights=power, minlength=pairs).astype(np.float64)
@@ -389,7 +405,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 finder.wavelengths,
                 max(1, lanes),
                 self.settings.los,
-                self.foliage,
+                self._losses,
             )
         return None
 

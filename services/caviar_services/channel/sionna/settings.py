@@ -25,6 +25,7 @@ from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.foliage import FoliageSettings
 from caviar_services.channel.propagation.fresnel import slab
+from caviar_services.channel.propagation.human_blockage import HumanBlockageSettings, check_screens
 from caviar_services.channel.sionna.materials import (
     DRAWN,
     OTHER_MATERIALS,
@@ -160,6 +161,9 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """What is foliage, through which waves pass with a loss: classes of moving objects, and names or patterns
     of names of objects and pieces of scenery, as in ``object_materials``. The volume of a piece of scenery is
     within its mesh, which is to be closed; that of an object is its bounding box."""
+    human_blockage: HumanBlockageSettings | None = None
+    """People as screens after 3GPP TR 38.901, blockage model B, ``{}`` with the sizes of the objects; their
+    class has to stand in ``without_body``, too, so that they do not block twice. Absent: none."""
     detail: DetailSettings = msgspec.field(default_factory=DetailSettings)
     """What of the scenery is left out; absent, nothing is."""
     outside_itu_range: OutsideRange = "error"
@@ -177,6 +181,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             raise ValueError(
                 'rung = "mimo-rt" traces all paths of an antenna pair at once; leave out scattering_samples'
             )
+        if self.human_blockage is not None:
+            check_screens(self.human_blockage, {"foliage": self.foliage}, self.without_body)
         if self.free_edges and not self.diffraction:
             raise ValueError("free_edges needs diffraction = true; write both or neither")
         if self.edges_within_m is not None and (not self.diffraction or self.rung == "mimo-rt"):
