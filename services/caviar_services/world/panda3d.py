@@ -207,6 +207,7 @@ class Panda3dWorld(World[Panda3dSettings]):
         level = self._level
         if "camera" in preparation.demand:
             self._pictures = Pictures(level.node)
+            self._pictures.warm_up()
         prepared = super().prepare(preparation)
         if self.settings.model:
             shapes = sum(name.endswith(".ply") for name in level.assets)

@@ -457,6 +457,22 @@ class Pictures:
             )
         )
 
+    def warm_up(self) -> None:
+        """Take a picture of the level alone, so that the first frame does not wait for the renderer to load."""
+        nothing = np.zeros((0, 3))
+        self.take(
+            Scene(
+                names=(),
+                classes=(),
+                assets=(),
+                position=nothing,
+                orientation=np.zeros((0, 4)),
+                velocity=nothing,
+                dimensions=nothing,
+                devices=(CameraDevice(name="warm-up", width=8, height=6, position=(0.0, 0.0, 2.0)),),
+            )
+        )
+
     def close(self) -> None:
         """Release the buffers."""
         self._cameras.clear()
@@ -474,6 +490,11 @@ class Pictures:
         sun.setDirection(core.Vec3(*ray))
         for light in (sky, sun):
             self._root.setLight(self._root.attachNewNode(light))
+        # Without a material the renderer lights the colour of a node and multiplies by that colour again.
+        white = core.Material()
+        white.setAmbient((1.0, 1.0, 1.0, 1.0))
+        white.setDiffuse((1.0, 1.0, 1.0, 1.0))
+        self._root.setMaterial(white)
 
     def _show(self, scene: Scene) -> None:
         for gone in self._objects.keys() - set(scene.names):
