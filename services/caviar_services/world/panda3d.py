@@ -28,16 +28,9 @@ from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
-from caviar_services.world.panda3d_engine import (
-    TICK_NS,
-    Body,
-    Level,
-    Physics,
-    Pictures,
-    empty_level,
-    level_of_model,
-    level_of_scenery,
-)
+from caviar_services.world.panda3d_bodies import TICK_NS, Body, Physics
+from caviar_services.world.panda3d_level import Level, empty_level, level_of_model, level_of_scenery
+from caviar_services.world.panda3d_pictures import Pictures
 from caviar_services.world.scenery import scenery_file
 from caviar_services.world.trajectory import Length, NamedObject, unique_name
 
@@ -271,9 +264,7 @@ class Panda3dWorld(World[Panda3dSettings]):
             pose, velocity, yaw_rate = self._bodies[name].state()
             if rest:
                 x, y, z = (p + v * rest for p, v in zip(pose.position, velocity, strict=True))
-                pose = Pose(
-                    (x, y, z), multiply(quaternion_from_euler(yaw_rate * rest), pose.orientation)
-                )
+                pose = Pose((x, y, z), multiply(quaternion_from_euler(yaw_rate * rest), pose.orientation))
             yield ObjectState(
                 name=name,
                 kind=thing.kind,
@@ -285,7 +276,7 @@ class Panda3dWorld(World[Panda3dSettings]):
             )
 
     def checkpoint(self) -> bytes:
-        """All commands since the episode began: Bullet does not give out all that its next step depends on."""
+        """All commands since the episode began: not all that Bullet's next step depends on can be read."""
         return saved(self, 1, _State(orders=tuple(self._orders)))
 
     def restore(self, state: bytes) -> None:
@@ -372,9 +363,7 @@ def _checked(agent: str, command: MotionCommand) -> VelocityCommand | WaypointCo
     return command
 
 
-def _wanted(
-    command: VelocityCommand | WaypointCommand | None, body: Body, uav: EngineFlownObject
-) -> Vector:
+def _wanted(command: VelocityCommand | WaypointCommand | None, body: Body, uav: EngineFlownObject) -> Vector:
     """Velocity that a command asks for [m/s], within what the UAV can do; without one it brakes."""
     if isinstance(command, WaypointCommand):
         speed = min(command.speed, uav.max_speed_m_s)
