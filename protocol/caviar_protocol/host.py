@@ -148,6 +148,7 @@ _MODULES = {
     "plot": "matplotlib",
     "mavlink": "pymavlink",
     "mujoco": "mujoco",
+    "panda3d": "panda3d",
     "system": "sionna.sys",
 }
 
@@ -157,7 +158,7 @@ def has_extra(extra: str) -> bool:
 
     Args:
         extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``datasets``, ``learning``, ``plot``,
-            ``mavlink``, ``mujoco`` or ``system``.
+            ``mavlink``, ``mujoco``, ``panda3d`` or ``system``.
     """
     package, _, inner = _MODULES[extra].partition(".")
     spec = importlib.util.find_spec(package)

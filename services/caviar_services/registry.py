@@ -36,6 +36,7 @@ BUILT_IN: dict[str, str] = {
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
     "world:airsim": "caviar_services.world.airsim:AirSimWorld",
+    "world:panda3d": "caviar_services.world.panda3d:Panda3dWorld",
     "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
     "channel:free-space": "caviar_services.channel.statistical.free_space:FreeSpaceChannel",
     "channel:geometric": "caviar_services.channel.statistical.geometric:GeometricChannel",

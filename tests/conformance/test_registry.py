@@ -26,6 +26,7 @@ EXTRAS = {
     "world:sumo": "libsumo",
     "sensors:camera": "mitsuba",
     "world:flight": "sionna",
+    "world:panda3d": "panda3d",
     "channel:sionna-rt": "sionna",
     "sensors:lidar": "mitsuba",
     "agent:policy": "onnx",

@@ -28,7 +28,7 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Servi
 from caviar_services.testing import samples
 
 # Importing one of these costs start-up time and memory in every process that does, an agent's too.
-HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib", "scipy")
+HEAVY = ("mitsuba", "drjit", "sionna", "torch", "libsumo", "traci", "matplotlib", "panda3d", "scipy")
 """Libraries that an implementation imports only when it prepares."""
 
 FRAMES = 4
