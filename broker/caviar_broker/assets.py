@@ -74,7 +74,7 @@ class _Delivery:
 
 @dataclass
 class AssetExchange:
-    """Handles the messages of services about assets, and holds back READY and DONE until their files are here.
+    """Handles the messages of services about assets; holds back READY and DONE until their files are here.
 
     Args:
         store: Where assets are kept.

@@ -179,8 +179,8 @@ class Asset(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 class GeometryChange(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Meshes that a world has beyond those of its ASSET_OFFER, from a frame of the episode on.
 
-    It replaces what the world announced before, so that a world which was started again says it once more, and
-    what nothing needs any longer is left out.
+    It replaces what the world announced before: a world that was started again says it once more, and what
+    nothing needs any longer is left out.
 
     Example:
         >>> import hashlib

@@ -1,8 +1,8 @@
 """Meshes that worlds announce while a run goes on: their names, and what they have to be.
 
-A mesh is named by the SHA-256 of its file, so that a name never stands for another file: not in this run, not
-after a restart, not in its recording. Whether a file is a mesh is decided once, where it enters a run, so that
-all consumers of geometry hold the same.
+A mesh is named by the SHA-256 of its file, so that a name never stands for another file: not in this run,
+not after a restart, not in its recording. Whether a file is a mesh is decided once, where it enters a run, so
+that all consumers of geometry hold the same.
 """
 
 from __future__ import annotations
@@ -210,4 +210,4 @@ class MeshCheck:
 
 
 def _too_many(called: str, count: int, most: int) -> str:
-    return f"{called}: has {count} faces, the run takes {most} (run.max_faces); give it fewer, or raise the limit"
+    return f"{called}: has {count} faces, the run takes {most} (run.max_faces); give it fewer, or raise that"

@@ -351,7 +351,7 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
 
 
 class Geometry(_Message, frozen=True, kw_only=True, tag="GEOMETRY"):
-    """Broker to service: fetch and load these meshes beside those of PREPARE, for the frames from this one on.
+    """Broker to service: fetch and load these meshes beside those of PREPARE, for this frame and later ones.
     Answered by GEOMETRY_DONE, in the order in which they came. Needs capability ``geometry``."""
 
     epoch: Epoch
@@ -365,11 +365,12 @@ class Geometry(_Message, frozen=True, kw_only=True, tag="GEOMETRY"):
 
 
 class GeometryDone(_Message, frozen=True, kw_only=True, tag="GEOMETRY_DONE"):
-    """Service to broker: I hold the geometry of this frame. Under the policy ``wait`` the service is not granted
-    the frame before.
+    """Service to broker: I hold the geometry of this frame. Under the policy ``wait`` the service is not
+    granted the frame before.
 
     Example:
-        >>> msgspec.to_builtins(GeometryDone(epoch=1, attempt=1, episode=0, frame=12, geometry="00" * 32))["frame"]
+        >>> done = GeometryDone(epoch=1, attempt=1, episode=0, frame=12, geometry="00" * 32)
+        >>> msgspec.to_builtins(done)["frame"]
         12
     """
 

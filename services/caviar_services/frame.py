@@ -234,8 +234,8 @@ class StepResult(msgspec.Struct, frozen=True, kw_only=True):
     end_episode: bool = False
     """Agents: this frame is the last of the episode."""
     meshes: Mapping[str, Path | bytes] | None = None
-    """Worlds with ``changes_geometry``: files of all meshes, beside those of `Service.scenery`, that objects may
-    have, by their names (`caviar_protocol.geometry.mesh_name`); None: as before."""
+    """Worlds with ``changes_geometry``: files of all meshes, beside those of `Service.scenery`, that objects
+    may have, by their names (`caviar_protocol.geometry.mesh_name`); None: as before."""
     meshes_from: int = -1
     """First frame in which they may; −1: this one."""
     seed: int = -1

@@ -1,8 +1,8 @@
 """A service's side of meshes that come and go while a run goes on (contract, clause 4).
 
-`AnnouncedMeshes` is that of a world: what its steps say of meshes as `GeometryChange`. `FollowedMeshes` is that
-of the services that load them: GEOMETRY says which there are from a frame on, the files are fetched beside the
-frames, and the service uses them from that frame on.
+`AnnouncedMeshes` is that of a world: what its steps say of meshes as `GeometryChange`. `FollowedMeshes` is
+that of the services that load them: GEOMETRY says which there are from a frame on, the files are fetched
+beside the frames, and the service uses them from that frame on.
 """
 
 from __future__ import annotations

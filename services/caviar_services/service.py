@@ -182,8 +182,8 @@ class Service(ABC, Generic[S]):
     uses_scenery: ClassVar[bool] = False
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
     changes_geometry: ClassVar[bool] = False
-    """Whether meshes may come and go while the run goes on: a world announces them (`StepResult.meshes`), other
-    services implement `use_meshes`."""
+    """Whether meshes may come and go while the run goes on: a world announces them (`StepResult.meshes`),
+    other services implement `use_meshes`."""
     checkpoints: ClassVar[bool] = False
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
     batches: ClassVar[bool] = False

@@ -94,7 +94,7 @@ class Dispatcher:
         self._waiting_for_frames: set[Participant] = set()
         self._waiting_for_geometry: set[Participant] = set()
         self.lacks_geometry: Callable[[str, int], bool] | None = None
-        """Whether a service has yet to load the meshes of a frame; None: no frame has any beyond scenery's."""
+        """Whether a service has yet to load the meshes of a frame; None: there is nothing but scenery."""
         # Finished frames when services were last woken for them.
         self._seen_finished = 0
 
@@ -390,7 +390,7 @@ class Dispatcher:
         return True
 
     def _awaits_geometry(self, participant: Participant, frame: int) -> bool:
-        """Whether a frame waits until its service has loaded its meshes: not where a late one is done without."""
+        """Whether a frame waits until its service has loaded its meshes; one that may miss it need not."""
         if self.lacks_geometry is None or not participant.plan.is_indispensable:
             return False
         # One that is gone is sent the meshes again when it comes back, and its grants after them.

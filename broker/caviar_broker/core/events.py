@@ -168,8 +168,8 @@ class StepRequested(msgspec.Struct, frozen=True):
 # A union for the type checker; `FrameClock` looks the handler up by the class of the event.
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
-    | CheckpointReceived | GeometryDoneReceived | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
-    | PauseRequested | ResumeRequested | StepRequested | PolicyOffered
+    | CheckpointReceived | GeometryDoneReceived | Violated | Progressed | Lost | ByeReceived | Journaled
+    | StopRequested | PauseRequested | ResumeRequested | StepRequested | PolicyOffered
 )  # fmt: skip
 
 

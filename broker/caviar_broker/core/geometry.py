@@ -1,9 +1,9 @@
 """Meshes that worlds announce while an episode goes on, and which services hold them (contract, clause 4).
 
-A world names meshes with its answer to a frame, and the frame from which on scenes may name them. GEOMETRY tells
-the services that trace rays or record; each loads them and answers with the digest of all that it holds. Under
-the policies ``wait`` and ``abort`` a service is not granted the frame before. Under the others it computes with
-what it has, says so with its answer, and its products carry that digest.
+A world names meshes with its answer to a frame, and the frame from which on scenes may name them. GEOMETRY
+tells the services that trace rays or record; each loads them and answers with the digest of all that it
+holds. Under the policies ``wait`` and ``abort`` a service is not granted the frame before. Under the others
+it computes with what it has, says so with its answer, and its products carry that digest.
 
 What a world announced lasts until the episode ends: an episode follows from its seed alone.
 """

@@ -357,8 +357,8 @@ def ply(mesh: Mesh, material: str = "") -> bytes:
 
     Args:
         mesh: Of a unit mesh, the box of its vertices is −½…½ on every axis.
-        material: Name in Recommendation ITU-R P.2040 of what it is made of; empty: what the channel's settings
-            say.
+        material: What it is made of, by its name in Recommendation ITU-R P.2040; empty: what the channel's
+            settings say.
 
     Example:
         >>> ply(unit_box())[:3]

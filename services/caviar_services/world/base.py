@@ -271,7 +271,8 @@ class World(Service[W]):
         """
         if not self.changes_geometry:
             raise RunError(
-                f"{type(self).__name__} brings a mesh while the run goes on: write changes_geometry = True in it"
+                f"{type(self).__name__} brings a mesh while the run goes on: write changes_geometry = True "
+                "in the class"
             )
         return self._meshes.add(content)
 
