@@ -307,7 +307,8 @@ class Simulation:
                 if takes is not None:
                     self._later(name, takes, lambda: self.answer(name, message))
             case m.Geometry() if sim.loads is not None:
-                self._later(name, sim.loads, lambda: self.loaded(name, message))
+                # Beside its frames, as a service fetches files.
+                self.after(sim.loads, lambda: self._if_alive(name, attempt, lambda: self.loaded(name, message)))
             case m.Shutdown() if sim.says_bye:
                 self._later(name, 0, lambda: self.feed(ev.ByeReceived(name, "told to")))
             case _:
@@ -343,11 +344,11 @@ class Simulation:
         attempt = self.attempt(name)
         self.busy_until[name] = max(self.now, self.busy_until.get(name, 0)) + takes
 
-        def if_alive() -> None:
-            if name in self.alive and attempt == self.attempt(name):
-                act()
+        self.after(self.busy_until[name] - self.now, lambda: self._if_alive(name, attempt, act))
 
-        self.after(self.busy_until[name] - self.now, if_alive)
+    def _if_alive(self, name: str, attempt: int, act: Callable[[], None]) -> None:
+        if name in self.alive and attempt == self.attempt(name):
+            act()
 
     def _get_ready(self, sim: Sim, message: m.Ready) -> None:
         if sim.assets:
