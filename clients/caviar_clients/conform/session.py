@@ -352,6 +352,28 @@ class Session:
             order["prefixes"] = {world: street.PREFIXES[world] for world in inputs.sources["scene"]}
         return order
 
+    def serve(self, digest: str, data: bytes) -> None:
+        """Have a file that the client may ask for.
+
+        Args:
+            digest: Its SHA-256.
+            data: Its bytes.
+        """
+        self._served[digest] = data
+
+    def serving(self, kind: str) -> Answer:
+        """Return the next message but ASSET_GETs, which are answered; it has to be of this kind.
+
+        Args:
+            kind: Type of the message.
+        """
+        while (answer := self.receive(kind)).kind == "ASSET_GET":
+            self._serve_asset(answer.fields)
+        if answer.kind != kind:
+            raise Failed(kind, str(answer))
+        self.check_identity(answer)
+        return answer
+
     def _serve_asset(self, get: Fields) -> None:
         """Answer an ASSET_GET of the client."""
         digest, offset = get["digest"], get.get("offset", 0)
