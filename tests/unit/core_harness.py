@@ -13,6 +13,7 @@ import heapq
 import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from core_history import History
@@ -308,7 +309,8 @@ class Simulation:
                     self._later(name, takes, lambda: self.answer(name, message))
             case m.Geometry() if sim.loads is not None:
                 # Beside its frames, as a service fetches files.
-                self.after(sim.loads, lambda: self._if_alive(name, attempt, lambda: self.loaded(name, message)))
+                load = partial(self.loaded, name, message)
+                self.after(sim.loads, lambda: self._if_alive(name, attempt, load))
             case m.Shutdown() if sim.says_bye:
                 self._later(name, 0, lambda: self.feed(ev.ByeReceived(name, "told to")))
             case _:

@@ -4,8 +4,8 @@ It shares no code with the product's broker and reads headers with the plain ``m
 it is a second reading of ``protocol/SPEC.md``. Only payloads are judged with `caviar_protocol`'s types.
 
 `conform` takes a client through the cases, one life after another, and collects the verdicts. The cases are
-in `lifecycle`, `frames`, `content`, `geometry` and `wrong`. `session` plays the broker for one life of the client, which
-`client` starts, with the contents of `street`; `canonical` judges what comes.
+in `lifecycle`, `frames`, `content`, `geometry` and `wrong`. `session` plays the broker for one life of the
+client, which `client` starts, with the contents of `street`; `canonical` judges what comes.
 """
 
 from __future__ import annotations
