@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.errors import PayloadError, SetupError
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import derive_seed
@@ -88,6 +88,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._finder: PathFinder
         self._outside: tuple[OutsideUse, ...] = ()
         self._enumerates = False
+        self._bodies_version = 0
         self._detail = ""
         self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()  # of the pieces of the scene in the last frame
@@ -237,7 +238,14 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
         Raises:
             AssetError: A file is no mesh.
+            ScenarioError: Paths are followed: what is known of them is known by the bodies of before.
         """
+        if meshes and self.settings.follow is not None:
+            raise ScenarioError(
+                "a world brings meshes while the run goes on, among which paths cannot be followed; leave it "
+                "out, or have the world bring its meshes at the beginning",
+                key=self.run.settings_place.at("follow").key,
+            )
         self._activate()
         self.run.progress("loading meshes", COMPILE_GRACE_S)
         self._scene.use_meshes(meshes)
@@ -245,12 +253,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _make_room(self, scene: Scene) -> None:
         """Make bodies for objects whose meshes came while the run goes on, where there are too few."""
-        # Kernels may have to be compiled for them, which the first trace does.
-        if self._scene.make_room(scene, frozenset(self.settings.without_body)):
+        self._scene.make_room(scene, frozenset(self.settings.without_body))
+        # Also where another model that shares the scene has made them.
+        if self._scene.bodies_version != self._bodies_version:
+            # Kernels may have to be compiled for them, which the first trace does.
             self.run.progress("making bodies of new meshes", COMPILE_GRACE_S)
-            before = self._finder
-            self._make_finder(before)
-            self._finder.resume(before.state)
+            self._bodies_version = self._scene.bodies_version
+            self._make_finder(self._finder)
             self._names, self._outside = self._scene.names, self._scene.outside
 
     def _start(self) -> tuple[str, ...]:

@@ -146,6 +146,8 @@ class SionnaScene(NumberedTriangles):
         from sionna.rt import RadioMaterial
 
         self._settings = settings
+        self.bodies_version = 0
+        """Counts how often bodies were made anew, for meshes that came while the run goes on."""
         self._rt_objects: list[tuple[Shape, Any]] = []
         bodied = any(pool.values())
         skins = self._skins = [
@@ -334,42 +336,31 @@ class SionnaScene(NumberedTriangles):
             changed=True,
         )
 
-    def make_room(self, scene: Scene, without_body: frozenset[str]) -> bool:
-        """Make bodies for the objects of a scene with meshes that came while the run goes on.
+    def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
+        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+
+        Then `bodies_version` is another, and what was made of the bodies before is of no use.
 
         Args:
             scene: The scene of a frame.
             without_body: Classes of objects that waves pass through.
-
-        Returns:
-            Whether the bodies are others than before; what was made of them is then of no use.
         """
         later = self._later
         if not later.changed and not any(map(is_mesh_name, scene.assets)):
-            return False
-        needed: Counter[tuple[str, str]] = Counter()
-        for i in self._solid(scene, without_body):
-            asset, material = self._body_of(scene, i)
-            if asset in later.meshes or is_mesh_name(scene.assets[i]):
-                needed[asset, material] += 1
-        stand_ins = {key: count for key, count in needed.items() if key[0] not in later.meshes}
-        # Boxes of objects with other meshes of the frame come on top.
-        for i in self._solid(scene, without_body):
-            key = self._body_of(scene, i)
-            if key in stand_ins and not is_mesh_name(scene.assets[i]):
-                needed[key] += 1
-        short = {key: n for key, n in needed.items() if n > self._pool.get(body_kind(*key), 0)}
+            return
+        solid = self._solid(scene, without_body)
+        # Boxes stand in for meshes that are not there, beside those of objects that have none.
+        mine = {self._body_of(scene, i) for i in solid if is_mesh_name(scene.assets[i])}
+        needed = Counter(key for i in solid if (key := self._body_of(scene, i)) in mine)
+        short = any(n > self._pool.get(body_kind(*key), 0) for key, n in needed.items())
         if not later.changed and not short:
-            return False
+            return
         # In powers of two: objects that come one by one seldom make bodies anew.
-        room = {key: 1 << (n - 1).bit_length() for key, n in needed.items()}
-        if not later.changed:
-            room = {key: max(n, later.room.get(key, 0)) for key, n in room.items()} | {
-                key: n for key, n in later.room.items() if key not in room
-            }
+        room = {} if later.changed else dict(later.room)
+        for key, n in needed.items():
+            room[key] = max(room.get(key, 0), 1 << (n - 1).bit_length())
         self._later = replace(later, room=room, changed=False)
         self._make_bodies()
-        return True
 
     def _make_bodies(self) -> None:
         """Put other bodies in place of those that there are; scenery stays."""
@@ -402,6 +393,7 @@ class SionnaScene(NumberedTriangles):
         super().__init__(self._shapes, ids, bodies, self._meshes, self.centre, len(self._moving))
         self.version = version + 1
         self._standing = frozenset()
+        self.bodies_version += 1
         self.__dict__.pop("_surface_materials", None)
         if self.edges is not None:
             self.edges = SceneEdges(self, self.unit_meshes, self._settings.free_edges)
