@@ -31,18 +31,21 @@ class SpawningSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_
     """Frame in which they come."""
     last: int = 15
     """Frame in which they are there for the last time."""
+    period: int = 10_000
+    """[frame] until others come, with other meshes."""
     wrong: tuple[str, ...] = ()
     """Meshes that are none, of which an object is there from ``first`` on: ``nan``, ``faces``, ``none``."""
     faces: int = 0
     """Of the mesh with too many."""
 
 
-def prism(sides: int) -> Mesh:
-    """An upright prism within the unit box: its first face looks along −x."""
+def prism(sides: int, wave: int = 0) -> Mesh:
+    """An upright prism within the unit box: its first face looks along −x. Each wave has others."""
     turn = np.pi + np.pi / sides
     around = 2 * np.pi * np.arange(sides) / sides + turn
     corners = np.stack([np.cos(around), np.sin(around)], axis=1)
-    low, high = (np.column_stack([corners, np.full(sides, z)]) for z in (0.0, 1.0))
+    low = np.column_stack([corners * (1 - 0.01 * wave), np.zeros(sides)])
+    high = np.column_stack([corners, np.ones(sides)])
     return fitted(loft(np.array([low, high])))[0]
 
 
@@ -88,16 +91,16 @@ class Spawning(World[SpawningSettings]):
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         s = self.settings
-        frame = elapsed_ns // self.run.sampling_period_ns
+        wave, frame = divmod(elapsed_ns // self.run.sampling_period_ns, s.period)
         if not s.first <= frame <= s.last:
             return
-        names = [self.add_mesh(ply(prism(4 + i), MATERIALS[i % 5])) for i in range(s.meshes)]
+        names = [self.add_mesh(ply(prism(4 + i, wave), MATERIALS[i % 5])) for i in range(s.meshes)]
         names += [self.add_mesh(wrong_mesh(kind, s.faces)) for kind in s.wrong]
         for i in range(max(s.objects, len(names))):
             # Behind the receiver, as seen from the transmitter, beside one another.
             at = (40.0, 3.0 * (i - s.objects // 2), 1.5)
             yield ObjectState(
-                f"spawned.{i:03}", "crate", at, LEVEL, STILL, (2.0, 2.0, 3.0), mesh=names[i % len(names)]
+                f"spawned.{i:03}", "crate", at, LEVEL, STILL, (2.0, 2.8, 3.0), mesh=names[i % len(names)]
             )
 
 

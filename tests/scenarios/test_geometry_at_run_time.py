@@ -32,7 +32,8 @@ record = ["channel"{lidar}]
 max_faces = 500
 
 [timeouts]
-rejoin_s = 30.0
+connect_s = 120.0
+rejoin_s = 60.0
 
 [[carriers]]
 name = "c"
@@ -65,7 +66,7 @@ position_m = [0.0, 0.0, 5.0]
 name = "rx"
 kind = "antenna"
 role = "rx"
-position_m = [30.0, 2.0, 1.5]
+position_m = [30.0, 3.6, 1.5]
 """
 GEOMETRIC = 'use = "free-space"\nbudget_ms = 2000'
 
