@@ -481,13 +481,14 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
     """Either way: I could not use what you sent. Never answered."""
 
     code: Word
-    """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``unknown-peer``."""
+    """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``refused-mesh``,
+    ``unknown-peer``."""
     message: Text
     """What is wrong with it."""
     of: Text = ""
     """Type of the message that could not be used, where it is known."""
     subject: Text = ""
-    """What it was about: the digest of an unknown asset."""
+    """What it was about: the digest of an unknown asset, or of a mesh that is refused."""
 
 
 # --- the heartbeat connection --------------------------------------------------------------
