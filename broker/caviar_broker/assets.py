@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+import msgspec
 import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
+from caviar_broker.core.geometry import GEOMETRY, has_capability
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore, IncomingAsset
+from caviar_protocol.assets import MAX_ASSET, AssetStore, IncomingAsset
 from caviar_protocol.errors import AssetError
+from caviar_protocol.geometry import MAX_FACES, MeshCheck, wrong_name
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import world_of
 from caviar_protocol.scenario.schema import pattern_asset
@@ -70,7 +74,7 @@ class _Delivery:
 
 @dataclass
 class AssetExchange:
-    """Handles the messages of services about assets, and holds back a READY until its scenery is here.
+    """Handles the messages of services about assets; holds back READY and DONE until their files are here.
 
     Args:
         store: Where assets are kept.
@@ -86,7 +90,14 @@ class AssetExchange:
     reply: Reply
     note: Callable[[str, str], None]
     _deliveries: dict[str, _Delivery] = field(default_factory=dict)
+    max_faces: int = MAX_FACES
+    """Triangles that a mesh may have which is announced while the run goes on."""
     _deferred: dict[str, m.Ready] = field(default_factory=dict)
+    # Of worlds whose meshes are on their way: their DONEs, the one that announced them first.
+    _answers: dict[str, deque[ev.DoneReceived]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._meshes = MeshCheck(self.store, self.max_faces)
 
     def handle_offer(self, service: str, message: m.AssetOffer, _: Sequence[zmq.Frame]) -> None:
         """Ask for the files of an ASSET_OFFER that are not here yet."""
@@ -122,8 +133,11 @@ class AssetExchange:
         except AssetError as error:
             self.feed(ev.Violated(service, f"sent wrong scenery: {error}"))
             return
-        if service in self._deferred and not delivery.owed:
+        if delivery.owed:
+            return
+        if service in self._deferred:
             self.feed(ev.ReadyReceived(service, self._deferred.pop(service)))
+        self._pass_on(service)
 
     def handle_get(self, service: str, message: m.AssetGet, _: Sequence[zmq.Frame]) -> None:
         """Answer ASSET_GET with the next chunk of a file."""
@@ -146,6 +160,58 @@ class AssetExchange:
         self._deferred[service] = message
         self.note(service, f"is ready, but {len(owed)} files of its scenery are due, {owed[0].name!r} first")
 
+    def holds_back(self, event: ev.DoneReceived) -> bool:
+        """Whether a DONE of a world has to wait for the meshes that it, or the one before, announces.
+
+        Args:
+            event: With the DONE. It is fed to the clock once the meshes are here.
+        """
+        service, message = event.service, event.message
+        waiting = self._answers.get(service)
+        if waiting:
+            waiting.append(event)
+            return True
+        if message.geometry is None or not self._may_announce(service, message):
+            return False
+        self._answers[service] = deque([event])
+        self._pass_on(service)
+        return True
+
+    def _may_announce(self, service: str, message: m.Done) -> bool:
+        """Whether meshes of a DONE may be used; else the clock says why not."""
+        member = self.clock.member(service)
+        return (
+            member is not None
+            and member.role == "world"
+            and has_capability(member, GEOMETRY)
+            and (message.epoch, message.attempt) == (self.clock.plan.epoch, member.attempt)
+        )
+
+    def _pass_on(self, service: str) -> None:
+        """Feed the DONEs of a world to the clock, up to the first one whose meshes are not here."""
+        waiting = self._answers.get(service)
+        while waiting:
+            event = waiting[0]
+            change = event.message.geometry
+            if change is not None:
+                if missing := self._missing_meshes(change):
+                    self._deliveries[service] = _Delivery(missing)
+                    self._ask_for_more(service)
+                    return
+                event = msgspec.structs.replace(event, refused=self._meshes.refusals(change.assets))
+            waiting.popleft()
+            self.feed(event)
+            waiting = self._answers.get(service)
+        self._answers.pop(service, None)
+
+    def _missing_meshes(self, change: m.GeometryChange) -> dict[str, m.Asset]:
+        """Meshes that are to be asked for, by digest; those of wrong names and sizes are refused unseen."""
+        return {
+            asset.digest: asset
+            for asset in change.assets
+            if not wrong_name(asset) and asset.size <= MAX_ASSET and not self.store.holds(asset)
+        }
+
     def handle_error(self, service: str, error: m.Error) -> bool:
         """Whether an ERROR says that a world does not have what it offered; then the run ends."""
         for asset in self._owed(service):
@@ -158,6 +224,7 @@ class AssetExchange:
     def forget(self, service: str) -> None:
         """Forget an incarnation of a service that is gone: what it owes will not come."""
         self._deferred.pop(service, None)
+        self._answers.pop(service, None)
         self._deliveries.pop(service, None)
 
     def _owed(self, service: str) -> tuple[m.Asset, ...]:

@@ -242,6 +242,7 @@ class JournalFile:
             service=entry.service,
             outcome=entry.outcome,
             decisions=entry.decisions,
+            geometry=entry.geometry,
             run=self._run if entry.outcome == "episode" else "",
             products=products,
         )

@@ -20,7 +20,7 @@ import msgspec
 from caviar_broker.core.run import Snapshot
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.files import map_regular
-from caviar_protocol.messages import GrantInput
+from caviar_protocol.messages import GeometryChange, GrantInput
 
 MAGIC = b"CAVIAR journal 2\n"
 HEAD = struct.Struct("<QI")
@@ -53,6 +53,8 @@ class JournalEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Of the service's state, in ``checkpoints/``."""
     digest: str = ""
     """SHA-256 of that state; of a snapshot, the digest of the run."""
+    geometry: GeometryChange | None = None
+    """Meshes that a world has from a frame on."""
     run: str = ""
     """Id of the run, in the first entry of an episode and in a snapshot: a journal opens with either."""
     products: tuple[tuple[str, bytes, bytes], ...] = ()
@@ -231,7 +233,7 @@ def entries_to_keep(entries: Iterable[EntryLocation], snapshot: Snapshot) -> tup
         if entry.episode > snapshot.episode
         or entry.frame >= base
         or entry.offset in held
-        or entry.outcome in ("end", "seed")
+        or entry.outcome in ("end", "seed", "geometry")
     ]
 
 

@@ -104,6 +104,8 @@ class _Reader:
         self._contents: dict[str, bytes | None] = {}
         # Frames in which agents ended the episode, or chose the next one's seed.
         self._ends: list[JournalEntry] = []
+        # What worlds announced of meshes.
+        self._geometry: list[JournalEntry] = []
 
     def add(self, entry: JournalEntry) -> None:
         """One more entry."""
@@ -121,6 +123,8 @@ class _Reader:
                 self._states.setdefault(entry.service, {})[entry.frame] = entry
             case "end" | "seed":
                 self._ends.append(entry)
+            case "geometry":
+                self._geometry.append(entry)
             case _:
                 self._decided(entry)
 
@@ -150,6 +154,7 @@ class _Reader:
             for late in [number for number in table if number >= frame]:
                 del table[late]
         self._ends = [entry for entry in self._ends if entry.frame < frame]
+        self._geometry = [entry for entry in self._geometry if entry.frame < frame]
 
     # --- decisions -----------------------------------------------------------------------------------
 
@@ -281,10 +286,22 @@ class _Reader:
             answered=self._answered,
             chosen=self._chosen,
             states=states,
+            geometry=tuple(
+                (entry.service, entry.geometry)
+                for entry in self._geometry
+                if entry.geometry is not None and entry.frame < finished
+            ),
         )
 
 
 def _product(service: str, entered: GrantInput, payload: tuple[bytes, bytes] | None) -> Product:
     return Product(
-        entered.topic, service, entered.frame, entered.t_ns, entered.digest, entered.fidelity, payload
+        entered.topic,
+        service,
+        entered.frame,
+        entered.t_ns,
+        entered.digest,
+        entered.fidelity,
+        payload,
+        entered.geometry,
     )

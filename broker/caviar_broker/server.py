@@ -111,6 +111,7 @@ class BrokerServer:
             feed=self.feed,
             reply=self._reply,
             note=self.note,
+            max_faces=plan.max_faces,
         )
         # Services that were sent a grant, and have answered none since.
         self._owing: set[str] = set()
@@ -174,6 +175,7 @@ class BrokerServer:
                 ev.CheckpointReceived(name, message, parts[0])
             ),
             m.Error: self._error,
+            m.GeometryDone: lambda name, message, _: self.feed(ev.GeometryDoneReceived(name, message)),
             m.AssetOffer: self._assets.handle_offer,
             m.AssetGet: self._assets.handle_get,
             m.AssetData: self._assets.handle_data,
@@ -311,8 +313,10 @@ class BrokerServer:
     # --- answers -------------------------------------------------------------------------------------
 
     def _done(self, service: str, message: m.Done, parts: Sequence[zmq.Frame]) -> None:
-        payloads = tuple(zip(parts[::2], parts[1::2], strict=True))
-        self.clock.handle(ev.DoneReceived(service, message, payloads), time.monotonic_ns())
+        event = ev.DoneReceived(service, message, tuple(zip(parts[::2], parts[1::2], strict=True)))
+        if self._assets.holds_back(event):
+            return
+        self.clock.handle(event, time.monotonic_ns())
         self._has_answers = True
         self._owing.discard(service)
 

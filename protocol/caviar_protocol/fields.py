@@ -176,6 +176,27 @@ class Asset(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Length of the file."""
 
 
+class GeometryChange(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Meshes that a world has beyond those of its ASSET_OFFER, from a frame of the episode on.
+
+    It replaces what the world announced before: a world that was started again says it once more, and what
+    nothing needs any longer is left out.
+
+    Example:
+        >>> import hashlib
+        >>> digest = hashlib.sha256(b"ply").hexdigest()
+        >>> crate = Asset(name=f"objects/{digest}.ply", digest=digest, size=3)
+        >>> GeometryChange(frame=12, assets=(crate,)).frame
+        12
+    """
+
+    frame: FrameIndex
+    """First frame in which scenes may name them, and in which what is left out is gone."""
+    # Without `few`: none of them is a message part.
+    assets: tuple[Asset, ...] = ()
+    """All of them, each named ``objects/SHA-256.ply``: a name never stands for another file."""
+
+
 class GrantInput(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Provenance of one input of a GRANT. Unless absent, two message parts hold the product.
 
@@ -203,6 +224,9 @@ class GrantInput(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Product digest (`caviar_protocol.digest.payload_digest`); empty when absent."""
     cause: Text = ""
     """Why it is absent or held: the service and frame at the origin (clause 10)."""
+    geometry: DigestOrNone = ""
+    """Digest of the geometry that it was made with, where its producer did not have that of the frame; empty:
+    it had, or has none."""
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -216,6 +240,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """As in its DONE."""
     counts: dict[str, Count] = {}
     """As in its DONE."""
+    geometry: GeometryChange | None = None
+    """As in the DONE of a world, without the meshes that were refused; a replay announces it again."""
 
 
 class ProductHeader(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -281,6 +307,14 @@ SINCE: dict[str, str] = {
     "DriveCommand": "1.6",
     "RoadStop": "1.6",
     "SignalCommand": "1.6",
+    "GeometryChange": "1.6",
+    "Geometry": "1.6",
+    "GeometryDone": "1.6",
+    "Prepare.max_faces": "1.6",
+    "Done.geometry": "1.6",
+    "Done.geometry_digest": "1.6",
+    "Report.geometry": "1.6",
+    "GrantInput.geometry": "1.6",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -38,6 +38,7 @@ from caviar_protocol.fields import (
     few,
 )
 from caviar_protocol.fields import Demand as Demand
+from caviar_protocol.fields import GeometryChange as GeometryChange
 from caviar_protocol.fields import GrantInput as GrantInput
 from caviar_protocol.fields import Input as Input
 from caviar_protocol.fields import Policy as Policy
@@ -49,7 +50,7 @@ from caviar_protocol.fields import Status as Status
 PROTOCOL_VERSION = (1, 6)
 """Major and minor version of the protocol that this package speaks."""
 
-CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "parts")
+CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "geometry", "parts")
 """Optional features that this package implements. Peers use what both of them list."""
 
 
@@ -151,6 +152,9 @@ class Prepare(_Message, frozen=True, kw_only=True, tag="PREPARE"):
     # Consumers check the names of objects with them (`SceneRules.prefixes`).
     prefixes: dict[str, tuple[Text, ...]] = {}
     """World to the prefixes of its READY; empty for worlds."""
+    max_faces: Count = 0
+    """Worlds with capability ``geometry``: triangles that a mesh may have which they announce while the run
+    goes on; 0: they may announce none in this run."""
 
 
 class AssetOffer(_Message, frozen=True, kw_only=True, tag="ASSET_OFFER"):
@@ -312,6 +316,12 @@ class Done(_Message, frozen=True, kw_only=True, tag="DONE"):
     """An agent ends the episode with this frame (clause 16)."""
     seed: SeedOrNone = -1
     """Agents, with ``end_episode`` or for the final grant: seed of the next episode."""
+    geometry: GeometryChange | None = None
+    """Worlds with capability ``geometry``: meshes that objects may have from a frame on, this one or a later
+    one; absent: as before."""
+    geometry_digest: DigestOrNone = ""
+    """Digest of the geometry that the products were made with (`caviar_protocol.digest.geometry_digest`);
+    empty: that of READY."""
 
 
 class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
@@ -338,6 +348,39 @@ class Fault(_Message, frozen=True, kw_only=True, tag="FAULT"):
     culprit: Text = ""
     """Source of an input that cannot be read, or says what its topic does not allow: the run ends, and names
     it."""
+
+
+class Geometry(_Message, frozen=True, kw_only=True, tag="GEOMETRY"):
+    """Broker to service: fetch and load these meshes beside those of PREPARE, for this frame and later ones.
+    Answered by GEOMETRY_DONE, in the order in which they came. Needs capability ``geometry``."""
+
+    epoch: Epoch
+    attempt: Attempt
+    episode: EpisodeIndex
+    frame: FrameIndex
+    """First frame for which they count."""
+    assets: tuple[Asset, ...] = ()
+    """All meshes beyond those of PREPARE, of all worlds; those of an earlier GEOMETRY that are not here are
+    gone."""
+
+
+class GeometryDone(_Message, frozen=True, kw_only=True, tag="GEOMETRY_DONE"):
+    """Service to broker: I hold the geometry of this frame. Under the policy ``wait`` the service is not
+    granted the frame before.
+
+    Example:
+        >>> done = GeometryDone(epoch=1, attempt=1, episode=0, frame=12, geometry="00" * 32)
+        >>> msgspec.to_builtins(done)["frame"]
+        12
+    """
+
+    epoch: Epoch
+    attempt: Attempt
+    episode: EpisodeIndex
+    frame: FrameIndex
+    """As in GEOMETRY."""
+    geometry: DigestOrNone = ""
+    """Digest of the assets of PREPARE and of GEOMETRY together (`caviar_protocol.digest.geometry_digest`)."""
 
 
 # Advisory: a service in the middle of a library call cannot stop, and its late answer is recorded.
@@ -438,13 +481,14 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
     """Either way: I could not use what you sent. Never answered."""
 
     code: Word
-    """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``unknown-peer``."""
+    """``malformed``, ``limit``, ``version``, ``unexpected``, ``unknown-asset``, ``refused-mesh``,
+    ``unknown-peer``."""
     message: Text
     """What is wrong with it."""
     of: Text = ""
     """Type of the message that could not be used, where it is known."""
     subject: Text = ""
-    """What it was about: the digest of an unknown asset."""
+    """What it was about: the digest of an unknown asset, or of a mesh that is refused."""
 
 
 # --- the heartbeat connection --------------------------------------------------------------
@@ -489,6 +533,6 @@ class HeartbeatAck(_Message, frozen=True, kw_only=True, tag="HEARTBEAT_ACK"):
 Message = (
     Hello | Welcome | Refuse | Prepare | AssetOffer | AssetGet | AssetData | Ready
     | Reset | ResetDone | Grant | Done | Fault | Cancel | EpisodeEnd | Checkpoint | CheckpointDone | Restore
-    | Shutdown | Bye | Stale | Error | Attach | Heartbeat | HeartbeatAck
+    | Geometry | GeometryDone | Shutdown | Bye | Stale | Error | Attach | Heartbeat | HeartbeatAck
 )  # fmt: skip
 """Every message of the protocol."""

@@ -207,7 +207,13 @@ def decoded(payload: Payload) -> Payload:
 
 
 def encoded_done(
-    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult, step_ns: int
+    identity: dict[str, int],
+    use: str,
+    grant: m.Grant,
+    result: StepResult,
+    step_ns: int,
+    geometry: m.GeometryChange | None = None,
+    geometry_digest: str = "",
 ) -> tuple[m.Done, list[Any]]:
     """Make DONE, and header and body of each product after it.
 
@@ -217,6 +223,8 @@ def encoded_done(
         grant: What is answered.
         result: What the service made of the frame.
         step_ns: What the step took [ns].
+        geometry: Meshes that a world announces with it.
+        geometry_digest: Of the geometry that it was made with, where that is not READY's.
 
     Raises:
         PayloadError: A product is not its topic's.
@@ -244,12 +252,19 @@ def encoded_done(
         counts=dict(result.counts),
         end_episode=result.end_episode,
         seed=result.seed,
+        geometry=geometry,
+        geometry_digest=geometry_digest,
     )
     return done, parts
 
 
 def plain_done(
-    identity: dict[str, int], use: str, grant: m.Grant, result: StepResult
+    identity: dict[str, int],
+    use: str,
+    grant: m.Grant,
+    result: StepResult,
+    geometry: m.GeometryChange | None = None,
+    geometry_digest: str = "",
 ) -> tuple[m.Done, tuple[Payload, ...]]:
     """Make DONE without digests, and the products as they are, for a consumer in this process.
 
@@ -260,6 +275,7 @@ def plain_done(
         use: What the implementation is called, for the error.
         grant: What is answered.
         result: What the service made of the frame.
+        geometry, geometry_digest: As for `encoded_done`.
 
     Raises:
         PayloadError: A product is not its topic's.
@@ -274,6 +290,8 @@ def plain_done(
         products=tuple([m.ProductHeader(topic=t, digest="", fidelity=result.fidelity) for t, _ in products]),
         end_episode=result.end_episode,
         seed=result.seed,
+        geometry=geometry,
+        geometry_digest=geometry_digest,
     )
     return done, tuple([decoded(payload) for _, payload in products])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TypeVar, cast
 
 import msgspec
@@ -232,5 +233,10 @@ class StepResult(msgspec.Struct, frozen=True, kw_only=True):
     """Nanoseconds that named phases took."""
     end_episode: bool = False
     """Agents: this frame is the last of the episode."""
+    meshes: Mapping[str, Path | bytes] | None = None
+    """Worlds with ``changes_geometry``: files of all meshes, beside those of `Service.scenery`, that objects
+    may have, by their names (`caviar_protocol.geometry.mesh_name`); None: as before."""
+    meshes_from: int = -1
+    """First frame in which they may; −1: this one."""
     seed: int = -1
     """Agents, with ``end_episode`` or for the final grant: of the next episode; −1: none chosen."""

@@ -16,8 +16,10 @@ import msgspec
 from msgspec import Meta
 
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.messages import GrantInput, Role, Status
+from caviar_protocol.geometry import recorded_meshes
+from caviar_protocol.messages import GeometryChange, GrantInput, Role, Status
 from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import PAYLOADS
 from caviar_services.conversion import Encoded
@@ -71,7 +73,22 @@ class Replayer(Service[ReplaySettings]):
 
     def scenery(self) -> Mapping[str, Path | bytes]:
         """Worlds: the recorded scenery. It does not tell whose it was, so each replayed world brings all."""
-        return self._recording.assets if self.role == "world" else {}
+        if self.role != "world":
+            return {}
+        # Meshes that came while the run went on come again with the frames that they came with.
+        there, at_first = self._recording.assets, {asset.name for asset in self._recording.metadata.assets}
+        return {name: file for name, file in there.items() if name in at_first}
+
+    @classmethod
+    def changes_geometry_with(cls, settings: Mapping[str, object]) -> bool:
+        """Whether meshes came while the run went on.
+
+        Args:
+            settings: As they stand in the scenario.
+        """
+        path = Path(str(settings.get("recording", "")))
+        folder = RunDirectory(path if path.is_dir() else path.parent).assets
+        return cls.changes_geometry and bool(recorded_meshes(folder))
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """Open the recording; `RecordingError` where it has nothing of this service."""
@@ -99,12 +116,26 @@ class Replayer(Service[ReplaySettings]):
         recorded = self._recording.frame(frame.episode, frame.number)
         report = next((r for r in recorded.reports if r.source == self.run.name), None)
         last = self._episodes[frame.episode][0]
+        change = report.geometry if report else None
         return StepResult(
             products=self._products(recorded),
             decisions=report.decisions if report else {},
             counts=report.counts if report else {},
             end_episode=self.role == "agent" and frame.number == last,
+            meshes=self._meshes(change) if change else None,
+            meshes_from=change.frame if change else -1,
         )
+
+    def _meshes(self, change: GeometryChange) -> dict[str, Path | bytes]:
+        """Recorded meshes that the world announced. `RecordingError` where one is not in the recording."""
+        there = self._recording.meshes
+        for asset in change.assets:
+            if asset.name not in there:
+                raise RecordingError(
+                    f"{self._recording.path} was recorded without the mesh {asset.name}, which its world "
+                    f"announced; run the world again, as in caviar replay --keep {self.run.name}"
+                )
+        return {asset.name: there[asset.name] for asset in change.assets}
 
     def _products(self, recorded: RecordedFrame) -> dict[str, Encoded]:
         return {
@@ -162,6 +193,7 @@ def _replayer(name: str) -> type[Replayer]:
             f"{name!r} names no replayed service: write its role, then its topics, as in world_scene"
         )
     members: dict[str, Any] = {"role": role, "outputs": tuple(topics), "__module__": __name__}
+    members["changes_geometry"] = role == "world"
     return cast(type[Replayer], type(name, (Replayer,), members))
 
 

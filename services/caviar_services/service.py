@@ -128,6 +128,8 @@ class Preparation:
     """Topic to its sources in this run."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Files of `Service.own_files`, by SHA-256."""
+    max_faces: int = 0
+    """Worlds: triangles that a mesh may have which comes while the run goes on; 0: none may come."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,6 +189,9 @@ class Service(ABC, Generic[S]):
     outputs: ClassVar[tuple[str, ...]] = ()
     uses_scenery: ClassVar[bool] = False
     """Whether the assets of the run are fetched for this service before `prepare` (clause 4)."""
+    changes_geometry: ClassVar[bool] = False
+    """Whether meshes may come and go while the run goes on: a world announces them (`StepResult.meshes`),
+    other services implement `use_meshes`."""
     checkpoints: ClassVar[bool] = False
     """Whether `checkpoint` and `restore` are implemented: the service has state that outlives a frame."""
     batches: ClassVar[bool] = False
@@ -239,6 +244,15 @@ class Service(ABC, Generic[S]):
         # What a subclass overrides would be left out: it has to say so itself.
         return bool(vars(cls).get("batches", False))
 
+    @classmethod
+    def changes_geometry_with(cls, settings: Mapping[str, object]) -> bool:
+        """Whether a world may announce meshes while the run goes on.
+
+        Args:
+            settings: As they stand in the scenario: not every world of a class does.
+        """
+        return cls.changes_geometry
+
     @property
     def needs_assets(self) -> bool:
         """Whether the assets of the run are fetched before `prepare`: where the class uses scenery, or what
@@ -265,6 +279,27 @@ class Service(ABC, Generic[S]):
             digest: Its SHA-256.
             path: Where it is; None: it could not be fetched.
             reason: Why not.
+        """
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:  # optional hook
+        """Take the meshes that objects may have from the next frame on, beside those of `prepare`.
+
+        Called between two frames. What is computed follows from the frame and from these meshes alone,
+        whichever there were before.
+
+        Args:
+            meshes: Files by asset name, all of them; those that are not here any more are gone.
+
+        Raises:
+            AssetError: A file cannot be read; the run has looked into it before.
+        """
+
+    def mesh_refused(self, digest: str, reason: str) -> None:  # optional hook
+        """Worlds: note that a mesh is not used; objects that have it are boxes.
+
+        Args:
+            digest: SHA-256 of the file; empty: none of those that were announced together is used.
+            reason: Why.
         """
 
     @property

@@ -38,6 +38,7 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
+from caviar_services.run_time_geometry import AnnouncedMeshes, FollowedMeshes
 from caviar_services.service import (
     Frame,
     Preparation,
@@ -123,6 +124,8 @@ class ServiceSession:
         self._trim_at = 0.0
         self._files = AssetFetcher(store, send, fetch_timeout_s)
         self._scenery = AssetFetcher(store, send, fetch_timeout_s, self._note_fetching)
+        self._followed = FollowedMeshes(store, self._files, lambda: self.running, self._loaded_meshes)
+        self._announced = AnnouncedMeshes(store)
         self._handlers: Mapping[type, Callable[[Any, Sequence[Any], float], None]] = {
             m.Welcome: self._welcome,
             m.Prepare: self._prepare,
@@ -130,6 +133,7 @@ class ServiceSession:
             m.AssetData: self._asset_data,
             m.Reset: self._reset,
             m.Grant: self._grant,
+            m.Geometry: self._geometry,
             m.EpisodeEnd: self._episode_end,
             m.Checkpoint: self._checkpoint,
             m.Restore: self._restore,
@@ -171,7 +175,11 @@ class ServiceSession:
             role=cls.role,
             inputs=cls.inputs,
             outputs=cls.outputs,
-            capabilities=tuple(c for c in m.CAPABILITIES if c != "checkpoint" or cls.checkpoints),
+            capabilities=tuple(
+                c
+                for c in m.CAPABILITIES
+                if (c != "checkpoint" or cls.checkpoints) and (c != "geometry" or cls.changes_geometry)
+            ),
             implementation=self.use,
             max_in_flight=MAX_IN_FLIGHT,
             host=host,
@@ -211,7 +219,8 @@ class ServiceSession:
 
     def expire(self, now: float) -> None:
         """Report the files that have not come by `deadline`."""
-        self._files.expire(now)
+        with self._reporting("files"):
+            self._files.expire(now)
         self._scenery.expire(now)
 
     def leave(self, reason: str) -> None:
@@ -297,7 +306,8 @@ class ServiceSession:
 
     def _asset_data(self, data: m.AssetData, parts: Sequence[Any], now: float) -> None:
         if data.digest == self._files.awaited:
-            self._files.data(data, parts[0], now)
+            with self._reporting("files"):
+                self._files.data(data, parts[0], now)
         elif not self._scenery.awaited:
             self._unexpected(data, "no asset was asked for")
         elif data.digest != self._scenery.awaited:
@@ -307,8 +317,13 @@ class ServiceSession:
                 self._scenery.data(data, parts[0], now)
 
     def _error(self, error: m.Error, _: Sequence[Any], now: float) -> None:
+        if error.code == "refused-mesh":
+            with self._reporting("geometry"):
+                self.running.mesh_refused(error.subject, error.message)
+            return
         if error.subject and error.subject == self._files.awaited:
-            self._files.fail(error.message, now)
+            with self._reporting("files"):
+                self._files.fail(error.message, now)
         if error.subject and error.subject == self._scenery.awaited:
             self._scenery.fail(f"the broker cannot deliver {self._scenery.name}: {error.message}", now)
 
@@ -316,8 +331,15 @@ class ServiceSession:
         files = self._store.folder_of(assets) if assets else {}
         demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
         prepared = self.running.prepare(
-            Preparation(demand=demand, assets=files, producers=order.producers, files=self._found)
+            Preparation(
+                demand=demand,
+                assets=files,
+                producers=order.producers,
+                files=self._found,
+                max_faces=order.max_faces,
+            )
         )
+        self._followed.begin(assets)
         self._ready(
             m.Ready(
                 **self._identity,
@@ -352,6 +374,8 @@ class ServiceSession:
             self._progress(f"reset to episode {reset.episode}", 0.0)
             if self._answers is not None:
                 self._answers.clear()
+            self._followed.reset()
+            self._announced.reset()
             self.running.reset(reset.seed_episode, reset.seed, reset.t0_ns)
             self._reset_to = reset
             self._send(m.ResetDone(**self._identity, episode=reset.episode), ())
@@ -415,6 +439,7 @@ class ServiceSession:
         phase = "step"
         # Without `_reporting`: its context costs as much as a small service.
         try:
+            self._followed.begin_frame(grant.frame)
             frame = self._frame(reset, grant, parts)
             began = time.monotonic_ns()
             result = self.running.step(frame)
@@ -432,9 +457,27 @@ class ServiceSession:
         return granted_frame(self.running, reset, grant, inputs)
 
     def _done(self, grant: m.Grant, result: StepResult, step_ns: int) -> tuple[m.Done, Sequence[Any]]:
+        geometry, digest = self._announced.change(grant.frame, result), self._followed.digest
         if self._encodes:
-            return encoded_done(self._identity, self.use, grant, result, step_ns)
-        return plain_done(self._identity, self.use, grant, result)
+            return encoded_done(self._identity, self.use, grant, result, step_ns, geometry, digest)
+        return plain_done(self._identity, self.use, grant, result, geometry, digest)
+
+    # --- meshes that come while the run goes on (clause 4) -------------------------------------------
+
+    def _geometry(self, order: m.Geometry, _: Sequence[Any], now: float) -> None:
+        reset = self._reset_to
+        if reset is None or order.episode != reset.episode:
+            self._unexpected(order, f"there was no RESET to episode {order.episode}")
+        elif not self.cls.changes_geometry:
+            self._unexpected(order, f"{self.use} named no capability 'geometry'")
+        else:
+            with self._reporting("geometry", order.episode):
+                self._progress(f"loading the meshes of frame {order.frame}", 0.0)
+                self._followed.order(order, now)
+
+    def _loaded_meshes(self, order: m.Geometry, digest: str) -> None:
+        done = m.GeometryDone(**self._identity, episode=order.episode, frame=order.frame, geometry=digest)
+        self._send(done, ())
 
     def _episode_end(self, end: m.EpisodeEnd, _: Sequence[Any], __: float) -> None:
         with self._reporting("end of episode", end.episode):
@@ -455,6 +498,7 @@ class ServiceSession:
             return
         with self._reporting("restore", order.episode, order.frame):
             self._progress(f"restoring the state after frame {order.frame}", 0.0)
+            self._followed.completed = order.frame
             self.running.restore(bytes(parts[0]))  # a copy: the message's buffer is freed after this
             if self._answers is not None:
                 self._answers.clear(order.frame)

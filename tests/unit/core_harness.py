@@ -13,6 +13,7 @@ import heapq
 import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from core_history import History
@@ -24,7 +25,7 @@ from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.journal import JournalFile
 from caviar_protocol import messages as m
-from caviar_protocol.digest import payload_digest
+from caviar_protocol.digest import geometry_digest, payload_digest
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -77,6 +78,12 @@ class Sim:
     """How long CHECKPOINT and RESTORE take [ns]; None: they are never answered."""
     features: tuple[Feature, ...] = ()
     """What the scenario needs it to know."""
+    loads: int | None = None
+    """How long it takes to load the meshes of GEOMETRY [ns]; None: it cannot, and does not name that."""
+    loads_wrong: bool = False
+    """Whether it says another digest than that of what it was sent."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Why a file that it announces is no mesh, by name: what the shell finds out."""
     forgets: bool = False
     """Whether a restored state is another than that which was saved."""
 
@@ -168,6 +175,10 @@ class Simulation:
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._ticket = itertools.count()
         self._progress: dict[str, int] = {}
+        self.scenery: dict[str, tuple[m.Asset, ...]] = {}
+        """Assets of the last PREPARE of each service."""
+        self.held: dict[str, list[tuple[int, str]]] = {}
+        """Geometry that services loaded since RESET: frame and digest."""
         self.states: dict[str, str] = {}
         """What is in the memory of stateful services."""
 
@@ -188,7 +199,7 @@ class Simulation:
             "inputs": sim.inputs,
             "outputs": sim.outputs,
             "max_in_flight": sim.max_in_flight,
-            "capabilities": m.CAPABILITIES if sim.stateful else (),
+            "capabilities": ("checkpoint",) * sim.stateful + ("geometry",) * (sim.loads is not None),
         }
         self.alive.add(name)
         self.feed(ev.Joined(m.Hello(**(fields | dict(sim.hello) | changes))))
@@ -281,7 +292,9 @@ class Simulation:
         ids = {"epoch": self.plan.epoch, "attempt": attempt}
         match message:
             case m.Prepare() if sim.ready_after is not None:
-                fields = {"geometry": "", **sim.ready}
+                self.scenery[name] = message.assets
+                own = geometry_digest(message.assets) if sim.loads is not None else ""
+                fields = {"geometry": own, **sim.ready}
                 self._later(name, sim.ready_after, lambda: self._get_ready(sim, m.Ready(**ids, **fields)))
             case m.Reset() if sim.reset_after is not None:
                 done = m.ResetDone(**ids, episode=message.episode)
@@ -294,14 +307,31 @@ class Simulation:
                 takes = sim.takes(message.episode, message.frame)
                 if takes is not None:
                     self._later(name, takes, lambda: self.answer(name, message))
+            case m.Geometry() if sim.loads is not None:
+                # Beside its frames, as a service fetches files.
+                load = partial(self.loaded, name, message)
+                self.after(sim.loads, lambda: self._if_alive(name, attempt, load))
             case m.Shutdown() if sim.says_bye:
                 self._later(name, 0, lambda: self.feed(ev.ByeReceived(name, "told to")))
             case _:
                 pass
 
     def was_reset(self, name: str, message: m.Reset, done: m.ResetDone) -> None:
+        self.held.pop(name, None)
         self.states[name] = f"{name} reset to {message.seed} {message.seed_episode}"
         self.feed(ev.ResetDoneReceived(name, done))
+
+    def loaded(self, name: str, message: m.Geometry) -> None:
+        ids = {f: getattr(message, f) for f in ("epoch", "attempt", "episode", "frame")}
+        digest = geometry_digest([*self.scenery[name], *message.assets])
+        self.held.setdefault(name, []).append((message.frame, digest))
+        told = "f" * 64 if self.services[name].loads_wrong else digest
+        self.feed(ev.GeometryDoneReceived(name, m.GeometryDone(**ids, geometry=told)))
+
+    def geometry_of(self, name: str, frame: int) -> str:
+        """Digest of the geometry that a service computes a frame with; empty: that of READY."""
+        held = [digest for first, digest in self.held.get(name, ()) if first <= frame]
+        return held[-1] if held and held[-1] != geometry_digest(self.scenery[name]) else ""
 
     def saved(self, name: str, message: m.Checkpoint) -> None:
         ids = {f: getattr(message, f) for f in ("epoch", "attempt", "episode", "frame")}
@@ -316,11 +346,11 @@ class Simulation:
         attempt = self.attempt(name)
         self.busy_until[name] = max(self.now, self.busy_until.get(name, 0)) + takes
 
-        def if_alive() -> None:
-            if name in self.alive and attempt == self.attempt(name):
-                act()
+        self.after(self.busy_until[name] - self.now, lambda: self._if_alive(name, attempt, act))
 
-        self.after(self.busy_until[name] - self.now, if_alive)
+    def _if_alive(self, name: str, attempt: int, act: Callable[[], None]) -> None:
+        if name in self.alive and attempt == self.attempt(name):
+            act()
 
     def _get_ready(self, sim: Sim, message: m.Ready) -> None:
         if sim.assets:
@@ -345,7 +375,10 @@ class Simulation:
         made = {t: product_of(name, t, *at, said) for t in topics}
         headers = tuple(m.ProductHeader(topic=t, digest=payload_digest(h, b"")) for t, h in made.items())
         fields = {"products": headers, "end_episode": at in sim.ends, **sim.report(*at)} | ids
-        self.feed(ev.DoneReceived(name, m.Done(**fields), tuple((header, b"") for header in made.values())))
+        if sim.loads is not None and sim.role != "world":
+            fields["geometry_digest"] = self.geometry_of(name, grant.frame)
+        payloads = tuple((header, b"") for header in made.values())
+        self.feed(ev.DoneReceived(name, m.Done(**fields), payloads, dict(sim.refused)))
 
     def kill(self, name: str, verdict: str = "exit status 1") -> None:
         self.alive.discard(name)

@@ -78,7 +78,7 @@ class History:
     def _journal(self, entry: ev.Journal) -> None:
         assert entry.number == self.numbers + 1, "journal entries are numbered without gaps"
         self.numbers = entry.number
-        if entry.outcome in ("episode", "resumed", "end", "seed", "checkpoint"):
+        if entry.outcome in ("episode", "resumed", "end", "seed", "checkpoint", "geometry"):
             self._turn(entry)
             return
         key = (entry.episode, entry.frame, entry.service)

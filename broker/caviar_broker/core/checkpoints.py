@@ -198,6 +198,11 @@ class Checkpoints:
 
     # --- restoring -----------------------------------------------------------------------------------
 
+    def resumes_with(self, member: Member) -> int | None:
+        """The first frame that a service is granted again once it is reset; None: it has no state to get."""
+        history = self.histories.get(member.name)
+        return None if history is None or history.last < 0 else history.frame + 1
+
     def restore(self, member: Member, now: int) -> bool:
         """Send RESTORE, or the first grant again, to a service that was reset; False where there is none."""
         history = self.histories.get(member.name)

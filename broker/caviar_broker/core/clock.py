@@ -62,6 +62,7 @@ class FrameClock:
             ev.DoneReceived: self._episodes.handle_done,
             ev.FaultReceived: self._episodes.handle_fault,
             ev.CheckpointReceived: self._episodes.handle_checkpoint_done,
+            ev.GeometryDoneReceived: self._episodes.handle_geometry_done,
             ev.Journaled: self._episodes.handle_journaled,
             ev.Violated: self._liveness.handle_violation,
             ev.Progressed: self._liveness.handle_heartbeat,
@@ -238,6 +239,7 @@ class FrameClock:
         assert (run.graph is None) == (run.state is RunState.JOINING) or run.over, "a graph too early"
         if dispatcher is not None:
             dispatcher.validate()
+            self._episodes.geometry.validate()
             away = [p for p in members if p.state is not ServiceState.ACTIVE and run.takes_part(p)]
             absent = [p.name for p in away if not p.rejoin(self.plan.timeouts)]
             assert not absent, f"{absent} are not in the episode"

@@ -185,6 +185,7 @@ def provenance_of(product: Product, status: Status, frame: int, cause: str = "")
         fidelity=product.fidelity,
         digest=product.digest,
         cause=cause,
+        geometry=product.geometry,
     )
 
 

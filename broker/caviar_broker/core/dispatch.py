@@ -6,7 +6,7 @@ dying or messages; `caviar_broker.core.episodes.Episodes` does that around it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from msgspec.structs import replace
 
@@ -92,6 +92,9 @@ class Dispatcher:
         self._waiting_for_journal: set[Participant] = set()
         self._waiting_for_pace: set[Participant] = set()
         self._waiting_for_frames: set[Participant] = set()
+        self._waiting_for_geometry: set[Participant] = set()
+        self.lacks_geometry: Callable[[str, int], bool] | None = None
+        """Whether a service has yet to load the meshes of a frame; None: there is nothing but scenery."""
         # Finished frames when services were last woken for them.
         self._seen_finished = 0
 
@@ -257,6 +260,10 @@ class Dispatcher:
         """Look again at what waited for real time, or for the user's pause to end."""
         self._wake(self._waiting_for_pace)
 
+    def wake_for_geometry(self) -> None:
+        """Look again at what waited for meshes to be loaded."""
+        self._wake(self._waiting_for_geometry)
+
     def wake_all(self) -> None:
         """Look at every service again, and forget what they waited for."""
         for waiting in self.waiting():
@@ -264,9 +271,15 @@ class Dispatcher:
         self.ready.update(self._participants.values())
 
     def waiting(self) -> list[set[Participant]]:
-        """The sets of services that wait: for the journal, for real time, for frames, for each decision."""
+        """The sets of services that wait: for the journal, real time, frames, meshes, and each decision."""
         decisions = [participant.waiting for participant in self._participants.values()]
-        return [self._waiting_for_journal, self._waiting_for_pace, self._waiting_for_frames, *decisions]
+        return [
+            self._waiting_for_journal,
+            self._waiting_for_pace,
+            self._waiting_for_frames,
+            self._waiting_for_geometry,
+            *decisions,
+        ]
 
     def _wake(self, waiting: set[Participant]) -> None:
         if waiting:
@@ -334,6 +347,9 @@ class Dispatcher:
                 # After another frame of the service, which is not decided yet, it will rely on more.
                 task.inputs = None if in_flight else inputs
                 return
+            if self.lacks_geometry is not None and self._awaits_geometry(participant, frame):
+                task.inputs = None if in_flight else inputs
+                return
             if (self.plan.realtime or self._gate.closed) and not self._release(participant, task, now):
                 return
             if in_flight and inputs.cause is not None:
@@ -371,6 +387,16 @@ class Dispatcher:
             if other.next_frame < reached:
                 other.waiting.add(participant)
                 return False
+        return True
+
+    def _awaits_geometry(self, participant: Participant, frame: int) -> bool:
+        """Whether a frame waits until its service has loaded its meshes; one that may miss it need not."""
+        if self.lacks_geometry is None or not participant.plan.is_indispensable:
+            return False
+        # One that is gone is sent the meshes again when it comes back, and its grants after them.
+        if not self.lacks_geometry(participant.plan.name, frame):
+            return False
+        self._waiting_for_geometry.add(participant)
         return True
 
     def _release(self, participant: Participant, task: Task, now: int) -> bool:

@@ -8,9 +8,20 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.checkpoints import Checkpoints, PayloadSize
 from caviar_broker.core.decisions import GrantOrder
 from caviar_broker.core.dispatch import Dispatcher
+from caviar_broker.core.geometry import GeometryLedger
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
-from caviar_protocol.messages import RUN_COMPLETE, Cancel, Done, EpisodeEnd, Fault, Grant, Report, Reset
+from caviar_protocol.messages import (
+    RUN_COMPLETE,
+    Cancel,
+    Done,
+    EpisodeEnd,
+    Fault,
+    GeometryChange,
+    Grant,
+    Report,
+    Reset,
+)
 from caviar_protocol.scenario.conversion import located
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
@@ -29,6 +40,8 @@ class Episodes:
         self._run = run
         self.checkpoints = Checkpoints(run, self._grant, self._return_service, payload_size)
         """What is kept for services that may come back."""
+        self.geometry = GeometryLedger(run)
+        """Meshes that worlds announced in the episode."""
         self.dispatcher: Dispatcher | None = None
         """Of the episode that is under way; None between episodes."""
         # Of the episode that was under way before.
@@ -41,6 +54,7 @@ class Episodes:
         if self._run.resumption is None:
             self._run.next_seed()
         self.checkpoints.begin_episode()
+        self.geometry.begin_episode()
         for member in self._members():
             if member.state is ServiceState.READY:
                 self.reset(member, now)
@@ -50,6 +64,7 @@ class Episodes:
         run = self._run
         if run.takes_part(member) and not run.over:
             member.move(ServiceEvent.RESET, now)
+            self.geometry.forget(member)
             self.checkpoints.reset(member, begins=self.dispatcher is None)
             # t0_ns: the first instant may be a later one.
             run.send(member, Reset(**run.ids(member), seed=run.seed, t0_ns=0, seed_episode=run.seed_episode))
@@ -62,9 +77,38 @@ class Episodes:
         if member.state is not ServiceState.RESETTING or message.episode != run.episode:
             run.unexpected(member, "RESET_DONE", f"after RESET of episode {run.episode}")
             return
+        # Before its state and its grants: a frame that is granted again has the meshes that it had.
+        if self.geometry.bring_back(member, self._resumes_with(member), now):
+            member.since = now
+            return
+        self._go_on(member, now)
+
+    def _go_on(self, member: Member, now: int) -> None:
+        """Restore a service that was reset and has the meshes of its next frame, or grant what it owes."""
         if not self.checkpoints.restore(member, now):
             member.move(ServiceEvent.RESET_DONE, now)
             self._return_service(member, now)
+
+    def _resumes_with(self, member: Member) -> int:
+        """The first frame that a service is granted after its reset."""
+        first = self.checkpoints.resumes_with(member)
+        if first is not None:
+            return first
+        if self.dispatcher is None:
+            return self._run.resumption.finished if self._run.resumption is not None else 0
+        owed = self.dispatcher.outstanding(member.name)
+        return owed[0].frame if owed else self.dispatcher.table.participants[member.name].next_frame
+
+    def handle_geometry_done(self, event: ev.GeometryDoneReceived, now: int) -> None:
+        """Take GEOMETRY_DONE: the service may be granted the frames that it was for."""
+        member = self._run.members[event.service]
+        if not self.geometry.handle_done(member, event.message, now):
+            return
+        if member.state is ServiceState.RESETTING:
+            if self.geometry.awaited_since(member) is None:
+                self._go_on(member, now)
+        elif self.dispatcher is not None:
+            self.dispatcher.wake_for_geometry()
 
     def _return_service(self, member: Member, now: int) -> None:
         """Grant what a service owes that is where it has to be, or start the episode."""
@@ -92,6 +136,7 @@ class Episodes:
             run.gate,
             histories,
         )
+        self._note_geometry(dispatcher)
         # After the dispatcher, so that frame 0 need not wait for these entries.
         facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": dispatcher.table.frames}
         before, run.resumption = run.resumption, None
@@ -102,6 +147,11 @@ class Episodes:
         run.enter_journal("episode", "", 0, now, facts=facts, members=run.graph.order)
         for name in histories:
             run.enter_journal("checkpoint", name, -1, now)
+
+    def _note_geometry(self, dispatcher: Dispatcher) -> None:
+        """Let frames wait for meshes, once there are any: a run without them asks no question about them."""
+        if self.geometry.has_changed:
+            dispatcher.lacks_geometry = self.geometry.is_lacking
 
     def _end(self, frames: int, now: int) -> None:
         """Send EPISODE_END, and begin the next episode or end the run."""
@@ -126,6 +176,7 @@ class Episodes:
         if self.dispatcher is not None:
             self.dispatcher.close(now)
             self._ended, self.dispatcher = self.dispatcher, None
+            self.geometry.end_episode()
 
     def handle_last_recording(self, event: ev.DoneReceived, now: int) -> bool:
         """Take a recorder's DONE after the end of the run: whether it was such a one.
@@ -157,8 +208,11 @@ class Episodes:
         if dispatcher is None:
             return
         t_ns = run.plan.t_ns(message.frame)
+        used = self.geometry.used_by(member, message) if self.geometry.has_changed else ""
         products = {
-            h.topic: ev.Product(h.topic, member.name, message.frame, t_ns, h.digest, h.fidelity, payload)
+            h.topic: ev.Product(
+                h.topic, member.name, message.frame, t_ns, h.digest, h.fidelity, payload, used
+            )
             for h, payload in zip(message.products, event.payloads, strict=True)
         }
         if len(products) < len(message.products) or not products.keys() <= member.outputs:
@@ -166,13 +220,17 @@ class Episodes:
             return
         # It got somewhere since its last loss: `MAX_LOSSES` counts only losses in a row.
         member.losses = 0
+        announced: GeometryChange | None = None
+        if message.geometry is not None:
+            announced = self._announce(member, message, event.refused or {}, dispatcher, now)
         report: Report | None = None
-        if message.decisions or message.counts or message.measured:
+        if message.decisions or message.counts or message.measured or announced:
             report = Report(
                 source=member.name,
                 decisions=message.decisions,
                 counts=message.counts,
                 measured=message.measured,
+                geometry=announced,
             )
         if member.name in run.plan.policies:
             news = run.swaps.note(member.name, message.decisions, message.frame)
@@ -190,6 +248,23 @@ class Episodes:
             run.enter_journal("end", member.name, message.frame, now, facts=facts)
         if self.checkpoints.histories:
             self._save_if_due(member, dispatcher, now)
+
+    def _announce(
+        self,
+        member: Member,
+        message: Done,
+        refused: Mapping[str, str],
+        dispatcher: Dispatcher,
+        now: int,
+    ) -> GeometryChange | None:
+        """Take the meshes that a world announces; None where nothing follows from them."""
+        if dispatcher.outstanding(member.name)[0].state is TaskState.ABANDONED:
+            return None
+        bases = [h.frame for h in self.checkpoints.histories.values()]
+        needed = min([dispatcher.table.finished_frames - 1, *bases]) + 1
+        announced = self.geometry.announce(member, message, refused, needed, now)
+        self._note_geometry(dispatcher)
+        return announced
 
     def _refuse_products(self, member: Member, message: Done, now: int) -> None:
         topics = [header.topic for header in message.products]

@@ -12,6 +12,8 @@ from caviar_protocol.messages import (
     CheckpointDone,
     Done,
     Fault,
+    GeometryChange,
+    GeometryDone,
     GrantInput,
     Hello,
     Message,
@@ -31,6 +33,8 @@ class Product(msgspec.Struct, frozen=True):
     digest: str
     fidelity: str
     payload: Any
+    geometry: str = ""
+    """Digest of the geometry that it was made with, where that is not the frame's."""
 
 
 # --- events ----------------------------------------------------------------------------------
@@ -66,11 +70,21 @@ class ResetDoneReceived(msgspec.Struct, frozen=True):
 
 
 class DoneReceived(msgspec.Struct, frozen=True):
-    """DONE came; ``payloads`` are opaque, one for each of its products."""
+    """DONE came; ``payloads`` are opaque, one for each of its products. The asset store holds the meshes that
+    it announces."""
 
     service: str
     message: Done
     payloads: tuple[Any, ...] = ()
+    refused: Mapping[str, str] | None = None
+    """Why a mesh that it announces is none, by name."""
+
+
+class GeometryDoneReceived(msgspec.Struct, frozen=True):
+    """GEOMETRY_DONE came."""
+
+    service: str
+    message: GeometryDone
 
 
 class FaultReceived(msgspec.Struct, frozen=True):
@@ -154,8 +168,8 @@ class StepRequested(msgspec.Struct, frozen=True):
 # A union for the type checker; `FrameClock` looks the handler up by the class of the event.
 Event = (
     Joined | AssetsOffered | ReadyReceived | ResetDoneReceived | DoneReceived | FaultReceived
-    | CheckpointReceived | Violated | Progressed | Lost | ByeReceived | Journaled | StopRequested
-    | PauseRequested | ResumeRequested | StepRequested | PolicyOffered
+    | CheckpointReceived | GeometryDoneReceived | Violated | Progressed | Lost | ByeReceived | Journaled
+    | StopRequested | PauseRequested | ResumeRequested | StepRequested | PolicyOffered
 )  # fmt: skip
 
 
@@ -190,7 +204,8 @@ class Journal(msgspec.Struct, frozen=True):
     outcome: str
     """``done``, ``fault``, ``overdue``, ``skipped``, or, for what came later, ``late``. Of the run:
     ``episode`` (one begins), ``resumed`` (one continues with this frame), ``end`` (an agent ends it with
-    this frame), ``seed`` (an agent chooses the next one's), ``checkpoint`` (a service saved its state)."""
+    this frame), ``seed`` (an agent chooses the next one's), ``checkpoint`` (a service saved its state),
+    ``geometry`` (a world announced meshes with its answer to this frame)."""
     decisions: tuple[GrantInput, ...] = ()
     products: tuple[Product, ...] = ()
     """Those that a later frame may consume, or a service that comes back."""
@@ -202,6 +217,8 @@ class Journal(msgspec.Struct, frozen=True):
     """Services of the run, where an episode begins."""
     state: Any = None
     """Of a service, after this frame; opaque."""
+    geometry: GeometryChange | None = None
+    """Meshes that a world has from a frame on."""
 
 
 class Notice(msgspec.Struct, frozen=True):

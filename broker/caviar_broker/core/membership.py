@@ -11,6 +11,7 @@ from collections.abc import Iterable
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
+from caviar_broker.core.geometry import GEOMETRY, GEOMETRY_SINCE, has_capability
 from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
@@ -21,7 +22,6 @@ from caviar_protocol.messages import (
     CAPABILITIES,
     PROTOCOL_VERSION,
     WARNING,
-    Asset,
     Hello,
     Prepare,
     Ready,
@@ -159,22 +159,34 @@ class Registration:
                     epoch=run.plan.epoch,
                     attempt=member.attempt,
                     demand=run.graph.demand[member.name],
-                    assets=() if member.role == "world" else self._scenery(),
+                    assets=() if member.role == "world" else run.scenery(),
                     producers=dict(run.graph.producers),
                     prefixes={} if member.role == "world" else _prefixes(worlds),
+                    max_faces=self._most_faces(member),
                 )
                 run.send(member, prepare)
 
-    def _scenery(self) -> tuple[Asset, ...]:
-        """The scenery of all worlds, each file once, and pattern files that no world brings."""
-        # A world's own file goes before the broker's, which is that of its name with the same digest.
-        found = {pattern.name: pattern.asset for pattern in self._run.plan.patterns if pattern.asset}
-        found |= {asset.name: asset for member in self._run.members.values() for asset in member.assets}
-        return tuple(found[name] for name in sorted(found))
+    def _most_faces(self, member: Member) -> int:
+        """Triangles that a mesh may have which a world announces while the run goes on; 0: it may not."""
+        run = self._run
+        if member.role != "world" or not has_capability(member, GEOMETRY):
+            return 0
+        # A scene may then name a mesh that was not in PREPARE, which a reader of an earlier version refuses.
+        for other in run.members.values():
+            takes = other.hello is not None and any(i.topic in ("scene", "*") for i in other.hello.inputs)
+            if takes and other.hello is not None and other.hello.version < GEOMETRY_SINCE:
+                text = (
+                    f"{member} may announce no meshes while the run goes on: {other} speaks protocol "
+                    f"{_dotted(other.hello.version)}, which does not know them: protocol "
+                    f"{_dotted(GEOMETRY_SINCE)} brought them; update the service. Its objects are boxes"
+                )
+                run.notice("warning", member.name, text)
+                return 0
+        return run.plan.max_faces
 
     def _missing_pattern(self) -> tuple[str, str] | None:
         """What to say of the first pattern file that neither a world nor the broker has, and its world."""
-        known = {asset.name for asset in self._scenery()}
+        known = {asset.name for asset in self._run.scenery()}
         for pattern in self._run.plan.patterns:
             if pattern.name not in known:
                 text = (
@@ -244,7 +256,7 @@ class Registration:
     def _accepted(self, member: Member, message: Ready, now: int) -> bool:
         """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
         # A service without geometry says none, and an empty digest is no contradiction.
-        expected = geometry_digest(self._scenery())
+        expected = geometry_digest(self._run.scenery())
         if member.role != "world" and message.geometry and message.geometry != expected:
             text = (
                 f"{member} holds scenery {message.geometry[:12]}…, the worlds announced "
@@ -436,6 +448,7 @@ class Liveness:
                 dispatcher = self._episodes.dispatcher
                 task = dispatcher.awaited(member.name) if dispatcher else None
                 since = task.started_at if task else self._saving_since(member)
+                since = self._loading_since(member) if since is None else since
                 return None if since is None else member.silent_until(since, timeouts.stall)
             case _:
                 return None  # it waits for others
@@ -443,6 +456,10 @@ class Liveness:
     def _saving_since(self, member: Member) -> int | None:
         """Since when a service without which the run cannot go on saves its state [ns]."""
         return self._episodes.checkpoints.saving_since(member) if member.plan.is_indispensable else None
+
+    def _loading_since(self, member: Member) -> int | None:
+        """Since when frames wait for a service to load the meshes of GEOMETRY [ns]."""
+        return self._episodes.geometry.awaited_since(member) if member.plan.is_indispensable else None
 
     def _blame(self, member: Member, now: int) -> str:
         timeouts, dispatcher = self._run.plan.timeouts, self._episodes.dispatcher
@@ -452,8 +469,10 @@ class Liveness:
             return member.blame_task(task, "makes no progress (timeouts.stall_s)", now, waiting)
         match member.state:
             case ServiceState.ACTIVE:
-                since = (now - (self._saving_since(member) or now)) / 1e9
-                words = f"makes no progress (timeouts.stall_s): {since:.3g} s since CHECKPOINT"
+                saving, loading = self._saving_since(member), self._loading_since(member)
+                asked = saving if saving is not None else loading if loading is not None else now
+                order = "CHECKPOINT" if saving is not None else "GEOMETRY"
+                words = f"makes no progress (timeouts.stall_s): {(now - asked) / 1e9:.3g} s since {order}"
                 return f"{member} {words}; {member.last_words(now)}"
             case ServiceState.EXPECTED:
                 missing = [p for p in self._run.members.values() if p.state is ServiceState.EXPECTED]

@@ -151,6 +151,8 @@ class RunPlan:
     """Pattern files that the scenario names, each once; the broker offers those that no world does."""
     policies: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """SHA-256 of the policies that agents were given, by name, the scenario's first (`policy_swaps`)."""
+    max_faces: int = 2_000_000
+    """Triangles that a mesh may have which a world announces while the run goes on."""
     checkpoint_frames: int = 0
     """Frames after which a service that can do so saves its state; 0: never."""
     imposed: Mapping[tuple[str, int, int], Mapping[str, str]] = field(default_factory=dict)
@@ -213,6 +215,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
         source=scenario.source,
         frames_in_flight=scenario.run.frames_in_flight,
         checkpoint_frames=scenario.run.checkpoint_frames,
+        max_faces=scenario.run.max_faces,
         timeouts=Timeouts(
             connect=round(t.connect_s * SECOND),
             ready=round(t.ready_s * SECOND),

@@ -23,7 +23,16 @@ from caviar_broker.core.transitions import (
     step,
 )
 from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Asset, Error, Hello, Message, Ready, Shutdown, Stale
+from caviar_protocol.messages import (
+    Asset,
+    Error,
+    GeometryChange,
+    Hello,
+    Message,
+    Ready,
+    Shutdown,
+    Stale,
+)
 
 _DOING = {
     ServiceState.EXPECTED: "being awaited",
@@ -198,6 +207,8 @@ class Resumption:
     """Decisions that services took, by service and frame."""
     states: Mapping[str, tuple[int, Any]] = field(default_factory=dict)
     """Last checkpoint: frame and state, by service; frame −1 where there is none."""
+    geometry: tuple[tuple[str, GeometryChange], ...] = ()
+    """What worlds announced of meshes in the finished frames of the episode, in order: world and meshes."""
 
 
 class Run:
@@ -252,6 +263,13 @@ class Run:
     def takes_part(self, member: Member) -> bool:
         """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
         return self.graph is None or member.name in self.graph.inputs
+
+    def scenery(self) -> tuple[Asset, ...]:
+        """The scenery of all worlds, each file once, and pattern files that no world brings."""
+        # A world's own file goes before the broker's, which is that of its name with the same digest.
+        found = {pattern.name: pattern.asset for pattern in self.plan.patterns if pattern.asset}
+        found |= {asset.name: asset for member in self.members.values() for asset in member.assets}
+        return tuple(found[name] for name in sorted(found))
 
     # --- seeds (clause 16) -------------------------------------------------------------------------
 

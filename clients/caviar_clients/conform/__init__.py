@@ -4,8 +4,8 @@ It shares no code with the product's broker and reads headers with the plain ``m
 it is a second reading of ``protocol/SPEC.md``. Only payloads are judged with `caviar_protocol`'s types.
 
 `conform` takes a client through the cases, one life after another, and collects the verdicts. The cases are
-in `lifecycle`, `frames`, `content` and `wrong`. `session` plays the broker for one life of the client, which
-`client` starts, with the contents of `street`; `canonical` judges what comes.
+in `lifecycle`, `frames`, `content`, `geometry` and `wrong`. `session` plays the broker for one life of the
+client, which `client` starts, with the contents of `street`; `canonical` judges what comes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from caviar_clients.conform import content, frames, lifecycle, wrong
+from caviar_clients.conform import content, frames, geometry, lifecycle, wrong
 from caviar_clients.conform.case import Case, Kit, Verdict
 from caviar_clients.conform.client import ByHand, Client, Rules, Started, Wire
 from caviar_protocol.errors import SetupError, suggestion
@@ -41,6 +41,7 @@ def cases() -> tuple[Case, ...]:
         *frames.FRAMES_AND_EPISODES,
         *content.CASES,
         *wrong.CASES,
+        *geometry.CASES,
         *frames.CHECKPOINTS,
         *lifecycle.LEAVING,
         *frames.AFTERWARDS,

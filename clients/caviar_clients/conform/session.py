@@ -37,7 +37,7 @@ EPOCH, ATTEMPT = 3, 2
 SEED = 11
 VERSION = (1, 6)
 """Version of the protocol that the kit plays."""
-CAPABILITIES = ("assets", "checkpoint", "episodes", "parts")
+CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "parts")
 """Capabilities of a broker of that version."""
 LEFT_OVER = 100_000
 """Messages of a life that are discarded before the next one, at most."""
@@ -351,6 +351,28 @@ class Session:
         if not is_world:
             order["prefixes"] = {world: street.PREFIXES[world] for world in inputs.sources["scene"]}
         return order
+
+    def serve(self, digest: str, data: bytes) -> None:
+        """Have a file that the client may ask for.
+
+        Args:
+            digest: Its SHA-256.
+            data: Its bytes.
+        """
+        self._served[digest] = data
+
+    def serving(self, kind: str) -> Answer:
+        """Return the next message but ASSET_GETs, which are answered; it has to be of this kind.
+
+        Args:
+            kind: Type of the message.
+        """
+        while (answer := self.receive(kind)).kind == "ASSET_GET":
+            self._serve_asset(answer.fields)
+        if answer.kind != kind:
+            raise Failed(kind, str(answer))
+        self.check_identity(answer)
+        return answer
 
     def _serve_asset(self, get: Fields) -> None:
         """Answer an ASSET_GET of the client."""

@@ -170,6 +170,22 @@ def briefing(hello: Fields, directory: str = "") -> Fields:
     return fields | ({"directory": directory, "resolved": plain} if hello["role"] == "recorder" else {})
 
 
+def unit_mesh(text: str) -> bytes:
+    """Make the mesh of an object: a tetrahedron that fills the unit box.
+
+    Args:
+        text: A comment in it, by which its digest is unlike all others.
+    """
+    corners = ((-0.5, -0.5, -0.5), (0.5, 0.5, -0.5), (0.5, -0.5, 0.5), (-0.5, 0.5, 0.5))
+    vertices = "".join(f"{x} {y} {z}\n" for x, y, z in corners)
+    faces = "3 0 1 2\n3 0 3 1\n3 0 2 3\n3 1 3 2\n"
+    return (
+        f"ply\nformat ascii 1.0\ncomment {text}\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face 4\nproperty list uchar int vertex_indices\nend_header\n{vertices}{faces}"
+    ).encode()
+
+
 def scenery(mark: str) -> dict[str, bytes]:
     """Make files of scenery by name.
 

@@ -34,6 +34,7 @@ from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
+from caviar_protocol.geometry import MeshCheck
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
@@ -157,6 +158,7 @@ class EmbeddedRun:
         plan = with_replay(plan, scenario.replay)
         imposed = plan.imposed if imposed is None else imposed
         store = AssetStore()
+        self._meshes = MeshCheck(store, plan.max_faces)
         if episode is not None:
             plan = replace(plan, first_episode=episode, episodes=episode + 1)
         plan = replace(
@@ -208,6 +210,10 @@ class EmbeddedRun:
         self._at_work: Work | None = None  # what a service handles just now
         self._direct: DirectFrames | None = None
         classes = {name: session.cls for name, session in self._sessions.items()}
+        # Which meshes there are in a frame is the clock's to say.
+        settings = {name: spec.settings for name, spec in scenario.services.items()}
+        if any(c.role == "world" and c.changes_geometry_with(settings[n]) for n, c in classes.items()):
+            self._without_clock = False
         self._watchdog = Watchdog(plan, classes, self._present_work, on_wait)
 
     def run(self) -> ev.Finished:
@@ -327,7 +333,9 @@ class EmbeddedRun:
         match message:
             case m.Done():
                 payloads = tuple(zip(parts[::2], parts[1::2], strict=True)) if self._encodes else tuple(parts)
-                event = ev.DoneReceived(name, message, payloads)
+                event = ev.DoneReceived(name, message, payloads, self._refused(message))
+            case m.GeometryDone():
+                event = ev.GeometryDoneReceived(name, message)
             case m.ResetDone():
                 event = ev.ResetDoneReceived(name, message)
             case m.AssetOffer():
@@ -341,6 +349,10 @@ class EmbeddedRun:
             case _:
                 raise RunError(f"{name!r} sent {message}, which a run in one process has no use for")
         self._events.append(event)
+
+    def _refused(self, message: m.Done) -> dict[str, str] | None:
+        """Why meshes that a world announces are none, by name; None where it announces none."""
+        return None if message.geometry is None else self._meshes.refusals(message.geometry.assets)
 
     def _skip_time(self) -> None:
         """No service has work left: move the clock to its next deadline."""

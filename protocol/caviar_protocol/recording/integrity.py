@@ -13,6 +13,7 @@ import msgspec
 
 from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
+from caviar_protocol.geometry import digest_in, recorded_meshes
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,
@@ -364,6 +365,27 @@ def damaged_assets(recorded: RecordedSegments) -> list[str]:
             continue
         if digest != asset.digest:
             found.append(f"{file}: its digest is {digest}, was {asset.digest}")
+    return found + _damaged_meshes(recorded)
+
+
+def _damaged_meshes(recorded: RecordedSegments) -> list[str]:
+    """Meshes that came while the run went on and are missing or altered: a line each."""
+    metadata = metadata_of(recorded.segments[0])
+    # A recorder that copies no scenery copies no meshes.
+    folder = RunDirectory(recorded.path).assets
+    there = recorded_meshes(folder)
+    reports = (r for segment in recorded.segments for entry in segment.entries for r in entry.reports)
+    named = {a.name for report in reports if report.geometry is not None for a in report.geometry.assets}
+    copied = bool(metadata.assets) or bool(there)
+    found = [f"{folder / name} is missing" for name in sorted(named - there.keys()) if copied]
+    for name, file in there.items():
+        try:
+            digest = file_digest(file)
+        except OSError as error:
+            found.append(f"{file} cannot be read: {error.strerror}")
+            continue
+        if digest != digest_in(name):
+            found.append(f"{file}: its digest is {digest}, was {digest_in(name)}")
     return found
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.geometry import recorded_meshes
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import (
     FrameEntry,
@@ -126,10 +127,15 @@ class Recording:
 
     @property
     def assets(self) -> dict[str, Path]:
-        """Files of scenery that were recorded, by asset name."""
+        """Files of scenery that were recorded, by asset name, and `meshes`."""
         folder = RunDirectory(self.directory).assets
         found = {asset.name: folder / asset.name for asset in self.metadata.assets}
-        return {name: file for name, file in found.items() if file.is_file()}
+        return {name: file for name, file in found.items() if file.is_file()} | self.meshes
+
+    @property
+    def meshes(self) -> dict[str, Path]:
+        """Files of the meshes that worlds announced while the run went on, by asset name."""
+        return recorded_meshes(RunDirectory(self.directory).assets)
 
     @property
     def topics(self) -> dict[str, tuple[str, ...]]:

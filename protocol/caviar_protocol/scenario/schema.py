@@ -119,6 +119,10 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ``lidar``, or with a part of it ``lidar.grid``."""
     checkpoint_frames: Annotated[int, quantity("frame", "from one checkpoint to the next", ge=0)] = 20
     """Services that can do so then save their state; 0: never."""
+    max_faces: Annotated[
+        int, quantity("1", "triangles of a mesh that a world announces while the run goes on", ge=1)
+    ] = 2_000_000
+    """One with more is refused, and its objects are boxes."""
     frames_in_flight: Annotated[int, quantity("frame", "frames that may overlap", ge=1, le=64)] = 4
     durability: Durability = "periodic"
     """What a loss of power costs: ``frame`` at most the frame in progress, ``periodic`` at most

@@ -64,6 +64,40 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
     return vertices, triangles
 
 
+_MOST_HEADER = 1 << 16
+
+
+def ply_comments(file: Path) -> tuple[str, ...]:
+    """Comments in the header of a PLY file.
+
+    Args:
+        file: The file; one that cannot be read, or has no header, has none.
+    """
+    return tuple(line[len("comment ") :] for line in _header_lines(file) if line.startswith("comment "))
+
+
+def ply_faces(file: Path) -> int:
+    """Faces that the header of a PLY file announces; 0 where it announces none or cannot be read.
+
+    Args:
+        file: The file, of which only the header is read.
+    """
+    for line in _header_lines(file):
+        match line.split():
+            case ["element", "face", count] if count.isdigit():
+                return int(count)
+    return 0
+
+
+def _header_lines(file: Path) -> list[str]:
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(_MOST_HEADER)
+    except OSError:
+        return []
+    return head.partition(b"end_header")[0].decode("latin-1").splitlines()
+
+
 @dataclass
 class _Element:
     """An element of the header: so many rows of numbers, lists, or both."""

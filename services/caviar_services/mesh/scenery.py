@@ -19,17 +19,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, suggestion
+from caviar_protocol.geometry import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.space.ply import read_ply
 from caviar_services.mesh.shapes import Mesh
-
-ITU_MATERIALS = frozenset(
-    (
-        "asphalt_concrete", "brick", "carpet_tile", "ceiling_board", "chipboard", "clear_acrylic", "concrete",
-        "floorboard", "glass", "marble", "medium_dry_ground", "metal", "plasterboard", "plywood", "vacuum",
-        "very_dry_ground", "vinyl_tile", "wet_ground", "wood",
-    )
-)  # fmt: skip
-"""Materials of Recommendation ITU-R P.2040-3, table 3, by the names that Sionna RT has for them."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -324,18 +324,50 @@ SHAPES: dict[str, Callable[[], Mesh]] = {
 """Object classes that have a mesh."""
 
 
-def ply(mesh: Mesh) -> bytes:
+def fitted(mesh: Mesh) -> tuple[Mesh, Float64Array, Float64Array]:
+    """Scale and centre a mesh to the unit box, as meshes of moving objects travel.
+
+    Args:
+        mesh: In the object's axes [m]: x forward, y left, z up.
+
+    Returns:
+        The unit mesh, the object's dimensions [m], Shape ``[3]``, and the centre of its bounding box in its
+        axes [m], Shape ``[3]``, which is where `ObjectState.position` is.
+
+    Raises:
+        PayloadError: It has no vertices, or is flat along an axis.
+
+    Example:
+        >>> unit, dimensions, centre = fitted(box((0, 4), (-1, 1), (0, 1.5)))
+        >>> dimensions.tolist(), centre.tolist(), unit.vertices.max(0).tolist()
+        ([4.0, 2.0, 1.5], [2.0, 0.0, 0.75], [0.5, 0.5, 0.5])
+    """
+    if not len(mesh.vertices):
+        raise PayloadError("a mesh without vertices has no size; give it some, or let its object be a box")
+    low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
+    dimensions, centre = high - low, (low + high) / 2
+    if not (dimensions > 0).all():
+        axis = "xyz"[int(np.argmin(dimensions))]
+        raise PayloadError(f"the mesh is flat along {axis}: it cannot fill a box; give it a thickness")
+    return Mesh((mesh.vertices - centre) / dimensions, mesh.faces), dimensions, centre
+
+
+def ply(mesh: Mesh, material: str = "") -> bytes:
     """Encode a mesh as binary PLY: float32 vertices, faces as uint8 count and int32 indices.
 
     Args:
         mesh: Of a unit mesh, the box of its vertices is −½…½ on every axis.
+        material: What it is made of, by its name in Recommendation ITU-R P.2040; empty: what the channel's
+            settings say.
 
     Example:
         >>> ply(unit_box())[:3]
         b'ply'
     """
+    comment = f"comment material {material}\n" if material else ""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
+        f"{comment}"
         f"element vertex {len(mesh.vertices)}\n"
         "property float x\nproperty float y\nproperty float z\n"
         f"element face {len(mesh.faces)}\n"

@@ -23,7 +23,7 @@ import msgspec
 
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import AssetError, RunError
-from caviar_protocol.files import sync_file
+from caviar_protocol.files import replace_file, sync_file
 from caviar_protocol.messages import Asset, GrantInput, Input, Role, Status
 from caviar_protocol.run_directory import RunDirectory
 from caviar_services.service import Service
@@ -240,6 +240,27 @@ def _after(key: str, file: Path) -> str:
     except OSError:
         return ""
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(key)), "")
+
+
+def copy_meshes(meshes: Mapping[str, Path], folder: Path, *, sync: bool = False) -> None:
+    """Copy meshes that came while the run goes on into a recording.
+
+    They are named by their content, so that one which is there already is the same.
+
+    Args:
+        meshes: File by asset name.
+        folder: Where the copies go.
+        sync: Whether they are on disk when this returns.
+
+    Raises:
+        OSError: A file cannot be read or written.
+    """
+    for name, source in sorted(meshes.items()):
+        target = folder / PurePosixPath(name)
+        if not target.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            # In one step: a recorder that is killed leaves no half of a mesh under the name of the whole.
+            replace_file(target, source.read_bytes(), durable=sync)
 
 
 def copy_assets(assets: Mapping[str, Path], folder: Path, *, sync: bool = False) -> tuple[Asset, ...]:

@@ -17,6 +17,8 @@ A recording is a run directory with ``recording-0000.mcap``, ``recording-0001.mc
   (`caviar_protocol.recording.segment`), handed to the operating system before DONE, and on disk as the
   run's ``durability`` says (`segment_writer.Persistence`). MCAP's index and statistics are written when a
   segment is full or the run ends; then the manifest ``recording.json`` lists it as finished.
+* Meshes that worlds announce while the run goes on are added to ``assets/`` before the first frame that has
+  them; the report of the world in ``caviar.frame/1`` says which those are, and from which frame on.
 * Metadata record ``caviar``: `caviar_protocol.recording.RecordingMetadata`, a JSON text a field.
 
 A recorder that is started again goes on in the recording of the process before it: nothing is there twice,
@@ -61,6 +63,7 @@ from caviar_services.recorder.base import (
     RunTime,
     StoredProducts,
     copy_assets,
+    copy_meshes,
     failure,
     machine,
     versions,
@@ -113,6 +116,7 @@ class McapRecorder(Recorder[McapSettings]):
     Settings = McapSettings
     outputs: ClassVar[tuple[str, ...]] = ()
     uses_scenery: ClassVar[bool] = True
+    changes_geometry: ClassVar[bool] = True
 
     def __init__(self, settings: McapSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -166,6 +170,23 @@ class McapRecorder(Recorder[McapSettings]):
             self._persistence = self._persisted([])
             self._open_segment()
         return Prepared(notes=(f"recording to {folder}",))
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Copy meshes that came while the run goes on, before a frame that has them is recorded.
+
+        Args:
+            meshes: Files by asset name.
+
+        Raises:
+            RunError: A file cannot be written; names path, errno and remedy.
+        """
+        if not self.settings.copy_assets:
+            return
+        folder = RunDirectory(self.run.directory).assets
+        try:
+            copy_meshes(meshes, folder, sync=self._durability != "none")
+        except OSError as error:
+            raise failure(Path(error.filename or folder), error) from error
 
     def step(self, frame: Frame) -> StepResult:
         """Write a frame; when this returns, the operating system has it, under ``frame`` the disk.

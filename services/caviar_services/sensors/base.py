@@ -20,7 +20,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Payload, quantity
-from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
+from caviar_protocol.geometry import check_unit_box, is_mesh_name
 from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.space.coordinates import Pose, Vector
@@ -87,6 +88,7 @@ class Sensors(Service[S]):
     Settings: ClassVar[type[msgspec.Struct]] = SensorSettings
     extra: ClassVar[str] = "sensors"
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
+    changes_geometry: ClassVar[bool] = True
 
     traced: TracedScene | None = None
     """The scene for rays; None where nothing is asked for."""
@@ -123,6 +125,19 @@ class Sensors(Service[S]):
             self.run.progress("compiling kernels", 60.0)
             self._warm_up(mi)
         return Prepared(notes=(f"rays are traced by {device}",))
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Take the meshes that objects may have from the next frame on, beside those of `prepare`.
+
+        Args:
+            meshes: Files by asset name.
+
+        Raises:
+            AssetError: A file is no mesh.
+        """
+        if self.traced is not None:
+            bodies = {name: load_unit_mesh(path) for name, path in meshes.items()}
+            self.traced.use_meshes(bodies)
 
     def step(self, frame: Frame) -> StepResult:
         """Move the bodies to the objects of the frame, and observe."""
@@ -284,13 +299,7 @@ def load_unit_mesh(file: Path) -> Mesh:
         12
     """
     vertices, faces = read_ply(file)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    # Files have float32, in which a half is exact; exporters that scale miss it by some rounding.
-    if not (np.allclose(low, -0.5, atol=1e-4) and np.allclose(high, 0.5, atol=1e-4)):
-        raise AssetError(
-            f"{file}: spans {low.round(4).tolist()} to {high.round(4).tolist()}; "
-            "scale and centre it to −0.5…0.5 on every axis"
-        )
+    check_unit_box(vertices, str(file))
     return Mesh(vertices, faces.astype(np.int32))
 
 
@@ -344,6 +353,7 @@ class TracedScene:
         self._scenery_names = names
         self._bodies = dict(bodies)
         self._capacity = dict(capacity)
+        self._later: dict[str, Mesh] = {}
         self._scenery: _Part | None = None
         scenery, self._scenery_owner = joined(meshes), _owners(meshes)
         self.scenery_faces = len(scenery.faces)
@@ -355,6 +365,22 @@ class TracedScene:
         self._nothing = Mesh(np.tile(place, (3, 1)), np.array([[0, 1, 2]], dtype=np.int32))
         self._moving = _Part(mi, "bodies", self._nothing)
         self._set_bodies([], [])
+
+    def use_meshes(self, bodies: Mapping[str, Mesh]) -> None:
+        """Take unit meshes that objects may have beside those of the beginning.
+
+        Any number of objects may have them: no body is kept for one that is not there.
+
+        Args:
+            bodies: By asset name; those of an earlier call that are not here are gone.
+        """
+        self._later = dict(bodies)
+
+    def _body(self, asset: str) -> Mesh:
+        """The unit mesh of an asset; the box for one that came later and is not there, or was refused."""
+        if is_mesh_name(asset):
+            return self._later.get(asset) or self._bodies.get(asset) or self._bodies[""]
+        return self._bodies[asset]
 
     def update(self, mi: Any, scene: Scene) -> None:
         """Bring the bodies to where the scene's objects are.
@@ -373,12 +399,13 @@ class TracedScene:
                 f"object {min(clash)!r} has the name of a shape of the scenery; give the world's objects "
                 "another prefix"
             )
-        assign_bodies(zip(scene.names, scene.assets, strict=True), self._capacity)
+        known = [pair for pair in zip(scene.names, scene.assets, strict=True) if not is_mesh_name(pair[1])]
+        assign_bodies(known, self._capacity)
         # Embree rebuilds all that is in the mesh, whether a ray can hit it or not: no body is parked there.
         # A pool of 4 × 64 bodies had 13,800 triangles rebuilt in each frame of `street-canyon`.
         meshes = [
             Mesh(placed(unit, scene.dimensions[index], object_pose(scene, index)), unit.faces)
-            for index, unit in enumerate(self._bodies[asset] for asset in scene.assets)
+            for index, unit in enumerate(self._body(asset) for asset in scene.assets)
         ]
         self._set_bodies(scene.names, meshes)
         self._moving.replace(mi, self._joined_bodies)
@@ -440,7 +467,7 @@ class TracedScene:
         if not (dimensions > 0).all():
             return False
         around = np.array(point) + 1e-3 * np.concatenate([np.eye(3), -np.eye(3)])
-        return all(contains(self._bodies[asset], place) for place in around / dimensions)
+        return all(contains(self._body(asset), place) for place in around / dimensions)
 
 
 def _owners(meshes: list[Mesh]) -> Int32Array:

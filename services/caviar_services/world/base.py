@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
-from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
@@ -28,6 +28,7 @@ from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.world.run_time_meshes import RunTimeMeshes
 from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets, scenery_file
 
 
@@ -54,6 +55,8 @@ class ObjectState(NamedTuple):
     """[rad/s] about the vertical through its position, counter-clockwise; 0 also where it is not known."""
     tilt_rate: tuple[float, float] = (0.0, 0.0)
     """[rad/s] about the world's x and y through its position, right-handed."""
+    mesh: str = ""
+    """Its own mesh, by the name that `World.add_mesh` returned; empty: that of its class, or a box."""
 
 
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -67,7 +70,7 @@ class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 W = TypeVar("W", bound=WorldSettings)
-_Listed = tuple[list[tuple[str, str]], tuple[str, ...], tuple[str, ...], tuple[str, ...]]
+_Listed = tuple[list[tuple[str, str, str]], tuple[str, ...], tuple[str, ...], tuple[str, ...]]
 
 
 class World(Service[W]):
@@ -121,6 +124,7 @@ class World(Service[W]):
         self._t0_ns = 0
         # Names and classes of the objects of the last frame; their names, classes and assets as published.
         self._listed: _Listed = ([], (), (), ())
+        self._meshes = RunTimeMeshes(run.again)
 
     @classmethod
     def placements(cls, settings: W) -> Iterable[tuple[str, str, Sequence[Vector]]]:
@@ -203,6 +207,7 @@ class World(Service[W]):
             ScenarioError: A device is mounted on an object that can never come; names its key.
         """
         self._check_parents()
+        self._meshes.max_faces = preparation.max_faces
         scenery = self.settings.scenery or "none"
         return Prepared(
             prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
@@ -236,20 +241,58 @@ class World(Service[W]):
         """Begin an episode; the same arguments lead to the same scenes, bit by bit."""
         self._t0_ns = t0_ns
         self._mounts.clear()
+        self._meshes.reset()
         self.begin(episode, seed)
 
     def step(self, frame: Frame) -> StepResult:
         """The scene at the frame's instant."""
-        scene = self._scene(list(self.objects_at(frame.t_ns - self._t0_ns)))
+        states = list(self.objects_at(frame.t_ns - self._t0_ns))
+        scene = self._scene(states)
         counts = {f"{WITHOUT_OBJECT_PREFIX}{name}": 1 for name in self._mounts.without_object}
-        return StepResult(products={"scene": scene}, counts=counts)  # counted in the run's summary
+        # Counted in the run's summary.
+        if not self.changes_geometry:
+            return StepResult(products={"scene": scene}, counts=counts)
+        meshes = self._meshes.at(frame.number, {state.mesh for state in states if state.mesh})
+        return StepResult(products={"scene": scene}, counts={**counts, **self._meshes.counts}, meshes=meshes)
+
+    def add_mesh(self, content: bytes) -> str:
+        """Bring a mesh while the run goes on, of a world with ``changes_geometry``.
+
+        It is there from the frame that is computed next, or now, for as long as an object has it, and
+        `RunTimeMeshes.LINGER_FRAMES` longer. Adding one that is there changes nothing.
+
+        Args:
+            content: A PLY file of a unit mesh, as `mesh.shapes.ply` makes it of what `mesh.shapes.fitted`
+                returns.
+
+        Returns:
+            Its name, for `ObjectState.mesh`.
+
+        Raises:
+            RunError: The class does not say ``changes_geometry = True``.
+        """
+        if not self.changes_geometry:
+            raise RunError(
+                f"{type(self).__name__} brings a mesh while the run goes on: write changes_geometry = True "
+                "in the class"
+            )
+        return self._meshes.add(content)
+
+    def mesh_refused(self, digest: str, reason: str) -> None:
+        """Note that a mesh is not used; its objects are boxes.
+
+        Args:
+            digest: SHA-256 of the file; empty: of none.
+            reason: Why.
+        """
+        self._meshes.refuse(digest, reason)
 
     def _scene(self, states: list[ObjectState]) -> Scene:
         # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
         devices = self._mounts.turned_back(devices, {state.name: state for state in states})
         states = sorted(states)
-        listed = [(state.name, state.kind) for state in states]
+        listed = [(state.name, state.kind, state.mesh) for state in states]
         # Objects hardly ever come and go: what follows from names and classes alone is kept.
         if listed != self._listed[0]:
             self._listed = listed, *self._described(listed)
@@ -268,17 +311,20 @@ class World(Service[W]):
         )
 
     def _described(
-        self, listed: Sequence[tuple[str, str]]
+        self, listed: Sequence[tuple[str, str, str]]
     ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-        """Names, classes and assets of objects by name and class, sorted."""
+        """Names, classes and assets of objects by name, class and own mesh, sorted."""
         # Sorted, so neighbours: consumers look objects up by name, and would take one of the two.
-        names = tuple(name for name, _ in listed)
+        names = tuple(name for name, *_ in listed)
         if len(set(names)) < len(names):
             twice = next(name for name, following in pairwise(names) if name == following)
             raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
         meshes = set(self.mesh_classes())
-        assets = tuple(f"objects/{kind}.ply" if kind in meshes else "" for _, kind in listed)
-        return names, tuple(kind for _, kind in listed), assets
+        assets = tuple(
+            (mesh if self._meshes.max_faces else "") or (f"objects/{kind}.ply" if kind in meshes else "")
+            for _, kind, mesh in listed
+        )
+        return names, tuple(kind for _, kind, _ in listed), assets
 
 
 def _may_begin(on: str, prefix: str) -> bool:

@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import count, islice
+from pathlib import Path
 from typing import ClassVar
 
 import msgspec
@@ -74,6 +75,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     outputs: ClassVar[tuple[str, ...]] = ("channel",)
     uses_scenery: ClassVar[bool] = True
     checkpoints: ClassVar[bool] = True
+    changes_geometry: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = AdaptiveSettings
     clock: Callable[[], int] = staticmethod(time.perf_counter_ns)
     """Wall time [ns]."""
@@ -162,6 +164,15 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
             if not (low[:2] < place[:2]).all() or not (place[:2] < high[:2]).all():
                 return False
         return not model.enclosing(np.array(place))
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Take the meshes that objects may have from the next frame on, in the model of every rung.
+
+        Args:
+            meshes: Files by asset name.
+        """
+        for rung in self._every:
+            rung.model.use_meshes(meshes)
 
     # --- frames ------------------------------------------------------------------------------------
 

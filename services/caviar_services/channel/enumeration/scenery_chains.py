@@ -218,6 +218,7 @@ class SceneryChains:
         launch: From where a transmitter stands.
         per_frame: Rays from one that moves.
         cache: Where chains are kept between runs; None: nowhere.
+        before: Of the same scenery among other bodies, whose chains hold; None: there are none.
     """
 
     def __init__(
@@ -227,6 +228,7 @@ class SceneryChains:
         launch: SceneryLaunch,
         per_frame: int,
         cache: ChainCache | None,
+        before: SceneryChains | None = None,
     ) -> None:
         self._scene, self._options, self._launch, self._cache = scene, options, launch, cache
         self._launcher = PartedLauncher(scene.mi_scene, only_reflected(options, per_frame))
@@ -235,8 +237,12 @@ class SceneryChains:
         # By the name of a transmitter that stands: its place in the world [m], and what is known from there.
         # Each has its own: however near to another one it stands, a wall may be between them.
         self._known: dict[str, tuple[Float64Array, KnownScenery]] = {}
+        if before is not None:
+            self._known.update(before._known)
         # All chains, and which planes see one another; None: too many.
-        self._every = self._every_chain()
+        self._every: tuple[ChainTree, Int32Array] | None = (
+            self._every_chain() if before is None else before._every
+        )
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
     def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.errors import PayloadError, SetupError
+from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import derive_seed
@@ -68,6 +69,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     extra: ClassVar[str] = "channel"
     uses_scenery: ClassVar[bool] = True
     checkpoints: ClassVar[bool] = True
+    changes_geometry: ClassVar[bool] = True
 
     @classmethod
     def check_settings(cls, settings: SionnaSettings, place: Place) -> None:
@@ -86,6 +88,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self._scene: SionnaScene
         self._finder: PathFinder
         self._outside: tuple[OutsideUse, ...] = ()
+        self._enumerates = False
+        self._bodies_version = 0
         self._detail = ""
         self._room: dict[str, int] = {}
         self._names: tuple[str, ...] = ()  # of the pieces of the scene in the last frame
@@ -222,15 +226,57 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """
         s = self.settings
         notes = self.load_scene(preparation)
-        frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
-        launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
         # Objects move in the run where a world has meshes of them, or devices are mounted on them.
         meshes = any(name.startswith("objects/") for name in preparation.assets)
         moving = meshes or any(device.on for device in self.run.devices)
-        enumerated = s.enumerates(moving) and launched.reflection
-        self._finder = PathFinder(self._scene, s, launched, self.run, enumerated)
-        self._launched, self._samples = self._finder.options, self._finder.samples
+        self._enumerates = s.enumerates(moving)
+        switched = self._make_finder()
         return (*notes, *self._finder.notes, *switched, *self._warm_up())
+
+    def _make_finder(self, before: PathFinder | None = None) -> tuple[str, ...]:
+        """Make what finds paths in the scene as it is; notes on what is switched off.
+
+        Args:
+            before: Of the scene with other bodies; None: none was made.
+        """
+        frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
+        launched, switched = contributing(self._asked, self._scene.used_surfaces(), frequencies)
+        enumerated = self._enumerates and launched.reflection
+        self._finder = PathFinder(self._scene, self.settings, launched, self.run, enumerated, before)
+        self._launched, self._samples = self._finder.options, self._finder.samples
+        return switched
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Take the meshes that objects may have from the next frame on, beside those of `prepare`.
+
+        Args:
+            meshes: Files by asset name.
+
+        Raises:
+            AssetError: A file is no mesh.
+            ScenarioError: Paths are followed: what is known of them is known by the bodies of before.
+        """
+        if meshes and self.settings.follow is not None:
+            raise ScenarioError(
+                "a world brings meshes while the run goes on, among which paths cannot be followed; leave it "
+                "out, or have the world bring its meshes at the beginning",
+                key=self.run.settings_place.at("follow").key,
+            )
+        self._activate()
+        self.run.progress("loading meshes", COMPILE_GRACE_S)
+        self._scene.use_meshes(meshes)
+        self.run.progress("meshes loaded", 0.0)
+
+    def _make_room(self, scene: Scene) -> None:
+        """Make bodies for objects whose meshes came while the run goes on, where there are too few."""
+        self._scene.make_room(scene, frozenset(self.settings.without_body))
+        # Also where another model that shares the scene has made them.
+        if self._scene.bodies_version != self._bodies_version:
+            # Kernels may have to be compiled for them, which the first trace does.
+            self.run.progress("making bodies of new meshes", COMPILE_GRACE_S)
+            self._bodies_version = self._scene.bodies_version
+            self._make_finder(self._finder)
+            self._names, self._outside = self._scene.names, self._scene.outside
 
     def _start(self) -> tuple[str, ...]:
         """Import the ray tracer with its library and variant; notes that say which."""
@@ -322,6 +368,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         _refuse_buried(scene, self.settings.without_body, self.foliage)
         for loss in self._losses:
             loss.move(scene)
+        self._make_room(scene)
         finder, antennas = self._finder, (transmitters, receivers)
         names, velocity = finder.place(scene)
         self._names = names

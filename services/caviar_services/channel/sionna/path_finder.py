@@ -56,6 +56,7 @@ class PathFinder:
         options: What is launched in a frame, without what cannot contribute.
         run: Carriers, and devices whose places are known before the first frame.
         enumerated: Whether reflections are enumerated.
+        before: Of the same scene with other bodies, whose knowledge of scenery holds; None: there is none.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class PathFinder:
         options: LaunchOptions,
         run: RunInfo,
         enumerated: bool,
+        before: PathFinder | None = None,
     ) -> None:
         self._scene, self._settings, self._run = scene, settings, run
         self.wavelengths = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in run.carriers])
@@ -97,7 +99,7 @@ class PathFinder:
         self._enumerated: EnumeratedTracer | None = None
         self._scenery: SceneryChains
         if enumerated:
-            self._enumerate(options)
+            self._enumerate(options, before)
         # Where no edge is in range of a transmitter and its receivers, a tracer without diffraction is used.
         self._edge_range: EdgeRange | None = None
         self._unbent: Tracer
@@ -124,7 +126,7 @@ class PathFinder:
 
     # --- before the first frame ----------------------------------------------------------------------
 
-    def _enumerate(self, options: LaunchOptions) -> None:
+    def _enumerate(self, options: LaunchOptions, before: PathFinder | None) -> None:
         """Know the scenery from where transmitters stand; notes say what was found, and what was not kept."""
         s, scene = self._settings, self._scene
         depth = min(options.max_depth, s.enumerated_depth)
@@ -140,7 +142,10 @@ class PathFinder:
         launch = SceneryLaunch(samples=self.samples, launches=s.scenery_launches)
         self._enumerated = EnumeratedTracer(scene, options)
         known_options = replace(options, max_depth=depth)
-        self._scenery = SceneryChains(scene, known_options, launch, s.samples_per_frame, cache)
+        earlier = before._scenery if before is not None and before._enumerated is not None else None
+        self._scenery = SceneryChains(scene, known_options, launch, s.samples_per_frame, cache, earlier)
+        if earlier is not None:
+            return
         for device in self._run.devices:
             if device.kind == "antenna" and device.role in ("tx", "both") and not device.on:
                 name = device.name

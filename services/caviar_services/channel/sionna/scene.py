@@ -14,10 +14,12 @@ adaptive ladder mostly do.
 
 from __future__ import annotations
 
+import gc
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.geometry import is_mesh_name, material_of
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -46,6 +49,7 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.channel.sionna.scene_loading import (
+    ObjectMaterial,
     Shape,
     bounds,
     by_material,
@@ -99,6 +103,30 @@ class SceneSettings:
     """Key of the scenario that says how many bodies there are, by asset, for errors."""
 
 
+def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:
+    """Find the materials that meshes of objects name in their files, by asset.
+
+    Args:
+        assets: Files of the run by name.
+    """
+    named = {name: material_of(file) for name, file in assets.items() if name.startswith("objects/")}
+    return {name: material for name, material in named.items() if material}
+
+
+@dataclass(frozen=True)
+class LaterBodies:
+    """Meshes that came while the run goes on, and the bodies that there are for them."""
+
+    meshes: Mapping[str, Mesh] = field(default_factory=dict)
+    """By asset."""
+    materials: Mapping[str, str] = field(default_factory=dict)
+    """By asset: of those that name one."""
+    room: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """Bodies by mesh and material; those of the box are for objects whose mesh is not there."""
+    changed: bool = False
+    """Whether bodies have to be made for them."""
+
+
 class SionnaScene(NumberedTriangles):
     """The triangles of a `sionna.rt.Scene` with a pool of bodies for moving objects.
 
@@ -117,8 +145,12 @@ class SionnaScene(NumberedTriangles):
     def __init__(self, assets: Mapping[str, Path], pool: Mapping[str, int], settings: SceneSettings) -> None:
         from sionna.rt import RadioMaterial
 
+        self._settings = settings
+        self.bodies_version = 0
+        """Counts how often bodies were made anew, for meshes that came while the run goes on."""
+        self._rt_objects: list[tuple[Shape, Any]] = []
         bodied = any(pool.values())
-        skins = [
+        skins = self._skins = [
             itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
             for frequency in settings.frequencies_hz
             if bodied
@@ -131,7 +163,10 @@ class SionnaScene(NumberedTriangles):
         self.foliage_meshes = {name: meshes.pop(name) for name in list(meshes) if self._foliage.of(name)}
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(meshes)
+        self._later = LaterBodies()
+        self._own_materials = own_materials(assets)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
+        made = self._made = self._with_own_materials(made)
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
         full = by_material(self._scene, meshes, changed)
         key = f"{settings.materials.key}.detail"
@@ -143,15 +178,20 @@ class SionnaScene(NumberedTriangles):
         self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
         self._pool_keys = {kind: settings.pool_keys.get(asset, "") for (asset, _), kind in kinds.items()}
         self._meshes = {kind: units[asset] for (asset, _), kind in kinds.items()}
+        self._first_pool, self._first_meshes = dict(self._pool), dict(self._meshes)
         of_material = {
             m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
             for m in ("", *made)
         }
         bodies = [body for of in of_material.values() for body in of]
+        self._bodies_of, self._at_rest = of_material, shapes
+        self._first_bodies_of = of_material
         self._standing: frozenset[Body] = frozenset()
         self.turning: Turning | None = None
         """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
-        skin = RadioMaterial(f"{_SKIN}-skin", BODY_THICKNESS, *(skins[0].constants if skins else (1.0, 0.0)))
+        skin = self._skin = RadioMaterial(
+            f"{_SKIN}-skin", BODY_THICKNESS, *(skins[0].constants if skins else (1.0, 0.0))
+        )
         self._moving = [self._body_shape(of_material[""], _SKIN, skin)]
         if bodied:
             self._moving += [
@@ -170,16 +210,24 @@ class SionnaScene(NumberedTriangles):
         if settings.edges:
             self.edges = SceneEdges(self, self.unit_meshes, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
+        self._set_carriers()
+
+    def _set_carriers(self) -> None:
+        """Note what materials have on each carrier, and which are used where they are not defined."""
+        settings, skins = self._settings, self._skins
         self._carriers: list[_Tuning] = []
         self.outside: tuple[OutsideUse, ...] = ()
         """Materials used where they are not defined, by carrier."""
+        # Of meshes that are gone, materials stay known to the ray tracer, and are used by nothing.
+        used_by_bodies = {m for m, bodies in self._bodies_of.items() if bodies} | set(self._objects.names)
+        made = {name: of for name, of in self._made.items() if name in used_by_bodies}
         for carrier, frequency in enumerate(settings.frequencies_hz):
             found = itu_materials(self._scene, frequency, settings.materials)
             used = [(material.name, itu, constants) for material, itu, constants in found]
             tuned = [(material, constants) for material, _, constants in found]
             if skins:
                 used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
-                tuned.append((skin, skins[carrier].constants))
+                tuned.append((self._skin, skins[carrier].constants))
             used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
             tuned += [(of.radio, of.constants[carrier]) for of in made.values()]
             self._carriers.append((frequency, tuned))
@@ -269,6 +317,99 @@ class SionnaScene(NumberedTriangles):
         """Numbers of the bodies that stand for an object, in ascending order."""
         return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
 
+    # --- meshes that come while the run goes on ------------------------------------------------------
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Take meshes that objects may have from the next frame on, beside those of the beginning.
+
+        Bodies for them are made by `make_room`, when it is known how many objects have them.
+
+        Args:
+            meshes: Files by asset name; those of an earlier call that are not here are gone.
+
+        Raises:
+            AssetError: A file is no mesh.
+        """
+        self._later = LaterBodies(
+            meshes={name: unit_mesh(name, meshes) for name in sorted(meshes)},
+            materials=own_materials(meshes),
+            changed=True,
+        )
+
+    def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
+        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+
+        Then `bodies_version` is another, and what was made of the bodies before is of no use.
+
+        Args:
+            scene: The scene of a frame.
+            without_body: Classes of objects that waves pass through.
+        """
+        later = self._later
+        if not later.changed and not any(map(is_mesh_name, scene.assets)):
+            return
+        solid = self._solid(scene, without_body)
+        # Boxes stand in for meshes that are not there, beside those of objects that have none.
+        mine = {self._body_of(scene, i) for i in solid if is_mesh_name(scene.assets[i])}
+        needed = Counter(key for i in solid if (key := self._body_of(scene, i)) in mine)
+        short = any(n > self._pool.get(body_kind(*key), 0) for key, n in needed.items())
+        if not later.changed and not short:
+            return
+        # In powers of two: objects that come one by one seldom make bodies anew.
+        room = {} if later.changed else dict(later.room)
+        for key, n in needed.items():
+            room[key] = max(room.get(key, 0), 1 << (n - 1).bit_length())
+        self._later = replace(later, room=room, changed=False)
+        self._make_bodies()
+
+    def _make_bodies(self) -> None:
+        """Put other bodies in place of those that there are; scenery stays."""
+        later = self._later
+        pool, meshes = dict(self._first_pool), dict(self._first_meshes)
+        of_material = {m: [*bodies] for m, bodies in self._first_bodies_of.items()}
+        self._made = self._with_own_materials(self._made)
+        for (asset, material), count in sorted(later.room.items()):
+            kind = body_kind(asset, material)
+            before = pool.get(kind, 0)
+            pool[kind] = max(before, count)
+            meshes[kind] = later.meshes[asset] if asset in later.meshes else self._first_meshes[asset]
+            more = [(kind, slot) for slot in range(before, pool[kind])]
+            of_material[material] = of_material.get(material, []) + more
+        self._pool, self._meshes, self._bodies_of = pool, meshes, of_material
+        moving = [
+            self._body_shape(
+                bodies, f"{_SKIN}-of-{m}" if m else _SKIN, self._made[m].radio if m else self._skin
+            )
+            for m, bodies in of_material.items()
+            if bodies
+        ]
+        self._replace_bodies(moving)
+
+    def _replace_bodies(self, moving: list[Shape]) -> None:
+        self._moving = moving or [Shape(_NOTHING, self._skin, [_NOTHING], [self._shrunk(unit_box())])]
+        self._shapes = [*self._at_rest, *self._moving]
+        version, bodies = self.version, [body for of in self._bodies_of.values() for body in of]
+        ids = self._replace_shapes(self.centre)
+        super().__init__(self._shapes, ids, bodies, self._meshes, self.centre, len(self._moving))
+        self.version = version + 1
+        self._standing = frozenset()
+        self.bodies_version += 1
+        self.__dict__.pop("_surface_materials", None)
+        if self.edges is not None:
+            self.edges = SceneEdges(self, self.unit_meshes, self._settings.free_edges)
+        self._set_carriers()
+
+    def _with_own_materials(self, made: Mapping[str, ObjectMaterial]) -> dict[str, ObjectMaterial]:
+        """Materials of bodies, with those that meshes name."""
+        named = {*self._own_materials.values(), *self._later.materials.values()} - made.keys()
+        # A mesh says what it is made of wherever it is used: where P.2040 does not define that at a carrier,
+        # the nearest constants count.
+        policy = self._settings.materials
+        if policy.outside == "error":
+            policy = replace(policy, outside="nearest")
+        own = ObjectMaterials({name: name for name in sorted(named)})
+        return {**made, **object_materials(own, self._settings.frequencies_hz, policy)}
+
     def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
         """Move the bodies to the objects of a scene, in one update; foliage has none.
 
@@ -283,12 +424,16 @@ class SionnaScene(NumberedTriangles):
         Raises:
             PayloadError: The pool is too small, or an object has the name of a piece of scenery.
         """
-        solid = [
+        solid = self._solid(scene, without_body)
+        return self.place_bodies(scene, {i: self._kind(scene, i) for i in solid})
+
+    def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
+        """Objects of a scene that waves meet, by their index."""
+        return [
             i
             for i, cls in enumerate(scene.classes)
             if cls not in without_body and not self._foliage.of(scene.names[i], cls)
         ]
-        return self.place_bodies(scene, {i: self._kind(scene, i) for i in solid})
 
     def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:
         """Move bodies of given kinds to some objects; else as `place`.
@@ -385,18 +530,39 @@ class SionnaScene(NumberedTriangles):
 
     def _kind(self, scene: Scene, i: int) -> str:
         """Which bodies may stand for an object of a scene."""
-        return body_kind(scene.assets[i], self._objects.of(scene.names[i], scene.classes[i]))
+        return body_kind(*self._body_of(scene, i))
+
+    def _body_of(self, scene: Scene, i: int) -> tuple[str, str]:
+        """Mesh and material of the body of an object of a scene; the box for a mesh that is not there."""
+        asset = scene.assets[i]
+        if is_mesh_name(asset) and asset not in self._later.meshes and asset not in self._first_meshes:
+            asset = ""
+        own = self._later.materials.get(asset) or self._own_materials.get(asset, "")
+        return asset, self._objects.of(scene.names[i], scene.classes[i]) or own
 
     def _replace_shapes(self, centre: Float64Array) -> Int64Array:
-        """Put the shapes in place of what was loaded. Returns their process-local numbers."""
+        """Put the shapes in place of what was there. Returns their process-local numbers."""
         from sionna.rt import SceneObject
 
-        added = [
-            SceneObject(mi_mesh=mi_mesh(shape, centre), radio_material=shape.material)
+        # Scenery that is there stays: its shapes are those of the first call.
+        there = {shape.id: item for shape, item in self._rt_objects if shape in self._at_rest}
+        made = [
+            (
+                shape,
+                there.get(shape.id)
+                or SceneObject(mi_mesh=mi_mesh(shape, centre), radio_material=shape.material),
+            )
             for shape in self._shapes
         ]
-        self._scene.edit(add=added, remove=list(self._scene.objects))
-        return np.array([item.object_id for item in added], np.int64)
+        kept = set(there.values())
+        self._scene.edit(
+            add=[item for _, item in made if item not in kept],
+            remove=[item for item in self._scene.objects.values() if item not in kept],
+        )
+        self._rt_objects = made
+        # A scene refers to itself: until the one before is collected, kernels branch over what is in it, too.
+        gc.collect()
+        return np.array([item.object_id for _, item in made], np.int64)
 
 
 def _material_name(shape: Shape) -> str:
