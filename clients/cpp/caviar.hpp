@@ -79,7 +79,7 @@ using Bytes = std::string;
 using Vector3 = std::array<double, 3>;
 using Quaternion = std::array<double, 4>;  // (w, x, y, z)
 
-constexpr std::int64_t PROTOCOL_MAJOR = 1, PROTOCOL_MINOR = 5;
+constexpr std::int64_t PROTOCOL_MAJOR = 1, PROTOCOL_MINOR = 6;
 constexpr std::size_t MAX_HEADER = 1048576, MAX_BODY = 1073741824, MAX_PARTS = 513, MAX_ASSET_CHUNK = 4194304;
 constexpr int MAX_NESTING = 32, MAX_DIMENSIONS = 6;
 constexpr double HALF_TURN = 3.14159265358979323846, LIGHT_M_S = 299792458.0;  // [rad], [m/s]
@@ -593,12 +593,15 @@ Welcome#WELCOME version:Version! run:Text! epoch:Epoch! attempt:Attempt! capabil
   rejoin_ns:Duration=0
 Refuse#REFUSE code:Word! message:Text!
 Prepare#PREPARE epoch:Epoch! attempt:Attempt! demand:[Demand]<=256=[] assets:[Asset]=[]
-  producers:{[Name]}={} prefixes:{[Text]}={}
+  producers:{[Name]}={} prefixes:{[Text]}={} max_faces:Count=0
 Ready#READY epoch:Epoch! attempt:Attempt! geometry:DigestOrNone="" prefixes:[Text]=[]
   actuators:[NamePattern]=[] notes:[Text]=[] seed:SeedOrNone=-1
 AssetOffer#ASSET_OFFER epoch:Epoch! attempt:Attempt! assets:[Asset]!
 AssetGet#ASSET_GET digest:Digest! offset:Size=0
 AssetData#ASSET_DATA digest:Digest! offset:Size! size:Size!
+Geometry#GEOMETRY epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameIndex! assets:[Asset]=[]
+GeometryDone#GEOMETRY_DONE epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameIndex!
+  geometry:DigestOrNone=""
 Reset#RESET epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! seed:Seed! t0_ns:Nanoseconds!
   seed_episode:EpisodeIndex=0
 ResetDone#RESET_DONE epoch:Epoch! attempt:Attempt! episode:EpisodeIndex!
@@ -607,7 +610,7 @@ Grant#GRANT epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameIndex
   final:bool=false decisions:{str}={} reports:[Report]<=256=[]
 Done#DONE epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameIndex!
   products:[ProductHeader]<=256=[] decisions:{str}={} measured:{Duration}={} counts:{Count}={}
-  end_episode:bool=false seed:SeedOrNone=-1
+  end_episode:bool=false seed:SeedOrNone=-1 geometry:GeometryChange? geometry_digest:DigestOrNone=""
 Fault#FAULT epoch:Epoch! attempt:Attempt! episode:EpisodeIndex=0 frame:FrameOrNone=-1 phase:Text!
   message:Text! detail:Text="" culprit:Text=""
 Cancel#CANCEL epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameIndex!
@@ -625,9 +628,11 @@ HeartbeatAck#HEARTBEAT_ACK sequence:Count!
 Input topic:NewName! lag:int>=0<=1=0 required:bool=true parts:[Word]<=256=[]
 Demand topic:Name! parts:[Word]<=256=[]
 Asset name:AssetName! digest:Digest! size:Size!
+GeometryChange frame:FrameIndex! assets:[Asset]=[]
 GrantInput topic:Name! source:Name! status:fresh|held|absent|late! frame:FrameOrNone=-1
   t_ns:Nanoseconds=0 age:Age=0 fidelity:Text="" digest:DigestOrNone="" cause:Text=""
-Report source:Name! decisions:{str}={} measured:{Duration}={} counts:{Count}={}
+  geometry:DigestOrNone=""
+Report source:Name! decisions:{str}={} measured:{Duration}={} counts:{Count}={} geometry:GeometryChange?
 ProductHeader topic:Name! digest:Digest! fidelity:Text=""
 Scene names:[str]! classes:[str]! assets:[str]! position:<f8[N,3]! orientation:<f8[N,4]!
   velocity:<f8[N,3]! dimensions:<f8[N,3]! devices:[AntennaDevice/LidarDevice/CameraDevice]=[]
@@ -655,7 +660,7 @@ Carrier name:str! frequency_hz:float>0! bandwidth_hz:float>0=100000000.0 subcarr
   slot_duration_s:float>=0=0.0
 ChannelOptions los:bool=true reflection:bool=false refraction:bool=false diffraction:bool=false
   scattering:bool=false max_depth:int>=0=0 samples:int>=0=0 materials_outside:[str]=[]
-  absorption_db_per_km:[float>=0]=[] detail:str="" foliage:[str]=[]
+  absorption_db_per_km:[float>=0]=[] detail:str="" foliage:[str]=[] blockage:[str]=[]
 ChannelMatrix carrier:int>=0! tx:int>=0! rx:int>=0! h:<c16[Nr,Nt]!
 ChannelResponse carrier:int>=0! tx:int>=0! rx:int>=0! h:<c8[S,K,Nr,Nt]!
 ChannelTaps carrier:int>=0! tx:int>=0! rx:int>=0! first:int! h:<c8[S,L,Nr,Nt]!
@@ -673,10 +678,15 @@ Segmentation object_names:[str]! material_names:[str]=[] images:[SegmentationIma
 SegmentationImage sensor:str! intrinsics:Intrinsics! position:Vector3! orientation:Quaternion!
   object:<i4[H,W]! material:<i4[H,W]?
 Intrinsics fx:float! fy:float! cx:float! cy:float!
-Action commands:[BeamChoice/WaypointCommand/VelocityCommand/UserSchedule]!
+Action commands:[BeamChoice/WaypointCommand/VelocityCommand/UserSchedule/PathCommand/AttitudeCommand/DriveCommand/SignalCommand]!
 BeamChoice#beam tx:str! rx:str! tx_beam:int>=0! rx_beam:int>=0=0 carrier:str=""
 WaypointCommand#waypoint object:str! position:Vector3! speed:float>0! at_once:bool=false
 VelocityCommand#velocity object:str! velocity:float*3!
+PathCommand#path object:str! points:[Vector3]! speed:float>0!
+AttitudeCommand#attitude object:str! orientation:Quaternion! thrust:float>=0!
+DriveCommand#drive object:str! speed:float>=0? lane:int>=0? route:[str]=[] stop:RoadStop?
+RoadStop road:str! position:float>=0! duration:float>=0! lane:int>=0=0
+SignalCommand#signal signal:str! phase:int>=0! duration:float>0?
 UserSchedule#schedule tx:str! rx:str!
 Link tx:[str]! rx:[str]! carrier:[str]! has_path:|b1[U]! los:|b1[U]! tx_beam:<i4[U]! rx_beam:<i4[U]!
   abs_y:<f8[U]! top_tx_beam:<i4[U,K]! top_rx_beam:<i4[U,K]! top_abs_y:<f8[U,K]!
@@ -1710,7 +1720,7 @@ inline std::string geometry_digest(const std::map<std::string, Bytes>& files) {
 
 // One command of an agent's action.
 struct Command {
-  enum class Kind : std::uint8_t { beam, waypoint, velocity, schedule };
+  enum class Kind : std::uint8_t { beam, waypoint, velocity, schedule, other };
   Kind kind = Kind::beam;
   std::string source;           // the agent
   std::string tx, rx, carrier;  // beam, schedule
@@ -1720,6 +1730,7 @@ struct Command {
   double speed = 0.0;    // at most [m/s]
   bool at_once = false;  // be there in this frame, at rest
   Vector3 velocity{};    // [m/s]
+  Value fields;          // all of them, and those of other kinds: path, attitude, drive, signal
 };
 
 inline std::vector<Command> commands_of(const Value& action, const std::string& source) {
@@ -1730,7 +1741,9 @@ inline std::vector<Command> commands_of(const Value& action, const std::string& 
     command.kind = type == "beam"       ? Command::Kind::beam
                    : type == "waypoint" ? Command::Kind::waypoint
                    : type == "velocity" ? Command::Kind::velocity
-                                        : Command::Kind::schedule;
+                   : type == "schedule" ? Command::Kind::schedule
+                                        : Command::Kind::other;
+    command.fields = value;
     command.source = source;
     command.tx = value["tx"].text(), command.rx = value["rx"].text(),
     command.carrier = value["carrier"].text();

@@ -386,7 +386,7 @@ Link tx:l(s) rx:l(s) carrier:l(s) has_path:a(|b1,U) los:a(|b1,U) tx_beam:a(<i4,U
 Hello:HELLO version:t2(i0) name:n role:e(world,channel,sensors,link,agent,recorder) inputs:l256(Input)=[] outputs:l256(n)=[] capabilities:l256(s1..128)=[] implementation:s='' max_in_flight:i1..64=1 host:s='' pid:i0=0
 Welcome:WELCOME version:t2(i0) run:s epoch:i1 attempt:i1 capabilities:l256(s1..128)=[] heartbeat_ns:i1 liveness_ns:i1 seed:i0=0 settings:m(*)={} scenario:m(*)={} rejoin_ns:i0=0
 Refuse:REFUSE code:s1..128 message:s
-Prepare:PREPARE epoch:i1 attempt:i1 demand:l256(Demand)=[] assets:l(Asset)=[] producers:m(l(s1..128))={} prefixes:m(l(s))={}
+Prepare:PREPARE epoch:i1 attempt:i1 demand:l256(Demand)=[] assets:l(Asset)=[] producers:m(l(s1..128))={} prefixes:m(l(s))={} max_faces:i0=0
 AssetOffer:ASSET_OFFER epoch:i1 attempt:i1 assets:l(Asset)
 AssetGet:ASSET_GET digest:d offset:i0=0
 AssetData:ASSET_DATA digest:d offset:i0 size:i0
@@ -394,13 +394,15 @@ Ready:READY epoch:i1 attempt:i1 geometry:D='' prefixes:l(s)=[] actuators:l(s1..2
 Reset:RESET epoch:i1 attempt:i1 episode:i0 seed:i0 t0_ns:i seed_episode:i0=0
 ResetDone:RESET_DONE epoch:i1 attempt:i1 episode:i0
 Grant:GRANT epoch:i1 attempt:i1 episode:i0 frame:i0 previous_frame:i-1=-1 t_ns:i budget_ns:i0=0 inputs:l256(GrantInput)=[] final:b=false decisions:m(s)={} reports:l256(Report)=[]
-Done:DONE epoch:i1 attempt:i1 episode:i0 frame:i0 products:l256(ProductHeader)=[] decisions:m(s)={} measured:m(i0)={} counts:m(i0)={} end_episode:b=false seed:i-1=-1
+Done:DONE epoch:i1 attempt:i1 episode:i0 frame:i0 products:l256(ProductHeader)=[] decisions:m(s)={} measured:m(i0)={} counts:m(i0)={} end_episode:b=false seed:i-1=-1 geometry:GeometryChange=? geometry_digest:D=''
 Fault:FAULT epoch:i1 attempt:i1 episode:i0=0 frame:i-1=-1 phase:s message:s detail:s='' culprit:s=''
 Cancel:CANCEL epoch:i1 attempt:i1 episode:i0 frame:i0
 EpisodeEnd:EPISODE_END epoch:i1 attempt:i1 episode:i0 frames:i0
 Checkpoint:CHECKPOINT epoch:i1 attempt:i1 episode:i0 frame:i0
 CheckpointDone:CHECKPOINT_DONE epoch:i1 attempt:i1 episode:i0 frame:i0
 Restore:RESTORE epoch:i1 attempt:i1 episode:i0 frame:i0
+Geometry:GEOMETRY epoch:i1 attempt:i1 episode:i0 frame:i0 assets:l(Asset)=[]
+GeometryDone:GEOMETRY_DONE epoch:i1 attempt:i1 episode:i0 frame:i0 geometry:D=''
 Shutdown:SHUTDOWN reason:s grace_ns:i0=0
 Bye:BYE epoch:i1 attempt:i1 reason:s=''
 Stale:STALE of:s1..128 epoch:i1 attempt:i1 episode:i0 frame:i-1
@@ -418,6 +420,7 @@ CameraImage sensor:s intrinsics:Intrinsics position:t3(f) orientation:t4(f) rgb:
 DepthImage sensor:s intrinsics:Intrinsics position:t3(f) orientation:t4(f) depth:a(<f4,H,W) normals:a(<f4,H,W,3)=?
 SegmentationImage sensor:s intrinsics:Intrinsics position:t3(f) orientation:t4(f) object:a(<i4,H,W) material:a(<i4,H,W)=?
 Asset name:p digest:d size:i0
+GeometryChange frame:i0 assets:l(Asset)=[]
 AntennaDevice:antenna name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] role:e(tx,rx,both) array:AntennaArray={} power_dbm:f=0.0
 LidarDevice:lidar name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] beams:i1..1024=64 azimuth_steps:i1..36000=1800 elevation_min:f=-0.4363323129985824 elevation_max:f=0.05235987755982989 max_range:f<0=100.0 min_range:f0=0.0
 CameraDevice:camera name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] width:i1..8192=640 height:i1..8192=480 field_of_view:f<0=1.5707963267948966
@@ -432,8 +435,8 @@ DriveCommand:drive object:s speed:f0=? lane:i0=? route:l(s)=[] stop:RoadStop=?
 SignalCommand:signal signal:s phase:i0 duration:f<0=?
 Input topic:n lag:i0..1=0 required:b=true parts:l256(s1..128)=[]
 Demand topic:s1..128 parts:l256(s1..128)=[]
-GrantInput topic:s1..128 source:s1..128 status:e(fresh,held,absent,late) frame:i-1=-1 t_ns:i=0 age:i0=0 fidelity:s='' digest:D='' cause:s=''
-Report source:s1..128 decisions:m(s)={} measured:m(i0)={} counts:m(i0)={}
+GrantInput topic:s1..128 source:s1..128 status:e(fresh,held,absent,late) frame:i-1=-1 t_ns:i=0 age:i0=0 fidelity:s='' digest:D='' cause:s='' geometry:D=''
+Report source:s1..128 decisions:m(s)={} measured:m(i0)={} counts:m(i0)={} geometry:GeometryChange=?
 ProductHeader topic:s1..128 digest:d fidelity:s=''
 AntennaArray rows:i1..1024=1 columns:i1..1024=1 vertical_spacing:f<0=0.5 horizontal_spacing:f<0=0.5 pattern:e(iso,dipole,hw_dipole,tr38901)='iso' polarization:e(V,H,-45,+45,RHCP,LHCP,VH,cross,circular)='V' pattern_file:s='' panels:l(Panel)=[]
 OccupancyGrid origin:t3(f) cell:t3(f) occupancy:a(|i1,X,Y,Z)
@@ -2029,7 +2032,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             }).ToList();
             Send("HELLO", new Map
             {
-                { "version", new List<object> { 1L, 5L } }, { "name", Name }, { "role", "world" },
+                { "version", new List<object> { 1L, 6L } }, { "name", Name }, { "role", "world" },
                 { "inputs", inputs },
                 { "outputs", new List<object> { "scene" } },
                 { "capabilities", new List<object> { "assets", "episodes", "checkpoint" } },

@@ -131,6 +131,8 @@ function keyOf(command) {
       return `beam:${command.rx}\0${command.tx}\0${command.carrier ?? ""}`;
     case "schedule":
       return `schedule:${command.tx}\0${command.rx}\0`;
+    case "signal":
+      return `signal:${command.signal}\0\0`;
     default:
       return `motion:${command.object}\0\0`;
   }

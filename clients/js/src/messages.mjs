@@ -6,7 +6,7 @@ import { bigInteger, bool, integer, list, map, optional, plain, string, Struct }
 /** @import { Context } from "./schema.mjs" */
 
 /** Version of the protocol that this library speaks. */
-export const VERSION = [1, 5];
+export const VERSION = [1, 6];
 export const MAX_HEADER = 1 << 20;
 export const MAX_BODY = 1 << 30;
 export const MAX_PARTS = 513;
@@ -32,6 +32,7 @@ const turn = { ...who, episode: count, frame: count };
 const version = list(count, { exactly: 2 });
 const assets = list(new Struct({ name: assetName, digest, size: count }));
 const parts = optional(list(word, few), []);
+const geometryChange = optional(new Struct({ frame: count, assets: optional(assets, []) }));
 
 const input = new Struct({
   topic: newName,
@@ -50,6 +51,7 @@ const granted = new Struct({
   fidelity: optional(text, ""),
   digest: optional(digestOrNone, ""),
   cause: optional(text, ""),
+  geometry: optional(digestOrNone, ""),
 });
 const reported = {
   decisions: optional(map(text), {}),
@@ -90,6 +92,7 @@ export const MESSAGES = {
     assets: optional(assets, []),
     producers: optional(map(list(word)), {}),
     prefixes: optional(map(list(text)), {}),
+    max_faces: optional(count, 0),
   }),
   READY: new Struct({
     ...who,
@@ -118,7 +121,7 @@ export const MESSAGES = {
     inputs: optional(list(granted, few), []),
     final: optional(bool, false),
     decisions: optional(map(text), {}),
-    reports: optional(list(new Struct({ source: word, ...reported }), few), []),
+    reports: optional(list(new Struct({ source: word, ...reported, geometry: geometryChange }), few), []),
   }),
   DONE: new Struct({
     ...turn,
@@ -126,6 +129,8 @@ export const MESSAGES = {
     ...reported,
     end_episode: optional(bool, false),
     seed: optional(orNone, -1),
+    geometry: geometryChange,
+    geometry_digest: optional(digestOrNone, ""),
   }),
   FAULT: new Struct({
     ...who,
@@ -141,6 +146,8 @@ export const MESSAGES = {
   CHECKPOINT: new Struct(turn),
   CHECKPOINT_DONE: new Struct(turn),
   RESTORE: new Struct(turn),
+  GEOMETRY: new Struct({ ...turn, assets: optional(assets, []) }),
+  GEOMETRY_DONE: new Struct({ ...turn, geometry: optional(digestOrNone, "") }),
   SHUTDOWN: new Struct({ reason: text, grace_ns: optional(count, 0) }),
   BYE: new Struct({ ...who, reason: optional(text, "") }),
   STALE: new Struct({ of: word, ...turn, frame: orNone }),

@@ -99,6 +99,7 @@ const NO_OPTIONS = {
   absorption_db_per_km: [],
   detail: "",
   foliage: [],
+  blockage: [],
 };
 const options = new Struct({
   los: optional(bool, true),
@@ -112,6 +113,7 @@ const options = new Struct({
   absorption_db_per_km: optional(list(notBelow), []),
   detail: optional(text, ""),
   foliage: optional(names, []),
+  blockage: optional(names, []),
 });
 const pair = { carrier: count, tx: count, rx: count };
 const intrinsics = new Struct({ fx: float, fy: float, cx: float, cy: float });
@@ -229,6 +231,18 @@ export const TOPICS = {
         }),
         velocity: new Struct({ object: text, velocity: vector3 }),
         schedule: new Struct({ tx: text, rx: text }),
+        path: new Struct({ object: text, points: list(vector3), speed: above }),
+        attitude: new Struct({ object: text, orientation: quaternion, thrust: notBelow }),
+        drive: new Struct({
+          object: text,
+          speed: optional(notBelow),
+          lane: optional(count),
+          route: optional(names, []),
+          stop: optional(
+            new Struct({ road: text, position: notBelow, duration: notBelow, lane: optional(count, 0) }),
+          ),
+        }),
+        signal: new Struct({ signal: text, phase: count, duration: optional(above) }),
       }),
     ),
   }),

@@ -96,7 +96,45 @@ export interface UserSchedule {
   tx: string;
   rx: string;
 }
-export type Command = BeamChoice | WaypointCommand | VelocityCommand | UserSchedule;
+/** Since 1.6: fly along straight lines between points. */
+export interface PathCommand {
+  type: "path";
+  object: string;
+  points: Vector3[];
+  speed: number;
+}
+/** Since 1.6: an attitude (w, x, y, z) and a thrust over the mass [m/s²]. */
+export interface AttitudeCommand {
+  type: "attitude";
+  object: string;
+  orientation: [number, number, number, number];
+  thrust: number;
+}
+/** Since 1.6: drive a vehicle on its network of roads. */
+export interface DriveCommand {
+  type: "drive";
+  object: string;
+  speed?: number;
+  lane?: number;
+  route?: string[];
+  stop?: { road: string; position: number; duration: number; lane?: number };
+}
+/** Since 1.6: switch traffic lights to a phase of their program. */
+export interface SignalCommand {
+  type: "signal";
+  signal: string;
+  phase: number;
+  duration?: number;
+}
+export type Command =
+  | BeamChoice
+  | WaypointCommand
+  | VelocityCommand
+  | UserSchedule
+  | PathCommand
+  | AttitudeCommand
+  | DriveCommand
+  | SignalCommand;
 
 /** One declared input. */
 export interface InputDeclaration {

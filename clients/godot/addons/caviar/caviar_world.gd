@@ -187,7 +187,7 @@ func _join(patience):
 	for topic in inputs:
 		declared.append({"topic": topic, "lag": 1, "required": false})
 	_send("HELLO", {
-		"version": [1, 5], "name": name, "role": "world", "inputs": declared, "outputs": ["scene"],
+		"version": [1, 6], "name": name, "role": "world", "inputs": declared, "outputs": ["scene"],
 		"capabilities": ["assets", "episodes", "checkpoint"], "implementation": implementation, "max_in_flight": 4,
 	})
 
