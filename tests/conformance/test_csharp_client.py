@@ -111,6 +111,7 @@ def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path,
     worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
 
 
+@pytest.mark.exhaustive
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
     command: list[str], tmp_path: Path
 ) -> None:

@@ -41,7 +41,7 @@ def digest(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("victim", "number"),
     [
-        ("caviar_services traffic", signal.SIGKILL),
+        pytest.param("caviar_services traffic", signal.SIGKILL, marks=pytest.mark.exhaustive),
         ("caviar_services channel", signal.SIGKILL),
         pytest.param("caviar_services agent", signal.SIGKILL, marks=pytest.mark.exhaustive),
         pytest.param("caviar_services recorder", signal.SIGKILL, marks=pytest.mark.exhaustive),

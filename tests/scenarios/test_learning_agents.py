@@ -66,6 +66,7 @@ def killed_twice(scenario: Path, out: Path) -> Path:
     return directory
 
 
+@pytest.mark.exhaustive
 def test_the_agent_of_the_page_learns_and_is_killed_without_a_trace(tmp_path: Path) -> None:
     """The page is followed; its agent is killed twice in its scenario, and passes the conformance tests."""
     pytest.importorskip("torch", reason="PyTorch is not installed")

@@ -127,6 +127,7 @@ def test_an_agent_over_tcp_needs_no_copy_and_takes_a_swap(tmp_path: Path) -> Non
     replayed(directory, tmp_path / "again")
 
 
+@pytest.mark.exhaustive
 def test_a_broker_that_dies_after_a_swap_is_followed_by_one_that_knows_it(tmp_path: Path) -> None:
     """And what was refused to somebody who did not wait is not what the agent comes back with."""
     first, second, torn = (tmp_path / f"{name}.onnx" for name in ("first", "second", "torn"))

@@ -87,6 +87,7 @@ def test_a_killed_command_goes_on_to_the_policy_of_one_that_was_not(tmp_path: Pa
     assert len(results(tmp_path / "whole")) == 1
 
 
+@pytest.mark.exhaustive
 def test_an_environment_beside_the_experiment_is_trained_in_every_process(tmp_path: Path) -> None:
     """That of the page, and its reward alone: a policy is exported where agents can observe the same."""
     (block,) = (text for _, text in blocks(ROOT / "docs/howto/train-an-agent.md") if "# my_env.py" in text)

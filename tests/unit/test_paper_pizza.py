@@ -192,6 +192,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_trial_plays_all_pairs_in_the_loop_and_is_called_a_trial(trial: tuple[Path, str]) -> None:
     folder, output = trial
     found = json.loads((folder / "pizza-quick.json").read_text())
@@ -213,6 +214,7 @@ def test_the_trial_plays_all_pairs_in_the_loop_and_is_called_a_trial(trial: tupl
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_trial_has_a_figure_and_a_film(trial: tuple[Path, str]) -> None:
     from PIL import Image
 
