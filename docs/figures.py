@@ -113,6 +113,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
     ),
+    "panda3d": Measurement(
+        "python tests/bench/bench_panda3d.py --frames 60 --markdown {out}/panda3d.md",
+        "python tests/bench/bench_panda3d.py --munich --markdown {out}/panda3d.md",
+        "panda3d.md",
+        {"panda3d-frames": ""},
+    ),
     "pizza": Measurement(
         "caviar paper pizza --quick --out {out}",
         "caviar paper pizza --out {out}",

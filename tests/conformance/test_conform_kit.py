@@ -52,6 +52,7 @@ def failures(verdicts: list[Verdict]) -> dict[str, str]:
 
 RIGHT = {
     "agent.py": (python(ROOT / "clients/minimal/agent.py", "{endpoint}", "{name}"), {}),
+    "world.py": (python(ROOT / "clients/python/world.py", "{endpoint}", "{name}"), {}),
     "control": (python(BROKEN, "{endpoint}", "{name}", "none"), {}),
     "control-world": (python(BROKEN, "{endpoint}", "{name}", "none", "world"), {}),
     "control-recorder": (python(BROKEN, "{endpoint}", "{name}", "none", "recorder"), {}),

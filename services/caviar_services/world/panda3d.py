@@ -34,8 +34,8 @@ from caviar_services.world.panda3d_pictures import Pictures
 from caviar_services.world.scenery import scenery_file
 from caviar_services.world.trajectory import Length, NamedObject, unique_name
 
-# [s] of its way at which a vehicle turns to the next point before it is at one.
-_AHEAD_S = 0.3
+# [s] of its way at which a vehicle on a straight path goes on to the point after the next.
+_LEAST_S = 0.05
 # Part of the acceleration that the approach of a point counts on.
 _BRAKES = 0.8
 _REST: Vector = (0.0, 0.0, 0.0)
@@ -313,15 +313,19 @@ class Panda3dWorld(World[Panda3dSettings]):
 
     def _course(self, name: str, vehicle: DrivenObject) -> Vector:
         """Velocity with which a vehicle drives to its next point [m/s]."""
-        body, path = self._bodies[name], vehicle.path_m
-        position, speed = body.position, vehicle.speed_m_s
-        last = not vehicle.loop and self._next[name] == len(path) - 1
-        if not last and math.dist(position, path[self._next[name]]) <= speed * _AHEAD_S:
-            self._next[name] = (self._next[name] + 1) % len(path)
-            last = not vehicle.loop and self._next[name] == len(path) - 1
-        return _towards(
-            position, path[self._next[name]], speed, vehicle.max_acceleration_m_s2 if last else math.inf
-        )
+        body, path, speed = self._bodies[name], vehicle.path_m, vehicle.speed_m_s
+        position, goal = body.position, self._next[name]
+        last = not vehicle.loop and goal == len(path) - 1
+        if not last:
+            following = (goal + 1) % len(path)
+            ahead = _towards(path[goal], path[following], speed, math.inf)
+            # An acceleration a turns v into v' within T = |v' − v| / a, and the vehicle goes v·T/2 meanwhile.
+            turn = speed * math.dist(ahead, body.velocity) / (2 * vehicle.max_acceleration_m_s2)
+            near = min(max(turn, speed * _LEAST_S), math.dist(path[goal], path[following]) / 2)
+            if math.dist(position, path[goal]) <= near:
+                goal = self._next[name] = following
+                last = not vehicle.loop and goal == len(path) - 1
+        return _towards(position, path[goal], speed, vehicle.max_acceleration_m_s2 if last else math.inf)
 
     def _commands(self, frame: Frame) -> dict[str, VelocityCommand | WaypointCommand]:
         """Command for each UAV; beams and schedules are not for worlds."""
