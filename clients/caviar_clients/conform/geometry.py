@@ -6,8 +6,8 @@ import hashlib
 
 from caviar_clients.conform import street
 from caviar_clients.conform.case import Kit, case
-from caviar_clients.conform.client import Failed, NotApplicable
-from caviar_clients.conform.session import ACTIVE, Fields, Session
+from caviar_clients.conform.client import Failed, Fields, NotApplicable
+from caviar_clients.conform.session import ACTIVE, Session
 
 CLAUSES = "clause 4; Geometry at run time"
 
