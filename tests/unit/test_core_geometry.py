@@ -165,6 +165,16 @@ def test_what_was_announced_lasts_until_the_episode_ends() -> None:
     assert sent == [(0, 1, (CRATE,)), (0, 4, (BARREL,)), (1, 2, (CRATE,))]
 
 
+def test_what_is_said_again_changes_nothing_and_frames_never_descend() -> None:
+    both = change(6, CRATE, BARREL)
+    changes = {(0, 1): change(1, CRATE), (0, 2): both, (0, 3): change(3, CRATE), (0, 4): change(4, BARREL)}
+    run = street(changes).run()
+    assert run.outcome.error == ""
+    assert [order.frame for order in run.seen(m.Geometry, "lidar")] == [1, 6]
+    (error,) = run.seen(m.Error, "world")
+    assert "meshes for frame 4 came after those for frame 6" in error.message
+
+
 def test_meshes_of_two_worlds_are_one_set() -> None:
     one, other = announcing({(0, 1): change(4, CRATE)}), announcing({(0, 2): change(3, BARREL)})
     services = [
