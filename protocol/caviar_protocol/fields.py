@@ -264,6 +264,14 @@ class ProductHeader(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
 # --- versions ---------------------------------------------------------------------------------------------
 
 SINCE: dict[str, str] = {
+    "GeometryChange": "1.6",
+    "Geometry": "1.6",
+    "GeometryDone": "1.6",
+    "Prepare.max_faces": "1.6",
+    "Done.geometry": "1.6",
+    "Done.geometry_digest": "1.6",
+    "Report.geometry": "1.6",
+    "GrantInput.geometry": "1.6",
     "Ready.seed": "1.1",
     "Done.seed": "1.1",
     "Reset.seed_episode": "1.1",
@@ -307,14 +315,6 @@ SINCE: dict[str, str] = {
     "DriveCommand": "1.6",
     "RoadStop": "1.6",
     "SignalCommand": "1.6",
-    "GeometryChange": "1.6",
-    "Geometry": "1.6",
-    "GeometryDone": "1.6",
-    "Prepare.max_faces": "1.6",
-    "Done.geometry": "1.6",
-    "Done.geometry_digest": "1.6",
-    "Report.geometry": "1.6",
-    "GrantInput.geometry": "1.6",
 }
 """Minor version that brought a field (``Grant.reports``) or a class (``Grant``); 1.0 unless said here."""
 

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from scenarios_support import caviar, eventually, pid_of, recorded_below, run, running
 
+from caviar_broker.core import events as ev
+from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.recording import Recording
+from caviar_protocol.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
 
@@ -92,7 +95,7 @@ def digest_of(directory: Path) -> str:
 
 
 def test_a_recording_has_the_meshes_and_its_replay_announces_them_again(tmp_path: Path) -> None:
-    path = scenario(tmp_path, objects=6, meshes=2, first=3, last=8, wrong=["nan"])
+    path = scenario(tmp_path, objects=6, meshes=2, first=3, last=8, wrong=["nan", "faces", "none"], faces=600)
     whole = run(path, tmp_path / "whole", timeout=120)
     assert whole.status == 0, whole.output
     embedded = run(path, tmp_path / "embedded", "--embedded", timeout=120)
@@ -100,15 +103,21 @@ def test_a_recording_has_the_meshes_and_its_replay_announces_them_again(tmp_path
     assert digest_of(whole.directory) == digest_of(embedded.directory)
     recording = Recording(whole.directory)
     used = {name for name in recording["scene"].assets.ravel().tolist() if name}
-    assert len(recording.meshes) == 2 < len(used) == 3, "the one that is none was refused, and is not kept"
+    assert len(recording.meshes) == 2
+    assert len(used) == 5, "objects with meshes that are none keep their names, and are boxes"
+    told = [json.loads(line) for line in (whole.directory / "events.jsonl").read_text().splitlines()]
+    reasons = sorted(line["text"] for line in told if line["kind"] == "refused")
+    assert len(reasons) == 3
+    for name in used - recording.meshes.keys():
+        assert any(reason.startswith(name) for reason in reasons)
+    for why in ("vertex 3 is at", "has 600 faces, the run takes 500", "has no faces"):
+        assert any(why in reason for reason in reasons), reasons
     assert [asset.name for asset in recording.metadata.assets if is_mesh_name(asset.name)] == []
     again = caviar("replay", whole.directory, "--out", tmp_path / "again", timeout=120)
     assert again.status == 0, again.output
     directory = next((tmp_path / "again").glob("*/"))
     assert digest_of(directory) == digest_of(whole.directory)
     assert Recording(directory).meshes.keys() == recording.meshes.keys()
-    refused = json.loads((whole.directory / "summary.json").read_text())
-    assert "nan" in json.dumps(refused).lower() or "mesh-refused" in json.dumps(refused)
 
 
 @pytest.mark.channel
@@ -127,7 +136,32 @@ def test_paths_off_spawned_objects_come_with_their_frame_and_a_killed_channel_ch
         os.kill(pid_of(mark, "caviar_services channel"), signal.SIGKILL)
         output, _ = process.communicate(timeout=240)
     assert process.returncode == 0, output
-    assert digest_of(next(out.glob("*/"))) == digest_of(whole.directory)
+    directory = next(out.glob("*/"))
+    told = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
+    assert {line["service"] for line in told if line["kind"] == "back"} == {"channel"}
+    assert digest_of(directory) == digest_of(whole.directory)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.channel
+def test_memory_is_flat_after_objects_with_meshes_of_their_own_went(tmp_path: Path) -> None:
+    """Six waves of 50 objects with five meshes each, none of which was there before."""
+    path = scenario(tmp_path, channel=TRACED, frames=6 * 32, objects=50, meshes=5, first=2, last=6, period=32)
+    resident = []
+
+    def note(finished: ev.FrameFinished) -> None:
+        if finished.frame % 32 == 31:
+            resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20)
+
+    out = tmp_path / "run"
+    out.mkdir()
+    outcome = EmbeddedRun(load_scenario(str(path)), out, on_frame=note).run()
+    assert outcome.error == ""
+    assert len(Recording(out).meshes) == 30
+    # The first wave compiles kernels.
+    assert resident[-1] - resident[0] < 20, f"{resident} MiB after each wave"
+    off = [frame for frame in range(6 * 32) if spawned_in(Recording(out), frame)]
+    assert off == [32 * wave + frame for wave in range(6) for frame in range(2, 7)]
 
 
 def spawned_in(recording: Recording, frame: int) -> set[str]:

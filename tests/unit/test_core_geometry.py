@@ -142,6 +142,15 @@ def test_another_digest_than_the_worlds_ends_the_run_and_names_its_service() -> 
     assert f"holds geometry {'f' * 12}… for frame 3" in run.outcome.error
 
 
+def test_a_service_that_loads_meshes_is_what_the_run_waits_for() -> None:
+    run = street({(0, 3): change(3, CRATE)}, {"channel": {"loads": 9 * SECOND}})
+    run.run(lambda run: bool(run.seen(m.Geometry)))
+    run.run_to(run.now + 2 * SECOND)
+    waits = {wait.service: wait.text for wait in run.clock.status(run.now).waits}
+    told = "channel 'channel' loads meshes that a world announced, for 2 s now, at most 30 s"
+    assert told in waits["channel"]
+
+
 def test_meshes_that_are_never_loaded_are_a_stall_with_blame() -> None:
     run = street({(0, 3): change(3, CRATE)}, {"channel": {"loads": 100 * SECOND}}).run()
     assert run.outcome.culprit == "channel"
@@ -154,6 +163,16 @@ def test_what_was_announced_lasts_until_the_episode_ends() -> None:
     assert run.outcome.error == ""
     sent = [(order.episode, order.frame, order.assets) for order in run.seen(m.Geometry, "lidar")]
     assert sent == [(0, 1, (CRATE,)), (0, 4, (BARREL,)), (1, 2, (CRATE,))]
+
+
+def test_what_is_said_again_changes_nothing_and_frames_never_descend() -> None:
+    both = change(6, CRATE, BARREL)
+    changes = {(0, 1): change(1, CRATE), (0, 2): both, (0, 3): change(3, CRATE), (0, 4): change(4, BARREL)}
+    run = street(changes).run()
+    assert run.outcome.error == ""
+    assert [order.frame for order in run.seen(m.Geometry, "lidar")] == [1, 6]
+    (error,) = run.seen(m.Error, "world")
+    assert "meshes for frame 4 came after those for frame 6" in error.message
 
 
 def test_meshes_of_two_worlds_are_one_set() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from caviar_broker.core.run import Member, Run
@@ -43,6 +43,12 @@ _IN_EPISODE = (ServiceState.ACTIVE, ServiceState.RESETTING, ServiceState.RESTORI
 def has_capability(member: Member, capability: str) -> bool:
     """Whether a service named a capability in its HELLO."""
     return member.hello is not None and capability in member.hello.capabilities
+
+
+def _assets_at(changes: Sequence[GeometryChange], frame: int) -> tuple[Asset, ...]:
+    """Meshes of a world in a frame; its changes are in ascending order of frames."""
+    until = bisect_right(changes, frame, key=lambda change: change.frame)
+    return changes[until - 1].assets if until else ()
 
 
 @dataclass(frozen=True)
@@ -99,9 +105,7 @@ class GeometryLedger:
         """Meshes of a frame beyond its scenery, of all worlds, sorted by name."""
         found: dict[str, Asset] = {}
         for changes in self._changes.values():
-            until = bisect_right(changes, frame, key=lambda change: change.frame)
-            if until:
-                found |= {asset.name: asset for asset in changes[until - 1].assets}
+            found |= {asset.name: asset for asset in _assets_at(changes, frame)}
         return tuple(found[name] for name in sorted(found))
 
     # --- worlds --------------------------------------------------------------------------------------
@@ -137,7 +141,14 @@ class GeometryLedger:
         change = GeometryChange(frame=offered.frame, assets=tuple(sorted(taken, key=lambda a: a.name)))
         known = self._changes.get(member.name, [])
         # A world that was started again says what it said before: nothing follows from that.
-        if change.assets == (known[-1].assets if known else ()):
+        if change.assets == _assets_at(known, change.frame):
+            return None
+        if known and change.frame < known[-1].frame:
+            why = (
+                f"meshes for frame {change.frame} came after those for frame {known[-1].frame}, which they "
+                "would replace: name frames in ascending order"
+            )
+            self._refuse(member, message.frame, "", why)
             return None
         self._put(member.name, change)
         self._forget_before(needed)
@@ -150,7 +161,6 @@ class GeometryLedger:
 
     def _wrong(self, member: Member, offered: GeometryChange, frame: int) -> str:
         """Why nothing of what a world announces can be used; empty: it can."""
-        known = self._changes.get(member.name)
         if member.role != "world":
             return "only a world announces meshes"
         if not has_capability(member, GEOMETRY):
@@ -159,11 +169,6 @@ class GeometryLedger:
             return "PREPARE said max_faces 0: a service of the run does not know meshes that come later"
         if offered.frame < frame:
             return f"meshes for frame {offered.frame} came with frame {frame}: name that one, or a later one"
-        if known and offered.frame < known[-1].frame:
-            return (
-                f"meshes for frame {offered.frame} came after those for frame {known[-1].frame}, which they "
-                "would replace: name frames in ascending order"
-            )
         return ""
 
     def _takes_changes(self) -> bool:

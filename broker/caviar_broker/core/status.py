@@ -175,6 +175,12 @@ def _wait(run: Run, episodes: Episodes, member: Member, now: int) -> Wait | None
         text += f"; {member.verdict}" if member.state is ServiceState.LOST else ""
         text += f"; {lacking}" if lacking and owed else ""
         return _of(member, owed[0].frame if owed else -1, now - member.since, limit, lacking, text, now)
+    loading = episodes.geometry.awaited_since(member)
+    if not owed and loading is not None and member.plan.is_indispensable:
+        limit = run.plan.timeouts.stall
+        text = f"{member} loads meshes that a world announced, for {duration(now - loading)} now, at most "
+        text += f"{duration(limit)}; {member.last_words(now)}{'; ' * bool(lacking)}{lacking}"
+        return _of(member, -1, now - loading, limit, lacking, text, now)
     if not owed:
         return None
     task = owed[0]
