@@ -508,18 +508,17 @@ def moved(scene: Scene, before: Scene) -> Iterator[tuple[float, float]]:
         if scene.classes[i] == "pedestrian" and name in before.names:
             j = before.names.index(name)
             yaws = [euler_from_quaternion(q)[0] for q in (before.orientation[j], scene.orientation[i])]
-            far = float(np.linalg.norm(scene.position[i] - before.position[j]))
+            way = scene.position[i] - before.position[j]
+            far = float(np.linalg.norm(way))
             if far <= 3.0:  # who is put elsewhere is no walk; the report counts it
-                assert scene.velocity[i] == pytest.approx(
-                    (scene.position[i] - before.position[j]) / 0.1, abs=1e-6
-                )
+                assert np.abs(scene.velocity[i] - way / 0.1).max() < 1e-6
             yield far, abs(math.remainder(yaws[1] - yaws[0], 2 * math.pi))
 
 
 @pytest.mark.parametrize(
     ("model", "person_steps"),
     [
-        ("striping", 6_000),
+        ("striping", 3_000),
         pytest.param("striping", 41_000, marks=pytest.mark.exhaustive),
         pytest.param("jupedsim", 41_000, marks=pytest.mark.exhaustive),
         pytest.param("nonInteracting", 41_000, marks=pytest.mark.exhaustive),
