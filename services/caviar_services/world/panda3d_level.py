@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
+from itertools import chain, count
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -130,7 +131,8 @@ def _geometries(core: ModuleType, level: Any) -> Iterator[tuple[str, Mesh, str, 
         matrix = node.getMat(level)
         for index in range(node.node().getNumGeoms()):
             base = _shape_name(node)
-            name = next(n for n in (base, *(f"{base}-{k}" for k in range(1, 1 << 20))) if n not in taken)
+            numbered = (f"{base}-{number}" for number in count(1))
+            name = next(name for name in chain([base], numbered) if name not in taken)
             taken.add(name)
             geom = node.node().getGeom(index).decompose()
             # Panda3D multiplies row vectors from the left; its world axes are those of the run.
