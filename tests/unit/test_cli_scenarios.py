@@ -57,7 +57,7 @@ def test_the_keys_that_the_file_of_a_new_scenario_advertises_are_keys() -> None:
 def test_the_list_marks_what_is_not_installed_and_names_one_command(monkeypatch: pytest.MonkeyPatch) -> None:
     text = listed(monkeypatch, installed=False)
     assert "channel*, sensors*, world*" in text
-    assert f"{sys.executable} -m pip install 'caviar-sim[channel,sensors,world]'" in text
+    assert f"{sys.executable} -m pip install 'caviar-sim[channel,panda3d,sensors,world]'" in text
 
 
 @pytest.mark.parametrize(
