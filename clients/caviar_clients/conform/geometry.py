@@ -21,6 +21,8 @@ def geometry(kit: Kit) -> str:
     held = _announce(session, session.frame, [crate])
     for _ in range(2):
         _expect_used(session, held)
+    # Cases share a life: the next one begins with the geometry of READY.
+    _announce(session, session.frame, [])
     return f"geometry {held[:12]}… with the frame that it is for, and after it"
 
 
@@ -33,6 +35,7 @@ def later_geometry(kit: Kit) -> str:
     _expect_used(session, "")
     _expect_used(session, "")
     _expect_used(session, held)
+    _announce(session, session.frame, [])
     return "from the frame on that it is for"
 
 
