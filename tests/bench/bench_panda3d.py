@@ -1,7 +1,7 @@
 """What a frame of the world ``panda3d`` costs: its physics, and the pictures of its renderer.
 
 Run as ``python tests/bench/bench_panda3d.py [--frames N] [--munich] [--wall] [--markdown FILE]``. Objects and
-level are those of the scenario ``panda3d``; with ``--munich`` the level is also Munich, with 38,936 triangles.
+level are those of the scenario ``panda3d``; with ``--munich`` also Munich, with 38,936 triangles.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
