@@ -102,7 +102,8 @@ def test_a_recording_has_the_meshes_and_its_replay_announces_them_again(tmp_path
     assert embedded.status == 0, embedded.output
     assert digest_of(whole.directory) == digest_of(embedded.directory)
     recording = Recording(whole.directory)
-    used = {name for name in recording["scene"].assets.ravel().tolist() if name}
+    scenes = [frame.scene() for frame in recording.frames()]
+    used = {name for scene in scenes if scene is not None for name in scene.assets if name}
     assert len(recording.meshes) == 2
     assert len(used) == 5, "objects with meshes that are none keep their names, and are boxes"
     told = [json.loads(line) for line in (whole.directory / "events.jsonl").read_text().splitlines()]
