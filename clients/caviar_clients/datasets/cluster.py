@@ -111,7 +111,16 @@ class Episodes:
             client.submit(function, *arguments, workers=[address], pure=False, allow_other_workers=False)
             for address in addresses
         ]
-        return list(client.gather(futures))
+        try:
+            return list(client.gather(futures))
+        except Exception as error:
+            # Of Dask: the process died, or its machine is gone.
+            if type(error).__name__ != "KilledWorker":
+                raise
+            raise RunError(
+                "a process that tried a scene beforehand died, of a signal, a lack of memory or an exit of a "
+                "service; play it alone with --workers 1 to see it"
+            ) from error
 
     def play(self, tasks: Iterable[EpisodeTask]) -> Iterator[EpisodeResult]:
         """Play episodes, and yield what came of each, as they end.
@@ -133,7 +142,11 @@ class Episodes:
                     task = playing.end(future)
                     if task is None:  # its twin was quicker
                         continue
-                    result = self._result(future, task, playing)
+                    try:
+                        result = self._result(future, task, playing)
+                    except (LostSchedulerError, OSError, TimeoutError):
+                        waiting.append(task)  # it has ended, but its result is lost with the scheduler
+                        raise
                     if result is None:
                         waiting.append(task)
                     else:
@@ -149,7 +162,12 @@ class Episodes:
                 if (straggler := playing.straggler(self.workers)) is not None:
                     playing.begin(self._submit(straggler), straggler)
                 return
-            playing.begin(self._submit(task), task)
+            try:
+                future = self._submit(task)
+            except (LostSchedulerError, OSError, TimeoutError):
+                waiting.append(task)
+                raise
+            playing.begin(future, task)
 
     def _submit(self, task: EpisodeTask) -> Future:
         if self._connected.status != "running":
@@ -204,13 +222,14 @@ class Episodes:
         if self._scheduler:
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)
+                self._client.wait_for_workers(1, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as error:
                 raise RunError(
-                    f"no Dask scheduler answers at {self._scheduler} within {CONNECT_S:.0f} s: start it with "
+                    f"no Dask scheduler answers at {self._scheduler} within {CONNECT_S:.0f} s, or it has no "
+                    f"worker: start it with "
                     "dask scheduler, and workers with dask worker ADDRESS --nthreads 1"
                 ) from error
             self._stack.callback(self._client.close, timeout=5)
-            self._client.wait_for_workers(1, timeout=CONNECT_S)
             self.workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
             return
         cluster = self._stack.enter_context(

@@ -79,19 +79,40 @@ def generate(
     remote = RemoteDataset(str(out)) if is_address(out) else None
     directory = DatasetDirectory(Path(out)) if remote is None else remote.written()
     with writing_dataset(directory):
-        if remote is not None and not directory.catalogue.exists():
-            remote.fetch_catalogue(
-                directory.catalogue
-            )  # of another machine, or of before the cache was emptied
+        if remote is not None:
+            _fetch_catalogue(remote, directory)
         catalogue = Catalogue(directory.catalogue, writable=True)
         ledger = _Ledger(str(out), directory, remote, catalogue)
         try:
-            return _generate(plan, ledger, observer, workers, scheduler)
-        finally:
+            _agree(plan, ledger)  # what is refused here changes nothing at an address
             try:
-                ledger.upload()
+                return _generate(plan, ledger, observer, workers, scheduler)
             finally:
-                catalogue.close()
+                ledger.upload()
+        finally:
+            catalogue.close()
+
+
+def _fetch_catalogue(remote: RemoteDataset, directory: DatasetDirectory) -> None:
+    """Have the catalogue of an address, where this machine has none, or that of another dataset."""
+    fetched = directory.path / "fetched.sqlite"
+    if not remote.fetch_catalogue(fetched):
+        directory.catalogue.unlink(missing_ok=True)
+        return
+    try:
+        # Of the same dataset the one of this machine may know of more: a killed command uploads nothing.
+        if not directory.catalogue.exists() or _settings(fetched) != _settings(directory.catalogue):
+            fetched.replace(directory.catalogue)
+    finally:
+        fetched.unlink(missing_ok=True)
+
+
+def _settings(file: Path) -> str:
+    catalogue = Catalogue(file)
+    try:
+        return fingerprint(catalogue.settings)
+    finally:
+        catalogue.close()
 
 
 @dataclass(frozen=True)
@@ -118,9 +139,16 @@ class _Ledger:
         """List a recording that is there, and that a killed command had not listed."""
         if self.remote is not None:
             self.remote.fetch_episode(number, self.directory)
-        self.catalogue.add(rows_of(Recording(self.directory.episode(number))), {})
+        folder = self.directory.episode(number)
+        rows = rows_of(Recording(folder))
+        if rows.episode[0] != number:
+            raise RunError(
+                f"{folder} has the recording of episode {rows.episode[0]}, not of {number}: remove it, and "
+                "the episode is played"
+            )
+        self.catalogue.add(rows, {})
         if self.remote is not None:
-            shutil.rmtree(self.directory.episode(number))
+            shutil.rmtree(folder)
 
     def upload(self) -> None:
         """Have the catalogue of now at the address."""
@@ -136,7 +164,6 @@ def _generate(
     plan: DatasetPlan, ledger: _Ledger, observer: Observer, workers: int, scheduler: str
 ) -> Outcome:
     catalogue = ledger.catalogue
-    _agree(plan, ledger)
     _agree_with_recordings(ledger, observer)
     there = set(catalogue.episodes())
     left = [number for number in range(plan.episodes) if number not in there]
@@ -152,6 +179,12 @@ def _generate(
             _keep(result, catalogue, outcome)
             outcome.wall_s = time.monotonic() - began
             observer.ended(result)
+    there = {*catalogue.episodes(), *outcome.failed}
+    if lost := [number for number in left if number not in there]:
+        raise RunError(
+            f"{len(lost)} episodes ended without a result, episode {lost[0]} the first; the same command "
+            "goes on with them"
+        )
     return outcome
 
 

@@ -8,6 +8,7 @@ end.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import os
 import shutil
@@ -49,7 +50,7 @@ class RemoteDataset:
         RunError: No package for such addresses is installed, or it refuses the address.
 
     Example:
-        >>> RemoteDataset("memory://d").episodes()
+        >>> RemoteDataset("file:///data/s008").episodes()
         []
     """
 
@@ -63,6 +64,8 @@ class RemoteDataset:
         with self._errors("cannot be opened"):
             # Other processes write there too: a listing that was kept may be out of date.
             self._files, self._root = fsspec.url_to_fs(self.address, use_listings_cache=False)
+        if "memory" in self._files.protocol:
+            raise RunError(f"{self.address}: each process has a memory of its own; give a folder, or a store")
 
     # --- episodes ----------------------------------------------------------------------------------
 
@@ -74,7 +77,8 @@ class RemoteDataset:
         """
         with self._errors("cannot be read"):
             # One listing: a question for each episode takes minutes for some thousand of them.
-            names = (str(path).split("/")[-2] for path in self._files.glob(self._at("episodes", "*", MARKER)))
+            pattern = "/".join((glob.escape(self._at("episodes")), "*", MARKER))
+            names = (str(path).split("/")[-2] for path in self._files.glob(pattern))
             return sorted(n for name in names if (n := DatasetDirectory.number_of(name)) is not None)
 
     def put_episode(self, number: int, folder: Path) -> None:
@@ -137,15 +141,19 @@ class RemoteDataset:
                 shutil.rmtree(work, ignore_errors=True)
 
     def remove(self) -> None:
-        """Remove all episodes, catalogue and scenery.
+        """Remove all episodes, catalogue and scenery; nothing where there is no catalogue.
 
         Raises:
             RunError: The store refuses.
         """
         with self._errors("cannot be written"):
-            for name in ("episodes", "assets", _CATALOGUE):
-                if self._files.exists(self._at(name)):
-                    self._files.rm(self._at(name), recursive=name != _CATALOGUE)
+            if not self._files.exists(self._at(_CATALOGUE)):
+                return
+            for number in self.episodes():
+                self._files.rm(self._at(_episode(number)), recursive=True)
+            if self._files.exists(self._at("assets")):
+                self._files.rm(self._at("assets"), recursive=True)
+            self._files.rm(self._at(_CATALOGUE))
 
     # --- the rest ----------------------------------------------------------------------------------
 

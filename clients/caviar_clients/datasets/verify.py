@@ -9,12 +9,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from caviar_clients.datasets.catalogue import TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.physics import Finding, PhysicsChecks
-from caviar_clients.datasets.remote import located
+from caviar_clients.datasets.remote import RemoteDataset, located
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
@@ -50,14 +51,29 @@ def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: N
     settings = catalogue.settings
     checks = PhysicsChecks(directory.assets, settings)
     for done, number in enumerate(listed, 1):
+        if remote is None:
+            yield from _episode(directory, catalogue, checks, settings, number)
+        else:
+            yield from _fetched(remote, catalogue, checks, settings, number)
+        progress(done, len(listed))
+
+
+def _fetched(
+    remote: RemoteDataset,
+    catalogue: Catalogue,
+    checks: PhysicsChecks,
+    settings: dict[str, Any],
+    number: int,
+) -> Iterator[Finding]:
+    """Verify an episode as it is at the address now, whatever the cache has."""
+    with TemporaryDirectory(prefix="caviar-verify-") as folder:
+        directory = DatasetDirectory(Path(folder))
         try:
-            if remote is not None:
-                remote.fetch_episode(number, directory)
+            remote.fetch_episode(number, directory)
         except RecordingError as error:
             yield Finding(number, None, "", "recording", "a whole recording", str(error))
-        else:
-            yield from _episode(directory, catalogue, checks, settings, number)
-        progress(done, len(listed))
+            return
+        yield from _episode(directory, catalogue, checks, settings, number)
 
 
 def _episode(
