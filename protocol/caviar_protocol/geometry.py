@@ -111,7 +111,7 @@ def material_of(file: Path) -> str:
 
     Example:
         >>> Path("crate.ply").write_bytes(b"ply\\nformat ascii 1.0\\ncomment material wood\\nend_header\\n")
-        59
+        54
         >>> material_of(Path("crate.ply"))
         'wood'
     """
