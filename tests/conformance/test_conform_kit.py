@@ -425,7 +425,7 @@ def test_what_fails_alike_is_told_once_at_the_end() -> None:
 
 
 def test_there_is_a_fault_for_every_case() -> None:
-    """So that no verdict is one that cannot fail; those of run-time meshes stand in test_geometry_cases.py."""
+    """So that no verdict is one that cannot fail; of run-time meshes see test_geometry_cases.py."""
     meshes = {"geometry", "later-geometry", "geometry-gone"}
     assert set(FAULTS) | meshes == {case.name for case in cases()}
 

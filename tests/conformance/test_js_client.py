@@ -166,7 +166,7 @@ def test_the_world_fails_no_case_of_the_kit(node: str) -> None:
     assert failures(verdicts) == {}
     assert [v.case for v in verdicts] == [case.name for case in cases()]
     passed = {v.case for v in verdicts if v.outcome == "pass"}
-    # Not of a world: a channel's parts, a recorder's late inputs, an agent's final grant, meshes of other worlds.
+    # Not of a world: parts of a channel, late inputs of a recorder, an agent's final grant, others' meshes.
     assert {v.case for v in verdicts} - passed == {
         "late-inputs", "channel-parts", "channel-consistency", "final-grant",
         "geometry", "later-geometry", "geometry-gone",
