@@ -143,7 +143,10 @@ def node_client(
     return command
 
 
-@pytest.mark.parametrize(("script", "role"), [("agent.mjs", "agent"), ("world.mjs", "world")])
+@pytest.mark.parametrize(
+    ("script", "role"),
+    [pytest.param("agent.mjs", "agent", marks=pytest.mark.exhaustive), ("world.mjs", "world")],
+)
 def test_the_clients_for_node_fail_nothing(node_client: Callable[[str], str], script: str, role: str) -> None:
     verdicts = conform(ANY, command=node_client(script), rules=Rules(name="mine", role=role))
     assert failures(verdicts) == {}

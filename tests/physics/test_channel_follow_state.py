@@ -67,6 +67,7 @@ def test_another_channel_goes_on_bit_by_bit(scene: Callable[[int], Scene]) -> No
     assert second.checkpoint() == first.checkpoint()
 
 
+@pytest.mark.exhaustive
 def test_without_its_state_another_channel_would_find_other_paths() -> None:
     """So the test above can fail: where chains are not known, a launch of all rays tells other ones."""
     settings = {"follow": FOLLOW, "samples": 2_000}

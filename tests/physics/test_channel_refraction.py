@@ -65,7 +65,13 @@ def street(count: int) -> Scene:
 
 
 @pytest.mark.parametrize("candidates", ["launched", "enumerated"])
-@pytest.mark.parametrize("options", [{"refraction": True}, {"refraction": True, "diffraction": True}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"refraction": True},
+        pytest.param({"refraction": True, "diffraction": True}, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_no_reflection_is_lost_and_none_is_there_twice(
     tmp_path: Path, candidates: str, options: dict[str, Any]
 ) -> None:

@@ -41,6 +41,7 @@ def test_power_of_the_chosen_is_in_the_mean_that_of_all_points() -> None:
     assert relative.mean() == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.exhaustive
 def test_all_points_bring_what_those_that_are_drawn_bring() -> None:
     """A launch in which each point counts, and one in which points are drawn: ten times the rays, to 0.5 dB
     in the sum over the receivers."""

@@ -49,7 +49,7 @@ def street(shift: float) -> Scene:
 @pytest.mark.parametrize(
     "options",
     [
-        {"max_depth": 2, "diffraction": True},
+        pytest.param({"max_depth": 2, "diffraction": True}, marks=pytest.mark.exhaustive),
         {"max_depth": 1, "reflection": False, "refraction": True},
     ],
     ids=["reflection and diffraction", "refraction"],

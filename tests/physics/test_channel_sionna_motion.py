@@ -216,7 +216,9 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("everything", [False, True], ids=["reflection", "everything"])
-@pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
+@pytest.mark.parametrize(
+    "rung", [pytest.param("siso-rt", marks=pytest.mark.exhaustive), "spherical", "mimo-rt"]
+)
 def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str, everything: bool) -> None:
     """Neither moving, coming and going, nor numbers of objects, receivers, elements and paths: all was
     compiled while preparing. Kernels of single frames would also be a leak of memory."""

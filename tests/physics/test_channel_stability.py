@@ -13,10 +13,13 @@ pytestmark = pytest.mark.channel
 DOCUMENT = Path(__file__).parents[2] / "docs" / "topics" / "channel-stability.md"
 GROUPS = sorted({case.group for case in cases() if case.traced})
 
+LONG = {"mesh", "place", "paths", "edge", "material"}
+"""Groups that take most of the time."""
+
 
 @pytest.mark.parametrize(
     "group",
-    [pytest.param(group, marks=() if group != "mesh" else pytest.mark.exhaustive) for group in GROUPS],
+    [pytest.param(group, marks=pytest.mark.exhaustive if group in LONG else ()) for group in GROUPS],
 )
 def test_cases_that_trace_are_right(group: str) -> None:
     results = run([case for case in cases() if case.group == group and case.traced])

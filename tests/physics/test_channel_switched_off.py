@@ -89,12 +89,12 @@ def same_paths(a: Channel, b: Channel) -> bool:
 @pytest.mark.parametrize(
     ("material", "thickness", "option", "more"),
     [
-        ("metal", 0.1, "refraction", {}),
+        pytest.param("metal", 0.1, "refraction", {}, marks=pytest.mark.exhaustive),
         ("concrete", 20.0, "refraction", {}),
         ("metal", 0.1, "refraction", {"reflection": False}),
-        ("concrete", 0.1, "scattering", {}),
+        pytest.param("concrete", 0.1, "scattering", {}, marks=pytest.mark.exhaustive),
         ("glass", 0.1, "scattering", {"refraction": True}),
-        ("concrete", 0.1, "diffraction", {"bodies": 0}),
+        pytest.param("concrete", 0.1, "diffraction", {"bodies": 0}, marks=pytest.mark.exhaustive),
     ],
 )
 def test_what_is_switched_off_would_have_found_nothing(
@@ -161,7 +161,7 @@ def test_without_surfaces_nothing_is_launched(monkeypatch: pytest.MonkeyPatch) -
     ("material", "thickness", "settings"),
     [
         ("concrete", 0.1, {"refraction": True}),
-        ("metal", 0.1, {"diffraction": True}),
+        pytest.param("metal", 0.1, {"diffraction": True}, marks=pytest.mark.exhaustive),
         (
             "concrete",
             0.1,

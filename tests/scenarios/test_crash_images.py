@@ -9,6 +9,7 @@ REASON = crash_images.missing()
 pytestmark = pytest.mark.skipif(bool(REASON), reason=f"crash images: {REASON}")
 
 
+@pytest.mark.exhaustive
 def test_a_run_goes_on_from_what_a_loss_of_power_left(capsys: pytest.CaptureFixture[str]) -> None:
     """One image under ``frame``, one under ``periodic``."""
     status = crash_images.main(["--images", "2", "--frames", "100", "--seed", "4"])

@@ -90,7 +90,7 @@ def late_in_recording(finished: Finished) -> set[tuple[str, int]]:
     }
 
 
-@pytest.mark.parametrize("policy", ["hold", "drop"])
+@pytest.mark.parametrize("policy", ["hold", pytest.param("drop", marks=pytest.mark.exhaustive)])
 def test_a_frame_goes_on_without_who_is_late_and_every_consumer_is_told(tmp_path: Path, policy: str) -> None:
     finished = run(scenario(tmp_path, policy), tmp_path / "out", timeout=120)
     assert finished.status == 0, finished.output

@@ -94,6 +94,7 @@ def children(process: psutil.Process) -> list[psutil.Process]:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_workers_write_the_bytes_of_one(scenario: Path, reference: Path, tmp_path: Path) -> None:
     done = generate(scenario, tmp_path / "d", "--workers", "2")
     assert done.returncode == 0, done.stderr

@@ -77,6 +77,7 @@ def scenario(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.exhaustive
 def test_every_kind_of_state_outlives_its_process(scenario: Path, tmp_path: Path) -> None:
     """Each of the four is killed once; the digest is that of an undisturbed run."""
     whole = run(scenario, tmp_path / "whole", timeout=120)

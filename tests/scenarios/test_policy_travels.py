@@ -160,6 +160,7 @@ def test_a_broker_that_dies_after_a_swap_is_followed_by_one_that_knows_it(tmp_pa
     replayed(directory, tmp_path / "again")
 
 
+@pytest.mark.exhaustive
 def test_at_a_given_pace_no_frame_is_missed_while_policies_are_swapped(tmp_path: Path) -> None:
     files = [constant_policy(tmp_path / f"{pair}.onnx", pair) for pair in (3, 5, 9)]
     scenario, out = scenario_with(tmp_path, files[0].name, 100), tmp_path / "out"

@@ -159,8 +159,9 @@ def test_the_wheel_runs_smoke_by_name_with_the_same_digest(
     assert digest_of_smoke([environment.folder / "bin" / "caviar"], tmp_path) == smoke_digest
 
 
+@pytest.mark.exhaustive
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("label", NEWEST_ALONE)
+@pytest.mark.parametrize("label", ENVIRONMENTS)
 def test_the_protocol_passes_its_vectors_and_unit_tests(
     label: str, environments: dict[str, Environment]
 ) -> None:

@@ -72,6 +72,7 @@ def test_another_agent_acts_in_the_recorded_world(smoke: Path, tmp_path: Path) -
     assert products(other.directory, "link") != products(smoke, "link")
 
 
+@pytest.mark.exhaustive
 def test_a_replay_can_be_replayed(smoke: Path, tmp_path: Path) -> None:
     other = replayed(smoke, tmp_path / "other", "--replace", "agent=random")
     again = replayed(other.directory, tmp_path / "again")
@@ -109,6 +110,7 @@ def test_what_was_held_or_absent_is_so_again(tmp_path: Path) -> None:
     assert products(other.directory, "channel") == products(late.directory, "channel")
 
 
+@pytest.mark.exhaustive
 def test_episodes_are_as_long_as_they_were(tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path, [("frames = 100\n", "frames = 6\nepisodes = 3\n")])
     episodes = run(scenario, tmp_path / "run")

@@ -85,6 +85,7 @@ def test_one_changed_payload_byte_gives_another_digest(smoke: Finished, tmp_path
 
 
 @pytest.mark.sumo
+@pytest.mark.exhaustive
 def test_seeds_lead_to_other_traffic(tmp_path: Path) -> None:
     """Street canyon with its real traffic; the ray tracer has no part in it, free space stands in."""
     pytest.importorskip("libsumo", reason="needs the world extra")

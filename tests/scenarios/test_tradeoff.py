@@ -77,6 +77,7 @@ def test_settings_are_measured_against_reference_and_baseline(tmp_path: Path) ->
 
 
 @pytest.mark.usefixtures("small_ladder")
+@pytest.mark.exhaustive
 def test_a_recording_gives_the_figures_of_its_scenario(tmp_path: Path) -> None:
     """Errors do not depend on the machine's speed: scenes and draws are the same."""
     pytest.importorskip("matplotlib")

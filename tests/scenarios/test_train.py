@@ -174,7 +174,7 @@ gymnasium.register("Mine-v0", entry_point=Mine)
 """
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.exhaustive), 2])
 def test_an_environment_of_ones_own_beside_the_file_is_trained_and_gone_on_with(
     jobs: int, tmp_path: Path
 ) -> None:

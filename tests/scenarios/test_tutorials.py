@@ -11,12 +11,18 @@ from scenarios_support import ROOT, follow
 TUTORIALS = ROOT / "docs" / "tutorials"
 CHANNEL = {"own-scenario"}
 """Pages that need the ray tracer."""
+LONG = {"own-scenario", "first-agent"}
+"""Pages that take most of the time."""
 
 
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(file.stem, marks=[pytest.mark.channel] if file.stem in CHANNEL else [])
+        pytest.param(
+            file.stem,
+            marks=[pytest.mark.channel] * (file.stem in CHANNEL)
+            + [pytest.mark.exhaustive] * (file.stem in LONG),
+        )
         for file in sorted(TUTORIALS.glob("*.md"))
         if file.stem != "index"
     ],

@@ -90,6 +90,7 @@ def test_an_agent_over_a_websocket_plays_the_run_that_it_plays_over_zeromq(
         assert agent.wait(WITHIN_S) == 0
 
 
+@pytest.mark.exhaustive
 def test_an_agent_with_the_websocket_of_node_plays_it_too(
     tmp_path: Path, over_zeromq: str, pytestconfig: pytest.Config
 ) -> None:

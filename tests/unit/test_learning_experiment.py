@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import pytest
 
 from caviar_clients.learning.experiment import Dqn, Encoding, Ppo, load_experiment, parse_experiment
@@ -144,6 +146,16 @@ def test_an_environment_of_a_module_beside_the_file(tmp_path: Path, monkeypatch:
     file.write_text(text.replace("BesideTheFile", "BesideFile"))
     with pytest.raises(ScenarioError, match=r"'beside_the_file' registers no .*mean 'BesideTheFile-v0'\?"):
         load_experiment(file)
+
+
+def test_an_environment_of_a_notebook_is_no_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A function that was made from text belongs to no module."""
+    names: dict[str, Any] = {"__name__": None}
+    exec("def make(): ...", names)  # noqa: S102 - as a notebook does
+    spec = gymnasium.envs.registration.EnvSpec("FromText-v0", entry_point=names["make"])
+    monkeypatch.setitem(gymnasium.registry, "FromText-v0", spec)
+    with pytest.raises(ScenarioError, match="did you mean 'caviar/BeamSelection-v0'"):
+        parse_experiment(TEXT.replace("Selection-v0", "Selecton-v0"))
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

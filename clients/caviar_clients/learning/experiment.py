@@ -425,7 +425,8 @@ def _import(module: str) -> None:
 def _is_of(spec: gymnasium.envs.registration.EnvSpec, module: str) -> bool:
     """Whether an environment is defined in a module, or in one below it."""
     made = spec.entry_point
-    name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", "")
+    # A function of a module that was run from text has None there.
+    name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", None) or ""
     return name == module or name.startswith(f"{module}.")
 
 
