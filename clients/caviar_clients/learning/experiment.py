@@ -425,8 +425,9 @@ def _import(module: str) -> None:
 def _is_of(spec: gymnasium.envs.registration.EnvSpec, module: str) -> bool:
     """Whether an environment is defined in a module, or in one below it."""
     made = spec.entry_point
-    # A function of a module that was run from text has None there.
-    name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", None) or ""
+    name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", None)
+    if not name:  # a function made from text belongs to none
+        return False
     return name == module or name.startswith(f"{module}.")
 
 
