@@ -157,6 +157,9 @@ def with_recording_checked(
     from caviar_protocol.recording.integrity import declared_digest
 
     recorders = [spec for spec in scenario.services.values() if spec.role == "recorder" and not spec.remote]
+    # A recording of some topics has another digest than the run.
+    if any(spec.settings.get("only_named") for spec in recorders):
+        return outcome
     if outcome["error"] or not outcome["frames"] or not recorders:
         return outcome
     try:

@@ -32,6 +32,7 @@ from caviar_protocol.host import resident_mib
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
+from caviar_services.recorder.provenance import installed_versions
 
 MEASURED = "measured.json"
 """Beside the recording of an episode: times, host and start, which differ from run to run."""
@@ -163,7 +164,9 @@ def _put_into_place(
     folder: Path, target: Path | RemoteDataset, episode: int, measured: dict[str, Any]
 ) -> None:
     """Have the disk hold a recording, and rename it in one step; upload it where the dataset is elsewhere."""
-    replace_file(folder / MEASURED, msgspec.json.encode(measured) + b"\n", durable=False)
+    # The recording names what it was computed with; this is everything that was installed.
+    beside = {**measured, "versions": installed_versions()}
+    replace_file(folder / MEASURED, msgspec.json.encode(beside) + b"\n", durable=False)
     if isinstance(target, RemoteDataset):
         target.put_episode(episode, folder)
         return

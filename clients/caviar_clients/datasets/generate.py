@@ -232,8 +232,8 @@ def _agree(plan: DatasetPlan, ledger: _Ledger) -> None:
         found = list(differences(before, settings))
         more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
         raise RunError(
-            f"{ledger.out} holds another dataset: {'; '.join(found[:3])}{more}; give another --out, or "
-            "--overwrite to remove it"
+            f"{ledger.out} holds another dataset: {'; '.join(found[:3])}{more}; give another --out "
+            "(--overwrite deletes the dataset that is there, with all its episodes)"
         )
     catalogue.plan(settings, max(plan.episodes, catalogue.planned))
     ledger.upload()  # so that another machine can go on where this one is lost

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.scenario.rules import with_overrides
 from caviar_services.drjit_setup import choose_variant
-from caviar_services.recorder.base import versions
+from caviar_services.recorder.provenance import code_digests, used_versions
+from caviar_services.world.scenery import scenery_assets
 
 FORMAT = 1
 """Version of the layout of a dataset."""
@@ -47,14 +48,16 @@ class DatasetPlan:
 
         Raises:
             ScenarioError: A file that the scenario names cannot be read.
+            AssetError: Scenery lacks a file.
         """
         content = msgspec.to_builtins(self.scenario)
         content.pop("source", None)
         return {
             "format": FORMAT,
             "scenario": _without_folders(content),
-            "files": dict(sorted(_files(content))),
-            "versions": versions(),
+            "files": _digests(_files(content)),
+            "code": code_digests(content),
+            "versions": used_versions(content),
             "device": choose_variant(),
         }
 
@@ -90,7 +93,13 @@ def plan_dataset(
                 f"services.{name}.use",
             )
     recorder = scenario.services[recorders[0]]
-    settings = {"compression": "zstd", **recorder.settings, "reproducible": True, "copy_assets": False}
+    settings = {
+        "compression": "zstd",
+        "only_named": True,
+        **recorder.settings,
+        "reproducible": True,
+        "copy_assets": False,
+    }
     services = {**scenario.services, recorders[0]: replace(recorder, settings=settings)}
     # A kill costs the episodes in progress, whatever the disk holds of them: each is synced as a whole.
     # Nor does a recording say how many episodes there are: a dataset may grow.
@@ -141,18 +150,36 @@ def _without_folders(value: Any) -> Any:
     return [_without_folders(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _files(value: Any) -> Iterator[tuple[str, str]]:
-    """Name and digest of each file that the settings name."""
+def _digests(files: Iterable[tuple[str, str, Path]]) -> dict[str, str]:
+    """Digest of each file by its name; by key and name where several files of one name differ."""
+    found: dict[str, dict[str, str]] = {}
+    for key, name, path in files:
+        found.setdefault(name, {})[key] = file_digest(path)
+    digests: dict[str, str] = {}
+    for name, by_key in found.items():
+        if len(set(by_key.values())) == 1:
+            digests[name] = next(iter(by_key.values()))
+        else:
+            digests |= {f"{key}: {name}": digest for key, digest in by_key.items()}
+    return dict(sorted(digests.items()))
+
+
+def _files(value: Any, key: str = "") -> Iterator[tuple[str, str, Path]]:
+    """Key, name and path of each file that the settings name, and of those that scenery names in turn."""
     if isinstance(value, str) and value.startswith("/"):
         path = Path(value)
         if path.is_file():
-            yield path.name, file_digest(path)
+            yield key, path.name, path
+            if key.endswith(".scenery"):
+                for name, mesh in scenery_assets(value).items():
+                    if isinstance(mesh, Path) and mesh != path:
+                        yield key, name, mesh
     elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _files(item)
+        for name, item in value.items():
+            yield from _files(item, f"{key}.{name}" if key else name)
     elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _files(item)
+        for at, item in enumerate(value):
+            yield from _files(item, f"{key}[{at}]")
 
 
 CAMERAS = ("left", "centre", "right")

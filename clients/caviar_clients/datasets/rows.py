@@ -25,7 +25,7 @@ class Episode:
     scenes: int
     seed: int
     digest: str
-    """Of the run: of the digests of all its products."""
+    """Of the digests of all its recorded products."""
     bytes: int
     """Of the recording's files."""
     sha256: str

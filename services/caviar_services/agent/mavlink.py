@@ -83,6 +83,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
 
     Settings = MavlinkSettings
     extra: ClassVar[str] = "mavlink"
+    packages: ClassVar[tuple[str, ...]] = ("pymavlink",)
 
     @classmethod
     def check_settings(cls, settings: MavlinkSettings, place: Place) -> None:

@@ -183,6 +183,7 @@ class PolicyAgent(Agent[PolicySettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = PolicySettings
+    packages: ClassVar[tuple[str, ...]] = ("onnxruntime",)
     _served: Served
     _places: Users
     _known: KnownDevices

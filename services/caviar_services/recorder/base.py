@@ -11,11 +11,8 @@ from __future__ import annotations
 import errno
 import os
 import platform
-import re
 import shutil
 from collections.abc import Mapping
-from functools import cache
-from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Generic, TypeVar
 
@@ -29,8 +26,6 @@ from caviar_protocol.run_directory import RunDirectory
 from caviar_services.service import Service
 
 S = TypeVar("S", bound=msgspec.Struct)
-
-DISTRIBUTION = "caviar-sim"
 
 
 class Recorder(Service[S], Generic[S]):
@@ -189,30 +184,6 @@ read: choose another directory with --out
         f"the recorder cannot write {path}: {error.strerror or error} (errno {error.errno}); "
         f"{remedy.format(folder=path.parent, resume=resume)}"
     )
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Versions of Python, of this distribution, and of its dependencies that are installed.
-
-    Example:
-        >>> versions()["python"] == platform.python_version()
-        True
-    """
-    found = {"python": platform.python_version()}
-    try:
-        requirements = [DISTRIBUTION, *(metadata.requires(DISTRIBUTION) or ())]
-    except metadata.PackageNotFoundError:
-        return found
-    for requirement in requirements:
-        if requirement.endswith(('extra == "dev"', "extra == 'dev'")):
-            continue  # tools of developers take no part in a run
-        name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return dict(sorted(found.items()))
 
 
 def machine() -> dict[str, str]:

@@ -66,8 +66,8 @@ from caviar_services.recorder.base import (
     copy_meshes,
     failure,
     machine,
-    versions,
 )
+from caviar_services.recorder.provenance import code_digests, installed_versions, used_versions
 from caviar_services.recorder.segment_writer import Persistence, SegmentWriter, stored_products
 from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, StepResult
 
@@ -87,8 +87,11 @@ class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     copy_assets: bool = True
     """Copy the scenery into the run directory."""
     reproducible: bool = False
-    """Leave out what differs between equal runs: start, machine, wall times, folders of files. Then the
-    recordings of equal runs have equal bytes."""
+    """Leave out what differs between equal runs: start, machine, wall times, folders of files, versions of
+    packages that no service computes with. Then the recordings of equal runs have equal bytes."""
+    only_named: bool = False
+    """Write the topics that ``record`` of the run names and no others; where it names none, all that are
+    produced. The digest of the recording is then that of these, and no longer the run's."""
     notes: tuple[str, ...] = ()
     """Free text, kept in the metadata."""
 
@@ -115,6 +118,7 @@ class McapRecorder(Recorder[McapSettings]):
 
     Settings = McapSettings
     outputs: ClassVar[tuple[str, ...]] = ()
+    packages: ClassVar[tuple[str, ...]] = ("mcap", "lz4", "zstandard")
     uses_scenery: ClassVar[bool] = True
     changes_geometry: ClassVar[bool] = True
 
@@ -128,6 +132,7 @@ class McapRecorder(Recorder[McapSettings]):
         self._failure: RunError | None = None
         self._runtime = RunTime(run.sampling_period_ns)
         self._stored = StoredProducts()
+        self._named = frozenset(self.parts) if settings.only_named else frozenset()
         # Whether frames that another process recorded are still to be taken over.
         self._goes_on = False
 
@@ -158,7 +163,7 @@ class McapRecorder(Recorder[McapSettings]):
             sampling_period_ns=self.run.sampling_period_ns,
             frames=self.run.frames,
             scenario=_without_folders(self.run.scenario) if reproducible else dict(self.run.scenario),
-            versions=versions(),
+            versions=_versions(self.run.scenario, used_only=reproducible),
             machine={} if reproducible else machine(),
             started="" if reproducible else datetime.now(UTC).isoformat(timespec="seconds"),
             assets=copied,
@@ -205,7 +210,8 @@ class McapRecorder(Recorder[McapSettings]):
         base_ns = self._runtime.base_of(frame.episode, frame.t_ns)
         self._stored.begin(frame.episode)
         # Sorted: equal runs have equal recordings, whatever came first.
-        inputs = sorted(map(_encoded, frame.inputs), key=_canonical)
+        wanted = [item for item in frame.inputs if not self._named or item.provenance.topic in self._named]
+        inputs = sorted(map(_encoded, wanted), key=_canonical)
         entry = FrameEntry(
             episode=frame.episode,
             frame=frame.number,
@@ -464,6 +470,13 @@ def durability_of(scenario: Mapping[str, object]) -> Durability:
 def _without_times(reports: tuple[Report, ...]) -> tuple[Report, ...]:
     """Reports without wall times, in the order of their services."""
     return tuple(replace_field(report, measured={}) for report in sorted(reports, key=lambda r: r.source))
+
+
+def _versions(scenario: Mapping[str, Any], *, used_only: bool) -> dict[str, str]:
+    """Versions for the metadata, and the start of the digest of each code that is not ours."""
+    versions = used_versions(scenario) if used_only else installed_versions()
+    code = {f"code of {name}": digest[:16] for name, digest in code_digests(scenario).items()}
+    return {**versions, **code}
 
 
 def _without_folders(value: Any) -> Any:

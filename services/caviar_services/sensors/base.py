@@ -87,6 +87,7 @@ class Sensors(Service[S]):
     role: ClassVar[Role] = "sensors"
     Settings: ClassVar[type[msgspec.Struct]] = SensorSettings
     extra: ClassVar[str] = "sensors"
+    packages: ClassVar[tuple[str, ...]] = ("mitsuba", "drjit")
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="scene"),)
     changes_geometry: ClassVar[bool] = True
 

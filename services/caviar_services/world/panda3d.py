@@ -113,6 +113,7 @@ class Panda3dWorld(World[Panda3dSettings]):
 
     Settings: ClassVar[type[msgspec.Struct]] = Panda3dSettings
     extra: ClassVar[str] = "panda3d"
+    packages: ClassVar[tuple[str, ...]] = ("panda3d",)
     checkpoints: ClassVar[bool] = True
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
     outputs: ClassVar[tuple[str, ...]] = ("scene", "camera")

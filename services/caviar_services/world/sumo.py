@@ -116,6 +116,7 @@ class SumoWorld(World[SumoSettings]):
 
     Settings = SumoSettings
     extra: ClassVar[str] = "world"
+    packages: ClassVar[tuple[str, ...]] = ("eclipse-sumo", "libsumo")
     checkpoints: ClassVar[bool] = True
 
     def __init__(self, settings: SumoSettings, run: RunInfo) -> None:

@@ -67,6 +67,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
     Settings: ClassVar[type[msgspec.Struct]] = SionnaSettings
     rung = "siso-rt"
     extra: ClassVar[str] = "channel"
+    packages: ClassVar[tuple[str, ...]] = ("sionna-rt", "mitsuba", "drjit", "scipy")
     uses_scenery: ClassVar[bool] = True
     checkpoints: ClassVar[bool] = True
     changes_geometry: ClassVar[bool] = True
