@@ -11,6 +11,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -29,15 +30,38 @@ _CATALOGUE = DatasetDirectory(Path()).catalogue.name
 MARKER = "complete.json"
 """In the folder of an episode: names and sizes of its files; it is written after them."""
 
+# ``s3:/bucket`` of any kind; ``s3:bucket`` and ``s3//bucket`` of kinds that no folder is called.
+_ALMOST = re.compile(
+    r"(?:(?P<scheme>[A-Za-z][A-Za-z0-9+.-]+):/"
+    r"|(?P<known>s3a?|gs|gcs|gdrive|az|abfss?|adl|s?ftp|ssh|hdfs|webhdfs|https?|file|github|smb|oci)(?::|//))"
+    r"/*"
+)
+
 
 def is_address(location: str | Path) -> bool:
     """Whether a location of a dataset is an address, not a folder.
+
+    Raises:
+        RunError: It is empty, or an address that lacks a colon or a slash; has the intended form.
 
     Example:
         >>> is_address("s3://bucket/s008"), is_address("data/s008"), is_address(Path("data"))
         (True, False, False)
     """
-    return isinstance(location, str) and "://" in location
+    text = str(location)
+    if not text.strip():
+        raise RunError("a dataset needs a place: give a folder, or an address as s3://bucket/name")
+    if isinstance(location, str) and "://" in text:
+        return True
+    # A path of Python has one slash where an address has two.
+    if found := _ALMOST.match(text):
+        scheme = found["scheme"] or found["known"]
+        rest = text[found.end() :]
+        intended = f"{scheme}://{'/' if scheme == 'file' else ''}{rest}"
+        raise RunError(
+            f"{text!r} is no address: write {intended!r}, as text; a folder of that name is './{text}'"
+        )
+    return False
 
 
 class RemoteDataset:
