@@ -7,14 +7,16 @@ is played with spherical waves, which stand for its arrays inside the ray tracer
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any, Literal
 
 from msgspec.structs import replace
 
-from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.scenario import Carrier, DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario import Carrier, DeviceSpec, Scenario, ServiceSpec, shipped_scenarios
 
 NO_TIME_MS = 1000
 """[ms] Sampling period of a set whose episodes have one scene: SUMO's longest step."""
@@ -113,10 +115,25 @@ def find_preset(name: str) -> Preset | None:
     Example:
         >>> find_preset("smoke") is None
         True
+        >>> find_preset("S8")
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.ScenarioError: there is no preset 'S8'; did you mean 's008'? presets: s001, \
+s005, s006, s008, s011, s012
     """
-    if name not in PRESETS and len(name) == 4 and name[0] in "sS" and name[1:].isdecimal():
-        raise ScenarioError(f"there is no preset {name!r}; {suggestion(name, PRESETS)}")
-    return PRESETS.get(name)
+    if name in PRESETS or name in shipped_scenarios():
+        return PRESETS.get(name)
+    numbered = _NUMBERED.fullmatch(name)
+    meant = f"s{int(numbered[1]):03d}" if numbered else ""
+    near = [meant] if meant in PRESETS else get_close_matches(name.lower(), PRESETS, n=1, cutoff=0.7)
+    if numbered or near:
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ScenarioError(f"there is no preset {name!r}; {hint}presets: {', '.join(PRESETS)}")
+    return None
+
+
+# With another letter case or number of zeros, or with a sign between.
+_NUMBERED = re.compile(r"[sS][-_ ]?([0-9]{1,4})")
 
 
 def _carriers(preset: Preset, scenario: Scenario) -> tuple[Carrier, ...]:
