@@ -106,8 +106,14 @@ def runs_below(folder: str | Path) -> str:
         folder: That was given.
 
     Returns:
-        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``; empty where it holds none.
+        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``, or what a dataset is looked at with; empty
+        where it holds none.
     """
+    folder = Path(folder)
+    episodes = folder / "episodes" if (folder / "catalogue.sqlite").is_file() else folder
+    if first := min(episodes.glob("episode-*"), default=None):
+        dataset = folder if episodes != folder else folder.parent
+        return f"; it is a dataset: give an episode, as {first}, or caviar verify {dataset}"
     try:
         newest = newest_run(folder)
     except (RecordingError, OSError):

@@ -34,8 +34,8 @@ def export_tables(catalogue: Catalogue, folder: str | Path, form: Format) -> lis
     """
     if is_address(folder):
         raise RunError(
-            f"tables are written to a folder of this machine, {folder} is an address: give a folder, and copy "
-            "its files there"
+            f"tables are written to a folder of this machine, and {folder} is an address: give a folder, and "
+            "copy its files there"
         )
     folder = Path(folder)
     names = (*TABLES, *MEASURED_TABLES)
@@ -43,8 +43,8 @@ def export_tables(catalogue: Catalogue, folder: str | Path, form: Format) -> lis
     for name, file in zip(names, files, strict=True):
         if file.exists() and not _is_table(file, list(columns_of(name))):
             raise RunError(
-                f"{file} is there, and is not the table {name} of a dataset: move it, or choose another folder "
-                "with --out"
+                f"{file} is there, and is not the table {name} of a dataset: move it, or choose another "
+                "folder with --out"
             )
     # A folder of its own: another command may write the same tables, and files of the user stay.
     with writing(files[0]), tempfile.TemporaryDirectory(prefix=".tables-", dir=folder) as work:

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import operator
 import random
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -16,11 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_clients.datasets.catalogue import TABLES, Catalogue
-from caviar_clients.datasets.remote import located
+from caviar_clients.datasets.directory import DatasetDirectory
+from caviar_clients.datasets.remote import is_address, located
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.recording import Recording
+from caviar_protocol.run_directory import RunDirectory
 
+_READS = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(?:select|with)\b", re.IGNORECASE | re.DOTALL)
 KEPT_RECORDINGS = 16
 """Recordings that stay open: mapped into memory, not read."""
 
@@ -46,15 +51,15 @@ class Dataset:
     def __init__(self, path: str | Path, episodes: Iterable[int] | None = None) -> None:
         self.location = str(path)
         """Folder or address."""
+        check_level(path)
         self.directory, self._remote = located(path)
         """Folder of this machine; of an address that in the cache."""
         self._catalogue = Catalogue(self.directory.catalogue)
         there = self._catalogue.episodes()
-        self.episodes = tuple(there) if episodes is None else tuple(episodes)
+        self.episodes = tuple(there) if episodes is None else _numbers(episodes)
         """Numbers of the episodes, in the order in which they are read."""
         if lacking := sorted(set(self.episodes) - set(there)):
-            has = f"{there[0]} to {there[-1]}" if there else "none"
-            raise RecordingError(f"{self.location} has no episode {lacking[0]}; it has {len(there)}: {has}")
+            raise RecordingError(f"{self.location} has no episode {lacking[0]}; it has {_range(there)}")
         self._open = lru_cache(maxsize=KEPT_RECORDINGS)(self._opened)
 
     def __len__(self) -> int:
@@ -97,7 +102,9 @@ class Dataset:
             RecordingError: It is none of this dataset, or its recording cannot be read.
         """
         if number not in self.episodes:
-            raise RecordingError(f"{self.location} has no episode {number} here")
+            raise RecordingError(
+                f"{self.location} has no episode {number} here; it has {_range(sorted(self.episodes))}"
+            )
         return self._open(number)
 
     def split(self, shares: Sequence[float], *, seed: int = 0) -> tuple[Dataset, ...]:
@@ -111,13 +118,20 @@ class Dataset:
             A dataset for each share; the last one takes what rounding leaves where they add up to 1.
 
         Raises:
-            ValueError: A share is not positive, or they add up to more than 1.
+            ValueError: There is no share, one is not positive, or they add up to more than 1.
+            TypeError: It is a number: a part lacks its share.
 
         Example:
             >>> train, test = Dataset("data/s008").split((0.8, 0.2), seed=1)  # doctest: +SKIP
         """
-        if not all(share > 0.0 for share in shares) or sum(shares) > 1.0 + 1e-9:
-            raise ValueError(f"shares are {tuple(shares)}: write positive numbers that add up to 1 at most")
+        if isinstance(shares, int | float):
+            rest = f"{1.0 - shares:.4g}" if 0.0 < shares < 1.0 else "0.2"
+            first = f"{shares:g}" if 0.0 < shares < 1.0 else "0.8"
+            raise TypeError(f"shares is {shares!r}: write a share for each part, as ({first}, {rest})")
+        shares = tuple(shares)
+        are_numbers = all(isinstance(share, int | float) and share > 0.0 for share in shares)
+        if not shares or not are_numbers or sum(shares) > 1.0 + 1e-9:
+            raise ValueError(f"shares are {shares}: write positive numbers that add up to 1 at most")
         order = sorted(self.episodes)
         random.Random(seed).shuffle(order)  # noqa: S311 - no secret; its algorithm is the same everywhere
         bounds = [round(len(order) * sum(shares[:at])) for at in range(len(shares) + 1)]
@@ -127,7 +141,12 @@ class Dataset:
         """These episodes only.
 
         Args:
-            episodes: Their numbers.
+            episodes: Their numbers, each once; they are read in this order.
+
+        Raises:
+            RecordingError: One is not there.
+            ValueError: One is named twice.
+            TypeError: It is no list of whole numbers.
         """
         return Dataset(self.location, episodes)
 
@@ -194,18 +213,22 @@ class Dataset:
         return Users(self, table.where(mask))
 
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> dict[str, NDArray[Any]]:
-        """Ask the catalogue in SQL, over all episodes.
+        """Ask the catalogue in SQL, over all episodes; nothing is written.
 
         Args:
-            sql: A ``SELECT`` on the tables ``episodes``, ``scenes``, ``users``, ``products``, ``timings``.
+            sql: A ``SELECT``, also after ``WITH``, on the tables ``episodes``, ``scenes``, ``users``,
+                ``products``, ``timings`` and ``failures``.
             parameters: What its question marks stand for.
 
         Returns:
             A column for each name, as NumPy finds its type.
 
         Raises:
-            RecordingError: SQLite refuses; has its words.
+            RecordingError: It is another statement, or SQLite refuses; has its words.
         """
+        # The catalogue is opened for reading, but ATTACH makes files elsewhere.
+        if not _READS.match(sql):
+            raise RecordingError(f"query({sql[:60]!r}): write one SELECT, or WITH … SELECT, on the catalogue")
         names, rows = self._catalogue.query(sql, parameters)
         columns = zip(*rows, strict=True) if rows else ((),) * len(names)
         return {name: np.array(column) for name, column in zip(names, columns, strict=True)}
@@ -224,3 +247,56 @@ class Dataset:
         if self._remote is not None:
             self._remote.fetch_episode(number, self.directory)
         return Recording(self.directory.episode(number))
+
+
+def check_level(location: str | Path) -> None:
+    """Check that a folder is not one inside a dataset, or one that holds datasets.
+
+    Args:
+        location: Folder of a dataset, or its address, which is not looked at.
+
+    Raises:
+        RecordingError: It is on another level; the text has the folder of the dataset.
+    """
+    if is_address(location) or DatasetDirectory(path := Path(location)).catalogue.is_file():
+        return
+    if path.is_dir() and RunDirectory(path).segments():
+        level = (
+            "the recording of an episode" if DatasetDirectory.number_of(path.name) is not None else "a run"
+        )
+        inspect = f"caviar inspect {path} and caviar.open({str(path)!r}) read it"
+        above = _dataset_above(path)
+        raise RecordingError(f"{path} is {level}: {f'its dataset is {above}; ' if above else ''}{inspect}")
+    if above := _dataset_above(path):
+        raise RecordingError(f"{path} is a part of a dataset: give {above}")
+    below = sorted(file.parent for file in path.glob(f"*/{DatasetDirectory(path).catalogue.name}"))
+    if below:
+        raise RecordingError(f"{path} is no dataset, it holds {len(below)}: give one of them, as {below[0]}")
+
+
+def _dataset_above(path: Path) -> Path | None:
+    """The dataset that a path lies in, up to the files of an episode."""
+    above = path.absolute().parents[:3]
+    found = next((folder for folder in above if DatasetDirectory(folder).catalogue.is_file()), None)
+    here = Path.cwd()
+    return found.relative_to(here) if found is not None and found.is_relative_to(here) else found
+
+
+def _numbers(episodes: Iterable[int]) -> tuple[int, ...]:
+    if isinstance(episodes, str | bytes) or not isinstance(episodes, Iterable):
+        raise TypeError(f"episodes is {episodes!r}: write a list of numbers, as [{episodes}]")
+    found = list[int]()
+    for number in episodes:
+        try:
+            found.append(operator.index(number))
+        except TypeError:
+            raise TypeError(f"episodes has {number!r}: write whole numbers, as [0, 1]") from None
+    if len(set(found)) < len(found):
+        twice = next(number for number in found if found.count(number) > 1)
+        raise ValueError(f"episodes has {twice} {found.count(twice)} times: name each once")
+    return tuple(found)
+
+
+def _range(episodes: Sequence[int]) -> str:
+    """Say which episodes there are."""
+    return f"{len(episodes)}: {episodes[0]} to {episodes[-1]}" if episodes else "none"

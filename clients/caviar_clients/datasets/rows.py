@@ -78,12 +78,39 @@ class UserRow:
     delay_spread_s: float | None
     """Square root of the second central moment of the power delay profile [s]."""
     tx_beam: int | None
-    """Of the best pair, by the link."""
+    """Of the best pair of the codebooks, by the link: not of the pair that the agent chose, which is
+    ``link.tx_beam`` of the recording."""
     rx_beam: int | None
+    """Likewise."""
     abs_y: float | None
-    """|w* H f| of the best pair."""
+    """|w* H f| of the best pair, not of the chosen one (``link.abs_y``)."""
     snr_db: float | None
-    """Of the best pair [dB]."""
+    """Of the best pair, not of the chosen one (``link.snr``) [dB]."""
+
+
+USER_COLUMNS = {
+    "episode": "number, from 0",
+    "scene": "number in the episode, from 0",
+    "carrier": "name",
+    "tx": "transmitting device, name",
+    "rx": "receiving device, name",
+    "object": "what carries the receiver, name; empty where it stands",
+    "object_class": "its class",
+    "x_m": "position of the receiver in world axes, to the east [m]",
+    "y_m": "likewise, to the north [m]",
+    "z_m": "likewise, upwards [m]",
+    "valid": "whether a path reaches it",
+    "los": "whether the line of sight is free",
+    "paths": "number of paths",
+    "gain_db": "sum of |a|² over the paths [dB]",
+    "delay_s": "of the first path [s]",
+    "delay_spread_s": "square root of the second central moment of the power delay profile [s]",
+    "tx_beam": "of the best pair; of the pair that the agent chose it is link.tx_beam",
+    "rx_beam": "of the best pair; of the chosen one link.rx_beam",
+    "abs_y": "|y| of the best pair; of the chosen one link.abs_y",
+    "snr_db": "SNR of the best pair [dB]; of the chosen one link.snr, linear",
+}
+"""What each column of the users is, with its unit."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from caviar_clients.datasets.user_rows import Columns
+from caviar_clients.datasets.user_rows import Columns, check_batches
 
 try:
     from torch.utils.data import IterableDataset
@@ -39,6 +39,8 @@ class UserSamples:
         return len(self._users)
 
     def __getitem__(self, at: int) -> dict[str, Any]:
+        if not isinstance(at, int | np.integer):
+            raise TypeError(f"samples[{at!r}]: a position is a whole number; users are 0 to {len(self) - 1}")
         if not -len(self) <= at < len(self):
             raise IndexError(f"user {at} of {len(self)}")
         row = self._users[np.array([at])].read(self._names)
@@ -56,9 +58,13 @@ class UserBatches(IterableDataset):  # type: ignore[misc]  # it has no types
         names: Columns and recorded arrays, as of ``users[name]``.
         size: Users of a batch; the last one may have fewer.
         shuffle: Seed of the order; None: as they are (`Users.batches`).
+
+    Raises:
+        ValueError: A batch would have no user, or ``shuffle`` is no number.
     """
 
     def __init__(self, users: Users, names: Sequence[str], size: int, shuffle: int | None = None) -> None:
+        check_batches(size, shuffle)
         self._users, self._names, self._size, self._seed = users, tuple(names), size, shuffle
         self.epoch = 0
         """Set it before each pass over the data: every epoch has an order of its own."""

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from caviar_clients.datasets.rows import USER_COLUMNS
+from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, SetupError, suggestion
 from caviar_protocol.host import install_command
 from caviar_protocol.recording.arrays import TopicArrays
@@ -24,6 +26,7 @@ _DTYPES: dict[type, Any] = {int: np.int64, float: np.float64, bool: np.bool_, st
 _NONE: dict[type, Any] = {int: -1, float: np.nan}
 SENSORS = ("lidar", "camera", "depth", "segmentation")
 """Topics with a row for each sensor: a user has the one on its own object, or that of all."""
+_WITH_USERS = ("channel", "link", *SENSORS)
 
 
 class Columns(Mapping[str, NDArray[Any]]):
@@ -101,8 +104,9 @@ class Users:
         return len(self._table)
 
     def __repr__(self) -> str:
-        lines = [f"{len(self)} users of {self._dataset.location}", f"  columns: {', '.join(self._table)}"]
-        lines += [f"  {name}: {doc}" for name, doc in self.recorded().items()]
+        about = {name: USER_COLUMNS.get(name, "") for name in self._table} | self.recorded()
+        lines = [f"{counted(len(self), 'user')} of {self._dataset.location}"]
+        lines += [f"  {name}: {text}" for name, text in about.items()]
         return "\n".join(lines)
 
     def recorded(self) -> dict[str, str]:
@@ -113,16 +117,31 @@ class Users:
         return {
             f"{topic}.{name}": f"{column.doc} [{column.unit}], {column.dtype.name}, {list(column.shape)}"
             for topic in topics
-            if topic in SENSORS or topic in ("channel", "link")
+            if topic in _WITH_USERS
             for name, column in TOPIC_ARRAYS[topic].columns.items()
         }
 
-    def __getitem__(self, name: str | slice | NDArray[Any]) -> Any:
-        """A column, a recorded array, or with a slice, a mask or positions these users only."""
-        if not isinstance(name, str):
-            rows = np.arange(len(self))[name]
-            return Users(self._dataset, self._table.where(rows))
-        return self.read([name])[name]
+    def __getitem__(self, name: str | slice | Sequence[int] | NDArray[Any]) -> Any:
+        """A column, a recorded array, or with a slice, a mask or positions these users only.
+
+        Raises:
+            RecordingError: There is no such name, or it was not recorded.
+            IndexError: There are no such users, or the mask has another length.
+            TypeError: It is the position of one user: ``users[3:4]`` are users, ``users["rx"][3]`` is a value.
+        """
+        if isinstance(name, str):
+            return self.read([name])[name]
+        has = f"users are 0 to {len(self) - 1}" if len(self) else "there are no users here"
+        if isinstance(name, int | np.integer) and not isinstance(name, bool):
+            raise TypeError(
+                f"users[{name}] is one user: write users[{name}:{name + 1 or None}] for that one alone, or "
+                f"users['rx'][{name}] for a value; {has}"
+            )
+        try:
+            rows = np.arange(len(self))[name if isinstance(name, slice) else np.asarray(name)]
+        except IndexError as error:
+            raise IndexError(f"users[{_shown(name)}]: {error}; {has}, as a slice, list or mask") from None
+        return Users(self._dataset, self._table.where(rows))
 
     def read(self, names: Sequence[str]) -> Columns:
         """Read several columns and recorded arrays at once, each scene once.
@@ -136,7 +155,9 @@ class Users:
 
         Raises:
             RecordingError: There is no such name, or it was not recorded; a user's object has no such sensor.
+            ValueError: ``names`` is no list of names.
         """
+        self.check_names(names)
         columns = {name: self._table[name] for name in names if "." not in name}
         recorded = [name for name in names if "." in name]
         rows = self._recorded(recorded) if recorded else {}
@@ -152,10 +173,12 @@ class Users:
                 them, so that what is read together lies together.
 
         Raises:
-            ValueError: A part would have no user.
+            RecordingError: There is no such name.
+            ValueError: A part would have no user, ``names`` is no list of names, or ``shuffle`` no number.
         """
-        for part in self.parts(size, shuffle=shuffle):
-            yield part.read(names)
+        self.check_names(names)
+        parts = self.parts(size, shuffle=shuffle)
+        return (part.read(names) for part in parts)  # no generator itself: what is wrong is said at once
 
     def parts(self, size: int, *, shuffle: int | None = None) -> list[Users]:
         """The parts that `batches` reads, in the same order; nothing is read.
@@ -165,10 +188,9 @@ class Users:
             shuffle: As of `batches`.
 
         Raises:
-            ValueError: A part would have no user.
+            ValueError: A part would have no user, or ``shuffle`` is no number.
         """
-        if size < 1:
-            raise ValueError(f"a batch has at least 1 user, got {size}")
+        check_batches(size, shuffle)
         order = np.arange(len(self)) if shuffle is None else self._shuffled(shuffle)
         return [self[order[start : start + size]] for start in range(0, len(order), size)]
 
@@ -179,8 +201,11 @@ class Users:
             names: Columns and recorded arrays of a sample.
 
         Raises:
+            RecordingError: There is no such name.
             SetupError: PyTorch is not installed; the text has the command.
+            ValueError: ``names`` is no list of names.
         """
+        self.check_names(names)
         _require_torch()
         from caviar_clients.datasets.torch_data import UserSamples
 
@@ -195,12 +220,42 @@ class Users:
             shuffle: Seed of the order; None: as they are.
 
         Raises:
+            RecordingError: There is no such name.
             SetupError: PyTorch is not installed; the text has the command.
+            ValueError: As of `batches`.
         """
+        self.check_names(names)
+        check_batches(size, shuffle)
         _require_torch()
         from caviar_clients.datasets.torch_data import UserBatches
 
         return UserBatches(self, names, size, shuffle)
+
+    def check_names(self, names: Sequence[str]) -> None:
+        """Check names of columns and of recorded arrays, without reading one.
+
+        Args:
+            names: As of `read`.
+
+        Raises:
+            RecordingError: There is no such name; the text has the near ones.
+            ValueError: It is no list of names, or an empty one.
+        """
+        if isinstance(names, str):
+            raise ValueError(f"names is {names!r}: write a list of names, as [{names!r}]")
+        if not len(names):
+            raise ValueError(f"names is {names!r}: name a column at least; known: {', '.join(self._table)}")
+        for name in names:
+            topic, dot, field = name.partition(".")
+            if not dot:
+                self._table[name]  # which raises
+            elif topic not in _WITH_USERS:
+                raise RecordingError(
+                    f"{name!r}: {topic!r} has no row for each user; {suggestion(topic, _WITH_USERS)} Other "
+                    "topics: dataset.episode(NUMBER)[TOPIC]"
+                )
+            elif field not in (columns := TOPIC_ARRAYS[topic].columns):
+                raise RecordingError(f"{topic} has no array {field!r}; {suggestion(field, columns)}")
 
     def _shuffled(self, seed: int) -> NDArray[np.int64]:
         draw = random.Random(seed)  # noqa: S311 - no secret
@@ -237,8 +292,6 @@ class Users:
         topic, _, field = name.partition(".")
         recording = self._dataset.episode(episode)
         arrays: TopicArrays[Any, Any] = recording[topic]
-        if field not in arrays.columns:
-            raise RecordingError(f"{topic} has no array {field!r}; {suggestion(field, arrays.columns)}")
         payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
         place = f"{recording.path}, scene {scene}"
         if payload is None:
@@ -265,6 +318,30 @@ class Users:
             f"{place}: {table['rx'][user]} has {len(own)} sensors of {topic} on its object, and {len(fixed)} "
             f"stand fixed: it takes one of either; read dataset.episode({table['episode'][user]})[{topic!r}]"
         )
+
+
+def check_batches(size: int, shuffle: int | None) -> None:
+    """Check the size of batches, and the seed of their order.
+
+    Args:
+        size: Users of a batch.
+        shuffle: Seed; None: none.
+
+    Raises:
+        ValueError: A batch would have no user, or the seed is no whole number.
+    """
+    if not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1:
+        raise ValueError(f"size is {size!r}: a batch has at least 1 user, write a whole number, as 64")
+    if shuffle is not None and (not isinstance(shuffle, int | np.integer) or isinstance(shuffle, bool)):
+        raise ValueError(
+            f"shuffle is {shuffle!r}: it is the seed of the order, write a whole number, as shuffle=1; None "
+            "leaves the users as they are"
+        )
+
+
+def _shown(value: object) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}…"
 
 
 def _require_torch() -> None:

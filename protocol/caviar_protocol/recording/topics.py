@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Payload
+from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording.arrays import Column, Rows, TopicArrays, payload_column
 from caviar_protocol.recording.scene import (
     CameraArrays,
@@ -145,6 +146,12 @@ def _wideband(field: str, carrier_field: str) -> Callable[[Any, Channel], Rows]:
     def rows(view: TopicArrays[Any, Any], channel: Channel) -> Rows:
         stored = {(part.carrier, part.tx, part.rx): part.h for part in getattr(channel, field)}
         has_bins = [getattr(carrier, carrier_field) for carrier in channel.carriers]
+        if not stored and not any(has_bins):
+            raise RecordingError(
+                f"{view.place} has no {field}: no carrier of the run has {carrier_field}; write "
+                f"{carrier_field} = … into [[carriers]] of the scenario and channel.{field} into `record` below "
+                "[run], and run again"
+            )
         found = [stored.get(pair) if has_bins[pair[0]] else _NO_BINS for pair in _pairs(channel)]
         return view.recorded(f"channel.{field}", found if stored else [None for _ in found[:1]])
 

@@ -212,4 +212,3 @@ def _distributions(module: str) -> tuple[str, ...]:
 @cache
 def _all_distributions() -> Mapping[str, list[str]]:
     return metadata.packages_distributions()
-
