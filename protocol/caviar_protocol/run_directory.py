@@ -106,14 +106,16 @@ def runs_below(folder: str | Path) -> str:
         folder: That was given.
 
     Returns:
-        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``, or what a dataset is looked at with; empty
+        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``, of a dataset one of its episodes; empty
         where it holds none.
     """
-    folder = Path(folder)
-    episodes = folder / "episodes" if (folder / "catalogue.sqlite").is_file() else folder
-    if first := min(episodes.glob("episode-*"), default=None):
-        dataset = folder if episodes != folder else folder.parent
-        return f"; it is a dataset: give an episode, as {first}, or caviar verify {dataset}"
+    for dataset in (Path(folder), Path(folder).parent):
+        first = min((dataset / "episodes").glob("episode-*"), default=None)
+        if first is not None and (dataset / "catalogue.sqlite").is_file():
+            return (
+                f"; {dataset} is a dataset: give an episode of it, as {first}; caviar verify {dataset} and "
+                f"caviar look {dataset} look at all"
+            )
     try:
         newest = newest_run(folder)
     except (RecordingError, OSError):

@@ -201,7 +201,7 @@ class Service(ABC, Generic[S]):
     extra: ClassVar[str] = ""
     """Extra of the distribution that brings the libraries of this service; empty: the base install does."""
     packages: ClassVar[tuple[str, ...]] = ()
-    """Distributions of which the version may change the products, beside NumPy and msgspec: a dataset that was
+    """Distributions whose versions may change the products, beside NumPy and msgspec: a dataset that was
     generated with others is another one (`caviar_services.recorder.provenance`)."""
     attributes_to_set: ClassVar[tuple[str, ...]] = ()
     """Class attributes that an implementation has to set; looked for when its class is loaded."""

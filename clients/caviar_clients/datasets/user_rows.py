@@ -127,7 +127,7 @@ class Users:
         Raises:
             RecordingError: There is no such name, or it was not recorded.
             IndexError: There are no such users, or the mask has another length.
-            TypeError: It is the position of one user: ``users[3:4]`` are users, ``users["rx"][3]`` is a value.
+            TypeError: It is the position of one user; ``users[3:4]`` are users, ``users["rx"][3]`` a value.
         """
         if isinstance(name, str):
             return self.read([name])[name]
@@ -155,7 +155,8 @@ class Users:
 
         Raises:
             RecordingError: There is no such name, or it was not recorded; a user's object has no such sensor.
-            ValueError: ``names`` is no list of names.
+            ValueError: ``names`` is empty.
+            TypeError: It is a text.
         """
         self.check_names(names)
         columns = {name: self._table[name] for name in names if "." not in name}
@@ -174,7 +175,8 @@ class Users:
 
         Raises:
             RecordingError: There is no such name.
-            ValueError: A part would have no user, ``names`` is no list of names, or ``shuffle`` no number.
+            ValueError: A part would have no user, ``names`` is empty, or ``shuffle`` no number.
+            TypeError: ``names`` is a text.
         """
         self.check_names(names)
         parts = self.parts(size, shuffle=shuffle)
@@ -203,7 +205,8 @@ class Users:
         Raises:
             RecordingError: There is no such name.
             SetupError: PyTorch is not installed; the text has the command.
-            ValueError: ``names`` is no list of names.
+            ValueError: ``names`` is empty.
+            TypeError: It is a text.
         """
         self.check_names(names)
         _require_torch()
@@ -222,7 +225,7 @@ class Users:
         Raises:
             RecordingError: There is no such name.
             SetupError: PyTorch is not installed; the text has the command.
-            ValueError: As of `batches`.
+            ValueError, TypeError: As of `batches`.
         """
         self.check_names(names)
         check_batches(size, shuffle)
@@ -239,10 +242,11 @@ class Users:
 
         Raises:
             RecordingError: There is no such name; the text has the near ones.
-            ValueError: It is no list of names, or an empty one.
+            ValueError: There is none.
+            TypeError: It is a text.
         """
         if isinstance(names, str):
-            raise ValueError(f"names is {names!r}: write a list of names, as [{names!r}]")
+            raise TypeError(f"names is {names!r}: write a list of names, as [{names!r}]")
         if not len(names):
             raise ValueError(f"names is {names!r}: name a column at least; known: {', '.join(self._table)}")
         for name in names:

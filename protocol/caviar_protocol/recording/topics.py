@@ -149,8 +149,8 @@ def _wideband(field: str, carrier_field: str) -> Callable[[Any, Channel], Rows]:
         if not stored and not any(has_bins):
             raise RecordingError(
                 f"{view.place} has no {field}: no carrier of the run has {carrier_field}; write "
-                f"{carrier_field} = … into [[carriers]] of the scenario and channel.{field} into `record` below "
-                "[run], and run again"
+                f"{carrier_field} = … into [[carriers]] of the scenario and channel.{field} into `record` "
+                "below [run], and run again"
             )
         found = [stored.get(pair) if has_bins[pair[0]] else _NO_BINS for pair in _pairs(channel)]
         return view.recorded(f"channel.{field}", found if stored else [None for _ in found[:1]])
