@@ -81,7 +81,8 @@ def generate_command(
         str, typer.Option(help="address of a Dask scheduler, tcp://HOST:8786, instead of own processes")
     ] = "",
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="remove the dataset that is in the folder first")
+        bool,
+        typer.Option("--overwrite", help="first delete the dataset that is there, with all its episodes"),
     ] = False,
 ) -> None:
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
@@ -142,17 +143,24 @@ def tables_command(
         str, typer.Option("--format", help="csv, or parquet, which DuckDB and pandas read")
     ] = "parquet",
     out: Annotated[
-        Path | None, typer.Option(help="folder of the files; by default tables in that of the dataset")
+        str | None,
+        typer.Option(
+            help="folder of the files; by default tables in that of the dataset, or in the cache of an address"
+        ),
     ] = None,
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
     from caviar_clients.datasets.catalogue import Catalogue
-    from caviar_clients.datasets.export import export_tables
+    from caviar_clients.datasets.export import check_out, export_tables
+    from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.remote import located
 
     require_known("--format", form, ("csv", "parquet"))
     if form == "parquet":
         require_installed("caviar tables --format parquet", ["datasets"])
+    if out is not None:
+        check_out(out)
+    check_level(dataset)
     directory, _ = located(dataset)
     catalogue, console = Catalogue(directory.catalogue), Console()
     for file in export_tables(catalogue, out or directory.tables, form):  # type: ignore[arg-type]
@@ -168,7 +176,9 @@ def look_command(
     """Write a page of a dataset: what it is, maps, histograms, samples, and how it was generated."""
     require_installed("caviar look", ["plot"])
     from caviar_clients.datasets.look.page import write_page
+    from caviar_clients.datasets.reader import check_level
 
+    check_level(dataset)
     console = Console()
     bar = progress_bar(console, transient=True)
     tasks: dict[str, Any] = {}
@@ -192,8 +202,10 @@ def verify_command(
     from rich.table import Column, Table
 
     from caviar_clients.cli.shared import write_json
+    from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.verify import as_rows, verify
 
+    check_level(dataset)
     console = Console()
     with progress_bar(console, MofNCompleteColumn(), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task("episodes", total=None)

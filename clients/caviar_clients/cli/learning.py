@@ -306,7 +306,7 @@ def swap_command(
     from caviar_broker.policies import awaited_outcome, offer_policy
     from caviar_clients.cli.remote import RUNS, newest_run
 
-    directory = run if run is not None else newest_run(RUNS)
+    directory = run if run is not None else newest_run(RUNS, f"caviar swap {policy} --run RUN")
     try:
         content = policy.read_bytes()
     except OSError as error:

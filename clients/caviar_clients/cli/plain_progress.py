@@ -14,7 +14,7 @@ EVERY_S = 30.0
 
 
 class PlainProgress(Progress):
-    """Prints how far the first task is every `EVERY_S`, also while nothing is reported.
+    """Prints how far the tasks are that have not ended, every `EVERY_S`, also while nothing is reported.
 
     Example:
         >>> bar = PlainProgress()
@@ -42,7 +42,9 @@ class PlainProgress(Progress):
 
     def _print(self) -> None:
         while not self._ended.wait(EVERY_S):
-            for task in self.tasks[:1]:
+            tasks = self.tasks
+            # Where all have ended, the work goes on with what has no task yet.
+            for task in [task for task in tasks if not task.finished] or tasks[-1:]:
                 print_line(self.console, line_of(task))
 
 

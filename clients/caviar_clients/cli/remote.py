@@ -150,15 +150,19 @@ def why_command(run: Path | None, console: Console) -> None:
         print_line(console, line)
 
 
-def newest_run(root: Path) -> Path:
+def newest_run(root: Path, command: str = "caviar why RUN") -> Path:
     """Find the run below a folder whose broker was started last and is still noted there.
+
+    Args:
+        root: The folder.
+        command: How a user names another run, for the error.
 
     Raises:
         RunError: No broker is noted below ``root``.
     """
     notes = [note for run in root.glob("*") if (note := RunDirectory(run).control_note).is_file()]
     if not notes:
-        raise RunError(f"no broker runs below {root.resolve()}; name the directory of a run: caviar why RUN")
+        raise RunError(f"no broker runs below {root.resolve()}; name the directory of a run: {command}")
     return max(notes, key=lambda note: note.stat().st_mtime_ns).parent
 
 

@@ -19,6 +19,7 @@ from caviar_clients.cli.shared import counted
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Report, Status
+from caviar_protocol.policies import REFUSED
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
@@ -153,6 +154,8 @@ class ReportTally:
         self._values: dict[tuple[str, str], Counter[str]] = {}
         self._last: dict[tuple[str, str], tuple[int, str]] = {}
         self._changes: Counter[tuple[str, str]] = Counter()
+        # Agents and what they could not serve, in the order in which they said so.
+        self._refused: dict[tuple[str, str], None] = {}
 
     def add(self, episode: int, reports: Iterable[Report]) -> None:
         """Count the reports of a frame. Frames come in their order.
@@ -169,6 +172,9 @@ class ReportTally:
                 self._frames_with[report.source, name] += bool(count)
             for name, value in report.decisions.items():
                 if name.startswith(STATE):
+                    continue
+                if name == REFUSED:  # it is said once, of a policy: no choice that every frame has
+                    self._refused[report.source, value] = None
                     continue
                 key = report.source, name
                 self._values.setdefault(key, Counter())[value] += 1
@@ -216,8 +222,8 @@ class ReportTally:
         )
 
     def warnings(self) -> list[str]:
-        """Warn of what the user probably did not mean: an agent without users in any frame, a device without
-        an object, paths that were dropped for values that are not finite, a key without effect."""
+        """Warn of what the user probably did not mean: a policy that an agent refused, an agent without users
+        in any frame, a device without an object, paths that were dropped for values that are not finite, a key without effect."""
         never, dropped, unmatched = [], [], []
         for (source, name), frames in sorted(self._frames_with.items()):
             prefix = next((prefix for prefix in _NEVER if name.startswith(prefix)), "")
@@ -241,7 +247,12 @@ class ReportTally:
                     f"{source}: {name.removeprefix(UNMATCHED_PREFIX)} had no effect: no object, class or "
                     "piece of scenery was called so in any frame"
                 )
-        return [*never, *dropped, *unmatched]
+        refused = [
+            f"{source} refused policy {value.partition(' ')[0][:12]}…, and stayed with the one that it had: "
+            f"{value.partition(' ')[2]}"
+            for source, value in self._refused
+        ]
+        return [*refused, *never, *dropped, *unmatched]
 
 
 class PacketTotals:

@@ -32,11 +32,7 @@ def export_tables(catalogue: Catalogue, folder: str | Path, form: Format) -> lis
         RunError: The folder is an address, a file is there that is no such table, or one cannot be written.
         SetupError: DuckDB, which writes Parquet, is not installed.
     """
-    if is_address(folder):
-        raise RunError(
-            f"tables are written to a folder of this machine, and {folder} is an address: give a folder, and "
-            "copy its files there"
-        )
+    check_out(folder)
     folder = Path(folder)
     names = (*TABLES, *MEASURED_TABLES)
     files = [folder / f"{name}.{form}" for name in names]
@@ -51,6 +47,22 @@ def export_tables(catalogue: Catalogue, folder: str | Path, form: Format) -> lis
         for name, file in zip(names, files, strict=True):
             _export(catalogue, name, Path(work), form).replace(file)
     return files
+
+
+def check_out(folder: str | Path) -> None:
+    """Check that tables can be written to a place, before the dataset is looked for.
+
+    Args:
+        folder: As of `export_tables`.
+
+    Raises:
+        RunError: It is an address, or empty.
+    """
+    if is_address(folder):
+        raise RunError(
+            f"tables are written to a folder of this machine, and {folder} is an address: give a folder, and "
+            "copy its files there"
+        )
 
 
 def _export(catalogue: Catalogue, name: str, folder: Path, form: Format) -> Path:

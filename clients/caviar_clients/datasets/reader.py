@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from caviar_clients.datasets.catalogue import TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.remote import is_address, located
+from caviar_clients.datasets.texts import counted
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.recording import Recording
@@ -45,7 +46,7 @@ class Dataset:
     Example:
         >>> data = Dataset("data/s008")  # doctest: +SKIP
         >>> data  # doctest: +SKIP
-        Dataset of data/s008: 2086 episodes, 2086 scenes
+        Dataset of data/s008: 2,086 episodes, 2,086 scenes
     """
 
     def __init__(self, path: str | Path, episodes: Iterable[int] | None = None) -> None:
@@ -68,7 +69,8 @@ class Dataset:
 
     def __repr__(self) -> str:
         scenes = int(self.table("episodes")["scenes"].sum()) if self.episodes else 0
-        return f"Dataset of {self.location}: {len(self)} episodes, {scenes} scenes"
+        counts = f"{counted(len(self), 'episode')}, {counted(scenes, 'scene')}"
+        return f"Dataset of {self.location}: {counts}"
 
     def __getstate__(self) -> dict[str, Any]:
         # Of processes that load in parallel each opens its own files.

@@ -14,6 +14,7 @@ import signal
 import warnings
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from difflib import get_close_matches
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -199,8 +200,8 @@ def check_folder(experiment: Experiment, root: Path) -> Path:
         changes = list(_differences(before.experiment, now.experiment))
         what = "; ".join(changes[:4]) or "the file of the scenario is another one"
         raise RunError(
-            f"{folder} was begun with other values: {what}. Give the experiment another name, or remove the "
-            "folder to train it anew"
+            f"{folder} was begun with other values: {what}. Put them back to go on with it; an experiment of "
+            "another name begins anew"
         )
     return folder
 
@@ -228,12 +229,17 @@ def _values(experiment: Experiment) -> dict[str, Any]:
 
 
 def _differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
-    """Each value that differs, by its key."""
+    """Each value that differs, by its key; of texts that are alike, what was probably meant."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for name in sorted({*before, *now}):
             yield from _differences(before.get(name), now.get(name), f"{key}.{name}" if key else name)
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        for at, (old, new) in enumerate(zip(before, now, strict=True)):
+            yield from _differences(old, new, f"{key}[{at}]")
     elif before != now:
-        yield f"{key} was {before!r} and is {now!r}"
+        is_near = isinstance(before, str) and isinstance(now, str) and get_close_matches(now, [before])
+        meant = f" (did you mean {before!r}?)" if is_near else ""
+        yield f"{key} was {before!r} and is {now!r}{meant}"
 
 
 # --- processes ------------------------------------------------------------------------------------------

@@ -1,9 +1,11 @@
 """What a run follows from beside its scenario: versions of packages, and code of classes that are not ours.
 
 A package counts where a service of the scenario computes with it (`Service.packages`): what else is installed
-changes neither a product nor a reproducible recording. CAVIAR itself counts by its version. Of a class that a scenario names ``module:Class``, or that another distribution registers, the source
-counts: the ``.py`` files of its package, or its module and the modules that it imports from the same places.
-Packages that such code imports count by their versions. Code that is loaded in other ways than ``import`` is
+changes neither a product nor a reproducible recording. CAVIAR itself counts by its version.
+
+Of a class that a scenario names ``module:Class``, or that another distribution registers, the source counts:
+its module or all ``.py`` files of its package, and likewise what they import that no distribution brings.
+What distributions bring of it counts by their versions. Code that is loaded in other ways than ``import`` is
 not seen.
 """
 
