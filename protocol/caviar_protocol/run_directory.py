@@ -106,8 +106,8 @@ def runs_below(folder: str | Path) -> str:
         folder: That was given.
 
     Returns:
-        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``, of a dataset an episode; empty where it
-        holds none.
+        ``"; it holds runs: give one, as runs/smoke-20261122-101500"``, of a dataset an episode; empty where
+        it holds none.
     """
     for dataset in (Path(folder), Path(folder).parent):
         first = min((dataset / "episodes").glob("episode-*"), default=None)

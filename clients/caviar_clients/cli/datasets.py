@@ -82,7 +82,7 @@ def generate_command(
     ] = "",
     overwrite: Annotated[
         bool,
-        typer.Option("--overwrite", help="first delete the dataset that is there, with all its episodes"),
+        typer.Option("--overwrite", help="first delete the dataset that is there with all its episodes"),
     ] = False,
 ) -> None:
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
@@ -145,7 +145,7 @@ def tables_command(
     out: Annotated[
         str | None,
         typer.Option(
-            help="folder of the files; by default tables in that of the dataset, or in the cache of an address"
+            help="folder of the files; by default tables in that of the dataset; of an address in the cache"
         ),
     ] = None,
 ) -> None:

@@ -223,7 +223,8 @@ class ReportTally:
 
     def warnings(self) -> list[str]:
         """Warn of what the user probably did not mean: a policy that an agent refused, an agent without users
-        in any frame, a device without an object, paths that were dropped for values that are not finite, a key without effect."""
+        in any frame, a device without an object, paths that were dropped for values that are not finite, a
+        key without effect."""
         never, dropped, unmatched = [], [], []
         for (source, name), frames in sorted(self._frames_with.items()):
             prefix = next((prefix for prefix in _NEVER if name.startswith(prefix)), "")
