@@ -142,3 +142,44 @@ def test_a_finished_run_is_not_resumed_and_stays_as_it_is(
 def test_what_nobody_sent_is_not_called_canonical() -> None:
     verdicts = conform("tcp://127.0.0.1:0", command="true", names=["canonical"], rules=Rules(timeout_s=1.0))
     assert [verdict.outcome for verdict in verdicts] == ["not applicable"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ("generate", "smoke", "--out", "s3:/bucket/x"),
+            "'s3:/bucket/x' is no address: write 's3://bucket/x'",
+        ),
+        (("generate", "smoke", "--out", "file:/data/x", "--overwrite"), "write 'file:///data/x'"),
+        (("generate", "smoke", "--out", ""), "give a folder, or an address as s3://bucket/name"),
+        (("generate", "S008", "--out", "d"), "there is no preset 'S008'; did you mean 's008'?"),
+        (("generate", "s08", "--out", "d"), "there is no preset 's08'; did you mean 's008'?"),
+        (
+            ("tables", "d", "--format", "csv", "--out", "s3://bucket/x"),
+            "s3://bucket/x is an address: give a",
+        ),
+        (("verify", "d/episodes/episode-000000"), "is the recording of an episode: its dataset is d;"),
+        (("look", "d/episodes"), "d/episodes is a part of a dataset: give d"),
+        (("tables", ".", "--format", "csv"), "is no dataset, it holds 1: give one of them, as d"),
+        (
+            ("inspect", "d"),
+            "d is a dataset: give an episode of it, as d/episodes/episode-000000;",
+        ),
+        (("swap", "policy.onnx"), "name the directory of a run: caviar swap policy.onnx --run RUN"),
+    ],
+)
+def test_a_mistake_about_datasets_or_policies_is_named_and_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments, words
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    episode = Path("d/episodes/episode-000000")
+    episode.mkdir(parents=True)
+    (episode / "recording-0000.mcap").write_bytes(b"")
+    Path("d/catalogue.sqlite").write_bytes(b"")
+    before = sorted(tmp_path.rglob("*"))
+    assert caviar(monkeypatch, *arguments) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert "Traceback" not in error
+    assert sorted(tmp_path.rglob("*")) == before

@@ -43,3 +43,20 @@ def test_what_has_no_end_is_counted() -> None:
     task = bar.add_task("frames", total=None)
     bar.update(task, completed=12)
     assert plain_progress.line_of(bar.tasks[0]) == "frames: 12"
+
+
+def test_every_task_that_has_not_ended_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a page with several parts, or a traffic before the episodes, not the first one for ever."""
+    output, ended = io.StringIO(), iter((False, True))
+    bar = plain_progress.PlainProgress(console=Console(file=output))
+    for name, done in (("traffic", 9), ("episodes", 2), ("scans", 0)):
+        bar.update(bar.add_task(name, total=9), completed=done)
+    bar._ended = threading.Event()
+    monkeypatch.setattr(bar._ended, "wait", lambda timeout: next(ended))
+    bar._print()
+    assert [line.partition(":")[0] for line in output.getvalue().splitlines()] == ["episodes", "scans"]
+    for task in bar.tasks:
+        bar.update(task.id, completed=9)
+    ended = iter((False, True))
+    bar._print()
+    assert output.getvalue().splitlines()[2:] == ["scans: 100 %"]

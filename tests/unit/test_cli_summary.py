@@ -12,9 +12,10 @@ from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
 from caviar_clients.cli.scenarios import new_scenario
-from caviar_clients.cli.summary import recorded_figures, summary_of
+from caviar_clients.cli.summary import ReportTally, recorded_figures, summary_of
 from caviar_clients.cli.summary_table import summary_table
 from caviar_protocol.errors import RunError
+from caviar_protocol.fields import Report
 from caviar_protocol.recording import Recording
 
 
@@ -117,3 +118,14 @@ def test_a_disk_that_fills_during_the_run_is_named_and_what_was_recorded_is_read
     recording = Recording(directory)
     assert not recording.complete
     assert len(recording) == len(recording["link"].abs_y) > 10
+
+
+def test_a_policy_that_was_refused_is_a_warning_and_no_choice_of_frames() -> None:
+    tally, served = ReportTally(), "3f" * 32
+    refused = {"policy": served, "policy.refused": f"{'ab' * 32} it has 3 inputs, not 2"}
+    for decisions in ({"policy": served}, refused, {"policy": served}):
+        tally.add(0, [Report(source="agent", decisions=decisions)])
+    assert tally.warnings() == [
+        "agent refused policy abababababab…, and stayed with the one that it had: it has 3 inputs, not 2"
+    ]
+    assert [(one.decision, one.frames) for one in tally.decisions()] == [("policy", {served: 3})]

@@ -145,6 +145,21 @@ def test_a_dataset_is_told_from_another_by_what_its_bytes_follow_from() -> None:
     assert list(differences(same, other)) == ["scenario.run.seed was 1, is 7"]
 
 
+def test_topics_that_are_not_named_are_not_recorded(tmp_path: Path) -> None:
+    named = 'record = ["scene", "channel", "action", "link"]'
+    for names, topics in (
+        (["scene", "link"], ("link", "scene")),
+        ([], ("action", "channel", "link", "scene")),
+    ):
+        out = tmp_path / f"{len(names)}"
+        text = SMOKE.read_text().replace(named, f"record = {names}".replace("'", '"'), 1)
+        dataset(out, parse_scenario(text), episodes=1)
+        recording = Recording(DatasetDirectory(out).episode(0))
+        assert tuple(sorted(recording.topics)) == topics
+        assert {p.provenance.topic for frame in recording.frames() for p in frame.products} == {*topics}
+        assert recording.run_digest().damage == ()
+
+
 def test_an_estimate_has_a_part_for_the_episode_and_one_for_each_scene() -> None:
     trials = [Trial(9.0, scenes=(1, 3), wall_s=(1.0, 2.0), bytes=(1000, 3000))] * 2
     assert estimate(trials, episodes=10, scenes=5) == Estimate(wall_s=15.0, bytes=50_000)

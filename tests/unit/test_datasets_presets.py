@@ -80,6 +80,12 @@ def test_a_scenario_without_a_carrier_is_refused() -> None:
 def test_a_preset_that_is_misspelt_is_named() -> None:
     assert find_preset("s008") is PRESETS["s008"]
     assert find_preset("street-canyon") is None
+    assert find_preset("cell") is None
+    for name in ("s08", "S008", "s8", "s-008", "so08"):
+        with pytest.raises(
+            ScenarioError, match=f"no preset '{name}'; did you mean 's008'\\? presets: s001, s005"
+        ):
+            find_preset(name)
     with pytest.raises(ScenarioError, match="there is no preset 's009'; did you mean 's00"):
         find_preset("s009")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.export import export_tables
 from caviar_clients.datasets.plan import plan_dataset
-from caviar_clients.datasets.reader import Dataset
-from caviar_protocol.errors import RecordingError
+from caviar_clients.datasets.reader import Dataset, check_level
+from caviar_clients.datasets.remote import is_address
+from caviar_clients.datasets.rows import USER_COLUMNS
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.scenario import load_scenario
 
 EPISODES, SCENES, USERS = 6, 3, 2
@@ -120,11 +123,118 @@ def test_a_dataset_goes_to_another_process(folder: Path) -> None:
         (lambda data: data.table("user"), "no table 'user'; did you mean 'users'"),
         (lambda data: data.select([9]), "has no episode 9; it has 6: 0 to 5"),
         (lambda data: data.query("SELECT none FROM users"), "no such column: none"),
+        (lambda data: data.query("ATTACH 'other.sqlite' AS o"), "query\\(.*write one SELECT"),
+        (lambda data: data.query("-- c\n PRAGMA query_only = 0"), "write one SELECT"),
+        (lambda data: data.query("WITH x AS (SELECT 1) DELETE FROM users"), "readonly database"),
+        (lambda data: data.query("SELECT 1; ATTACH 'o' AS o"), "one statement at a time"),
+        (lambda data: data.episode(9), "has no episode 9 here; it has 6: 0 to 5"),
+        (lambda data: data.users().batches(4, ["x_n"]), "no column 'x_n'; did you mean 'x_m'"),
+        (
+            lambda data: data.users().torch(["chanel.h"]),
+            "'chanel' has no row for each user; did you mean 'chan",
+        ),
+        (
+            lambda data: data.users()["channel.hf"],
+            "no carrier of the run has subcarriers; write subcarriers = ",
+        ),
+        (lambda data: data.users()["channel.taps"], "no carrier of the run has taps; write taps = "),
     ],
 )
 def test_what_is_not_there_is_named(folder: Path, ask: object, words: str) -> None:
     with pytest.raises(RecordingError, match=words):
         ask(caviar.dataset(folder))  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("ask", "error", "words"),
+    [
+        (lambda data: data.users()[3], TypeError, "users[3] is one user: write users[3:4]"),
+        (lambda data: data.users()[0], TypeError, "users['rx'][0] for a value; users are 0 to 35"),
+        (lambda data: data.users()[[0, 36]], IndexError, "users[[0, 36]]: index 36 is out of bounds"),
+        (lambda data: data.users()[np.ones(3, bool)], IndexError, "users are 0 to 35, as a slice, list"),
+        (lambda data: data.select([1, 1]), ValueError, "episodes has 1 2 times: name each once"),
+        (lambda data: data.select(1), TypeError, "episodes is 1: write a list of numbers, as [1]"),
+        (lambda data: data.select([1.5]), TypeError, "episodes has 1.5: write whole numbers"),
+        (
+            lambda data: data.split(0.8),
+            TypeError,
+            "shares is 0.8: write a share for each part, as (0.8, 0.2)",
+        ),
+        (lambda data: data.split(()), ValueError, "shares are (): write positive numbers"),
+        (
+            lambda data: data.users().batches(64, "x_m"),
+            TypeError,
+            "names is 'x_m': write a list of names, as ['x",
+        ),
+        (
+            lambda data: data.users().batches(64, []),
+            ValueError,
+            "name a column at least; known: episode, scene",
+        ),
+        (lambda data: data.users().batches(0, ["x_m"]), ValueError, "size is 0: a batch has at least 1 user"),
+        (
+            lambda data: data.users().torch_batches(0, ["x_m"]),
+            ValueError,
+            "size is 0: a batch has at least 1",
+        ),
+        (lambda data: data.users().torch_batches(2.5, ["x_m"]), ValueError, "size is 2.5: a batch has at"),
+        (lambda data: data.users().torch("x_m"), TypeError, "names is 'x_m'"),
+        (
+            lambda data: data.users().batches(4, ["x_m"], shuffle=True),
+            ValueError,
+            "shuffle is True: it is the seed of the order, write a whole number, as shuffle=1",
+        ),
+    ],
+)
+def test_what_is_wrong_with_an_argument_is_said_at_once(
+    folder: Path, ask: object, error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=re.escape(words)):
+        ask(caviar.dataset(folder))  # type: ignore[operator]
+
+
+def test_a_query_makes_no_file(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = caviar.dataset(folder)
+    with pytest.raises(RecordingError):
+        data.query("/* c */ attach database 'made.sqlite' as made")
+    assert list(tmp_path.iterdir()) == []
+    text = "/* of */ -- all\n with x as (select count(*) as n from users) select n from x"
+    assert data.query(text)["n"].tolist() == [EPISODES * SCENES * USERS]
+
+
+def test_users_are_shown_with_what_each_column_is(folder: Path) -> None:
+    text = repr(caviar.dataset(folder).users()[:1])
+    assert text.startswith(f"1 user of {folder}\n")
+    assert "  delay_s: of the first path [s]\n" in text
+    assert "  tx_beam: of the best pair; of the pair that the agent chose it is link.tx_beam\n" in text
+    assert "  channel.tau: " in text
+    assert list(USER_COLUMNS) == list(columns_of("users"))
+
+
+def test_the_folder_of_another_level_names_that_of_the_dataset(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    name = folder.name
+    episode = f"{name}/episodes/episode-000002"
+    with pytest.raises(
+        RecordingError, match=f"{episode} is the recording of an episode: its dataset is {name};"
+    ):
+        Dataset(episode)
+    for part in (f"{name}/episodes", f"{name}/catalogue.sqlite"):
+        with pytest.raises(RecordingError, match=f"{part} is a part of a dataset: give {name}$"):
+            check_level(part)
+    with pytest.raises(RecordingError, match=r"is no dataset, it holds \d+: give one of them, as "):
+        check_level(folder.parent)
+    check_level(folder)
+    check_level(tmp_path / "nothing")  # of which the catalogue says that it is not there
+    for place in (name, f"{name}/episodes"):
+        words = (
+            f"{name} is a dataset: give an episode of it, as {name}/episodes/episode-000000; caviar verify"
+        )
+        with pytest.raises(RecordingError, match=words):
+            caviar.open(place)
 
 
 def test_a_folder_without_a_catalogue_is_no_dataset(tmp_path: Path) -> None:
@@ -155,6 +265,69 @@ def test_tables_are_exported_without_loss(folder: Path, tmp_path: Path, form: st
             found = duckdb.read_parquet(str(tmp_path / f"{name}.parquet"))
             assert tuple(found.columns) == columns
             assert found.fetchall() == rows
+
+
+def test_tables_tell_an_empty_text_from_no_value_and_leave_other_files(folder: Path, tmp_path: Path) -> None:
+    import duckdb
+
+    catalogue = Catalogue(tmp_path / "catalogue.sqlite", writable=True)
+    for number, error in enumerate(("", 'a "b", c\r\nd', "NULL", "\\N")):
+        catalogue.add_failure(number, "2026-11-24", error, "")
+    notes = tmp_path / "t" / "notes.csv"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    for form in ("csv", "parquet", "csv", "parquet"):
+        export_tables(catalogue, tmp_path / "t", form)  # type: ignore[arg-type]
+    assert (
+        duckdb.read_parquet(str(tmp_path / "t" / "failures.parquet")).fetchall()
+        == catalogue.table("failures")[1]
+    )
+    assert (
+        (tmp_path / "t" / "failures.csv")
+        .read_text()
+        .startswith('episode,failed,error,host\n0,2026-11-24,"",""\n')
+    )
+    names = {f"{name}.{form}" for name in (*TABLES, *MEASURED_TABLES) for form in ("csv", "parquet")}
+    assert {file.name for file in notes.parent.iterdir()} == {*names, "notes.csv"}
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_a_file_of_the_user_is_not_replaced_by_a_table(folder: Path, tmp_path: Path, form: str) -> None:
+    catalogue = Catalogue(DatasetDirectory(folder).catalogue)
+    mine = tmp_path / f"users.{form}"
+    mine.write_text("name,age\nAda,36\n")
+    with pytest.raises(RunError, match=f"users.{form} is there, and is not the table users of a dataset"):
+        export_tables(catalogue, tmp_path, form)  # type: ignore[arg-type]
+    assert [file.name for file in tmp_path.iterdir()] == [mine.name]
+    assert mine.read_text() == "name,age\nAda,36\n"
+
+
+def test_tables_are_written_to_a_folder(folder: Path) -> None:
+    catalogue = Catalogue(DatasetDirectory(folder).catalogue)
+    with pytest.raises(RunError, match="s3://bucket/x is an address: give a folder"):
+        export_tables(catalogue, "s3://bucket/x", "csv")
+    with pytest.raises(RunError, match="write 's3://bucket/x', as text"):
+        export_tables(catalogue, Path("s3://bucket/x"), "csv")
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("s3:/bucket/x", "write 's3://bucket/x'"),
+        ("s3:bucket/x", "write 's3://bucket/x'"),
+        ("s3//bucket/x", "write 's3://bucket/x'"),
+        ("file:/data/x", "write 'file:///data/x'"),
+        ("", "give a folder, or an address as s3://bucket/name"),
+        ("  ", "give a folder, or an address as s3://bucket/name"),
+    ],
+)
+def test_an_address_that_lacks_something_is_no_folder(place: str, words: str, tmp_path: Path) -> None:
+    for ask in (is_address, caviar.dataset):
+        with pytest.raises(RunError, match=words):
+            ask(place)
+    assert not is_address("run:3/s3")
+    assert not is_address("./s3:/bucket")
+    assert is_address("file:///data/x")
 
 
 def test_an_episode_that_is_added_again_replaces_itself(folder: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from caviar_clients.learning import training
-from caviar_clients.learning.campaign import check_folder, reached, train_experiment
+from caviar_clients.learning.campaign import _differences, check_folder, reached, train_experiment
 from caviar_clients.learning.checkpoints import newest_checkpoint
 from caviar_clients.learning.events import EventFile, read_events
 from caviar_clients.learning.experiment import Experiment, parse_experiment
@@ -216,11 +216,23 @@ def test_a_folder_of_other_values_is_refused_with_the_values(short: Path, tmp_pa
     begin(wanted, tmp_path)
     begin(wanted, tmp_path)
     changed = experiment(short, 'name = "dqn"\nlearning_starts = 30')
-    with pytest.raises(RunError, match=r"algorithm\.learning_starts was 20 and is 30\. Give the experiment"):
+    with pytest.raises(
+        RunError, match=r"algorithm\.learning_starts was 20 and is 30\. Put them back"
+    ) as refused:
         check_folder(changed, tmp_path)
+    assert "remove" not in str(refused.value)
     short.write_text(short.read_text().replace("components = 3", "components = 2"))
     with pytest.raises(RunError, match="the file of the scenario is another one"):
         check_folder(wanted, tmp_path)
+
+
+def test_a_text_that_is_nearly_that_of_before_is_named() -> None:
+    before = {"environment": {"options": {"observe": ["aoa", "last_abs_y"], "reward": "abs_y"}}}
+    now = {"environment": {"options": {"observe": ["aoa", "lasst_abs_y"], "reward": "snr_db"}}}
+    assert list(_differences(before, now)) == [
+        "environment.options.observe[1] was 'last_abs_y' and is 'lasst_abs_y' (did you mean 'last_abs_y'?)",
+        "environment.options.reward was 'abs_y' and is 'snr_db'",
+    ]
 
 
 def test_a_folder_that_has_moved_with_its_scenario_is_gone_on_with(

@@ -76,12 +76,12 @@ def test_what_else_is_installed_changes_no_byte_and_stands_beside(
     """A recording and the settings of the dataset are the same; `measured.json` has the whole list."""
     plan = plan_dataset(load_scenario(SMOKE), episodes=1, scenes=2)
     before, found = plan.settings(), []
+    version, more = metadata.version, {"panda3d": "99.1", "duckdb": "99.2", "scipy": "99.3"}
+    everything = {**installed_versions(), **more}
     for name in ("one", "two"):
         if name == "two":
-            more = {**installed_versions(), "panda3d": "99.1", "duckdb": "99.2", "scipy": "99.3"}
-            monkeypatch.setattr("caviar_clients.datasets.episode.installed_versions", lambda: more)
-            monkeypatch.setattr("caviar_services.recorder.mcap.installed_versions", lambda: more)
-            version = metadata.version
+            monkeypatch.setattr("caviar_clients.datasets.episode.installed_versions", lambda: everything)
+            monkeypatch.setattr("caviar_services.recorder.mcap.installed_versions", lambda: everything)
             monkeypatch.setattr(metadata, "version", lambda name: more.get(name) or version(name))
         (tmp_path / name / "episodes").mkdir(parents=True)
         assert play_episode(EpisodeTask(plan.scenario, 0, str(tmp_path / name))).error == ""
@@ -210,5 +210,6 @@ end_header
 STREET = """<scene version="2.1.0">
 <bsdf type="itu-radio-material" id="mat-concrete">
 <string name="type" value="concrete"/><float name="thickness" value="0.1"/></bsdf>
-<shape type="ply" id="wall"><string name="filename" value="wall.ply"/><ref id="mat-concrete" name="bsdf"/></shape>
+<shape type="ply" id="wall"><string name="filename" value="wall.ply"/>
+<ref id="mat-concrete" name="bsdf"/></shape>
 </scene>"""

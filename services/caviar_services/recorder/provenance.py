@@ -110,13 +110,13 @@ def code_digests(scenario: Mapping[str, Any]) -> dict[str, str]:
 def _services(scenario: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     """Role, implementation and settings of each service, and of the models that an adaptive channel has."""
     for spec in scenario.get("services", {}).values():
-        if spec["use"] == REMOTE:
+        if spec.get("use", REMOTE) == REMOTE:
             continue
         settings = spec.get("settings", {})
         yield spec["role"], spec["use"], settings
-        reference = settings.get("reference")
-        for rung in (*settings.get("ladder", ()), *([reference] if isinstance(reference, Mapping) else ())):
-            yield "channel", rung.get("use", "sionna-rt"), rung.get("settings", {})
+        for rung in (*settings.get("ladder", ()), settings.get("reference")):
+            if isinstance(rung, Mapping):
+                yield "channel", rung.get("use", "sionna-rt"), rung.get("settings", {})
 
 
 def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
