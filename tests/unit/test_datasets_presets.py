@@ -110,6 +110,12 @@ def test_three_cameras_stand_beside_the_transmitter() -> None:
     assert scenario.services["camera"].use == "camera"
 
 
+def test_with_cameras_all_stays_recorded_where_no_topic_is_named() -> None:
+    base = load_scenario("canyon-mobile")
+    scenario = with_cameras(replace(base, run=replace(base.run, record=())))
+    assert set(scenario.run.record) == {"scene", "channel", "link", "action", "camera"}
+
+
 def test_cameras_need_a_transmitter_that_stands() -> None:
     base = load_scenario("canyon-mobile")
     flying = tuple(replace(d, on="vehicle.bus-1") if d.role == "tx" else d for d in base.devices)

@@ -17,6 +17,7 @@ from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.scenario.rules import with_overrides
 from caviar_services.drjit_setup import choose_variant
 from caviar_services.recorder.provenance import code_digests, used_versions
+from caviar_services.registry import load
 from caviar_services.world.scenery import scenery_assets
 
 FORMAT = 1
@@ -229,7 +230,14 @@ def with_cameras(scenario: Scenario) -> Scenario:
     services = dict(scenario.services)
     if not any(spec.use == "camera" for spec in services.values()):
         services["camera"] = ServiceSpec(role="sensors", use="camera", budget_ms=5000.0)
-    topics = tuple(dict.fromkeys((*scenario.run.record, "camera")))
+    # Where none is named all are recorded, and that shall stay so.
+    before = scenario.run.record or [
+        topic
+        for spec in scenario.services.values()
+        if spec.role != "sensors" and not spec.remote
+        for topic in load(spec.role, spec.use).outputs
+    ]
+    topics = tuple(dict.fromkeys((*before, "camera")))
     return replace(
         scenario,
         run=replace(scenario.run, record=topics),
