@@ -28,7 +28,8 @@ def scenario(**settings: dict[str, Any]) -> dict[str, Any]:
     services = {}
     for name, values in uses.items():
         role, _, use = name.partition("__")
-        services[name] = {"role": role, "use": use.replace("_", "-"), "settings": values}
+        use = use if ":" in use else use.replace("_", "-")
+        services[name] = {"role": role, "use": use, "settings": values}
     return {"services": services}
 
 
@@ -110,12 +111,10 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "helper_of_mine.py").write_text("BEAM = 1\n")
     (tmp_path / "msgspec_lookalike.py").write_text("import numpy\n")
     (tmp_path / "not_imported.py").write_text("")
-    package = tmp_path / "pack_of_mine" / "inner"
-    package.mkdir(parents=True)
-    (package.parent / "__init__.py").write_text("")
-    (package / "agents.py").write_text(AGENT.replace("Mine", "Theirs"))
+    (tmp_path / "pack_of_mine" / "inner").mkdir(parents=True)  # which has no __init__.py
+    (tmp_path / "pack_of_mine" / "__init__.py").write_text("")
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("agent_of_mine", "helper_of_mine", "pack_of_mine", "pack_of_mine.inner.agents"):
+    for name in ("agent_of_mine", "helper_of_mine", "msgspec_lookalike"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return tmp_path
 
@@ -144,12 +143,38 @@ def test_the_code_stands_in_recordings(own: Path) -> None:
     assert versions["code of agent_of_mine"] == plan.settings()["code"]["agent_of_mine"][:16]
 
 
-def test_all_files_of_a_package_count(own: Path) -> None:
+def test_what_a_module_of_a_package_imports_counts(own: Path) -> None:
     services = {"services": {"a": {"role": "agent", "use": "pack_of_mine.inner.agents:Theirs"}}}
+    package = own / "pack_of_mine"
+    (package / "inner" / "agents.py").write_text("from . import beams\nfrom ..shared import powers as p\n")
+    for name in ("inner/beams.py", "shared/__init__.py", "shared/powers.py", "inner/not_imported.py"):
+        (package / name).parent.mkdir(exist_ok=True)
+        (package / name).write_text("import numpy.linalg, json\n")
     before = code_digests(services)
-    assert list(before) == ["pack_of_mine"]
-    (own / "pack_of_mine" / "inner" / "more.py").write_text("")
-    assert code_digests(services) != before
+    assert list(before) == ["pack_of_mine.inner.agents"]
+    counted = []
+    for file in sorted(package.rglob("*.py")):
+        with file.open("a") as stream:
+            stream.write("# edited\n")
+        counted += [file.relative_to(package).as_posix()] if code_digests(services) != before else []
+        before = code_digests(services)
+    assert counted == [
+        "__init__.py", "inner/agents.py", "inner/beams.py", "shared/__init__.py", "shared/powers.py",
+    ]  # fmt: skip
+
+
+def test_modules_that_are_installed_count_by_the_version_of_what_brings_them(own: Path) -> None:
+    folder = own / "lib" / "site-packages"
+    folder.mkdir(parents=True)
+    before = code_digests(scenario(**{"agent__agent_of_mine:Mine": {}}))
+    (own / "helper_of_mine.py").rename(folder / "helper_of_mine.py")
+    sys.path.append(str(folder))
+    try:
+        moved = code_digests(scenario(**{"agent__agent_of_mine:Mine": {}}))
+        (folder / "helper_of_mine.py").write_text("BEAM = 2\n")
+        assert code_digests(scenario(**{"agent__agent_of_mine:Mine": {}})) == moved != before
+    finally:
+        sys.path.remove(str(folder))
 
 
 def test_a_rung_of_the_user_counts(own: Path) -> None:
@@ -161,7 +186,7 @@ def test_packages_that_code_of_the_user_imports_count_by_version(
     own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (own / "helper_of_mine.py").write_text("def f():\n    from yaml.nodes import Node\n    import json\n")
-    monkeypatch.setattr(provenance, "_all_distributions", lambda: {"yaml": ["PyYAML"], "numpy": ["numpy"]})
+    monkeypatch.setattr(provenance, "_distributions", lambda: {"yaml": ["PyYAML"], "numpy": ["numpy"]})
     version = metadata.version
     monkeypatch.setattr(metadata, "version", lambda name: "6.0" if name == "PyYAML" else version(name))
     services = {"services": {"a": {"role": "agent", "use": "agent_of_mine:Mine", "settings": {}}}}

@@ -19,6 +19,7 @@ from caviar_clients.datasets.estimate import Estimate, check_disk, estimate, try
 from caviar_clients.datasets.plan import DatasetPlan, differences
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import rows_of
+from caviar_clients.datasets.texts import counted
 from caviar_clients.datasets.traffic import SharedTraffic
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Recording
@@ -182,7 +183,7 @@ def _generate(
     there = {*catalogue.episodes(), *outcome.failed}
     if lost := [number for number in left if number not in there]:
         raise RunError(
-            f"{len(lost)} episodes ended without a result, episode {lost[0]} the first; the same command "
+            f"{counted(len(lost), 'episode')} ended without a result, episode {lost[0]} the first; the same command "
             "goes on with them"
         )
     return outcome
@@ -246,6 +247,6 @@ def _agree_with_recordings(ledger: _Ledger, observer: Observer) -> None:
         ledger.add_unlisted(number)
     if gone := sorted(listed - recorded):
         observer.note(
-            f"{len(gone)} recordings were removed, episode {gone[0]} the first: they are played again"
+            f"{counted(len(gone), 'recording')} removed, episode {gone[0]} the first: played again"
         )
         ledger.catalogue.forget(gone)

@@ -4,9 +4,9 @@ A package counts where a service of the scenario computes with it (`Service.pack
 changes neither a product nor a reproducible recording. CAVIAR itself counts by its version.
 
 Of a class that a scenario names ``module:Class``, or that another distribution registers, the source counts:
-its module or all ``.py`` files of its package, and likewise what they import that no distribution brings.
-What distributions bring of it counts by their versions. Code that is loaded in other ways than ``import`` is
-not seen.
+that of its module, and of all modules that this imports, and these in turn, as long as no other distribution
+brings them. What other distributions bring of it counts by their versions. Code that is loaded in other ways
+than ``import`` is not seen.
 """
 
 from __future__ import annotations
@@ -88,8 +88,7 @@ def code_digests(scenario: Mapping[str, Any]) -> dict[str, str]:
         scenario: As resolved, as plain values.
 
     Returns:
-        Digest by name of the top-level module or package; one that is not here, or has no source, is left
-        out.
+        Digest by name of the module; one that is not here, or has no source, is left out.
 
     Example:
         >>> code_digests({"services": {"agent": {"role": "agent", "use": "random", "settings": {}}}})
@@ -98,7 +97,7 @@ def code_digests(scenario: Mapping[str, Any]) -> dict[str, str]:
     found = {}
     for module in _own_modules(scenario):
         digest = hashlib.sha256()
-        for name, file in _sources(module):
+        for name, file in sorted(_sources(module).items()):
             data = file.read_bytes()
             # Name and length go in, too: code that moves from one file to the next is other code.
             digest.update(f"{name}\0{len(data)}\0".encode())
@@ -145,71 +144,99 @@ def _versions(names: Iterable[str]) -> dict[str, str]:
 
 
 def _own_modules(scenario: Mapping[str, Any]) -> list[str]:
-    """Top-level modules of classes that are none of this distribution, in order."""
+    """Modules of classes that are none of this distribution, in order."""
     found = set()
     for role, use, _ in _services(scenario):
         if f"{role}:{use}" not in BUILT_IN:
             target = use if ":" in use else registered().get(f"{role}:{use}", "")
-            found.add(target.partition(":")[0].partition(".")[0])
-    return sorted(found - OWN - {""})
+            found.add(target.partition(":")[0])
+    return sorted(name for name in found if name and _top(name) not in OWN)
 
 
-def _sources(module: str) -> list[tuple[str, Path]]:
-    """Name and file of the source of a module, and of what it imports that no distribution brings."""
+def _sources(module: str) -> dict[str, Path]:
+    """File of a module, and of what it imports that no distribution brings, by the names of the modules."""
     found: dict[str, Path] = {}
-    waiting, seen = [module], {module}
+    waiting = [module]
     while waiting:
-        for name, file in _files_of(waiting.pop()):
-            found[name] = file
-            for imported in sorted(_imports(file) - seen):
-                seen.add(imported)
-                if not _distributions(imported):
-                    waiting.append(imported)
-    return sorted(found.items())
+        name = waiting.pop()
+        if name in found or (file := _file_of(name)) is None:
+            continue
+        if _is_installed(file) and _top(name) != _top(module):
+            continue
+        found[name] = file
+        waiting += _imports(name, file)
+        waiting += _packages_of(name)
+    return found
 
 
-def _files_of(module: str) -> Iterator[tuple[str, Path]]:
-    """The ``.py`` files of a top-level module or package, by name; none where Python does not find it."""
+def _file_of(module: str) -> Path | None:
+    """The source of a module; None where Python does not find it, or it has none. Nothing is imported."""
+    loaded = getattr(sys.modules.get(module), "__file__", None)
+    if loaded:
+        return Path(loaded) if loaded.endswith(".py") else None
     try:
-        spec = importlib.util.find_spec(module)
+        spec = importlib.util.find_spec(_top(module))
     except (ImportError, ValueError):  # a module without a spec, as __main__
-        spec = None
+        return None
     if spec is None:
-        return
-    for folder in spec.submodule_search_locations or ():
-        for file in Path(folder).rglob("*.py"):
-            yield f"{module}/{file.relative_to(folder).as_posix()}", file
-    if not spec.submodule_search_locations and spec.origin and Path(spec.origin).is_file():
-        yield Path(spec.origin).name, Path(spec.origin)
+        return None
+    if spec.submodule_search_locations is None:
+        places = [Path(spec.origin)] if spec.origin and module == _top(module) else []
+    else:
+        _, *rest = module.split(".")
+        inside = [Path(folder, *rest) for folder in spec.submodule_search_locations]
+        places = [place for path in inside for place in (path / "__init__.py", path.with_suffix(".py"))]
+    return next((place for place in places if place.suffix == ".py" and place.is_file()), None)
 
 
-def _imports(file: Path) -> set[str]:
-    """Top-level modules that a source imports anywhere, without those of Python and of CAVIAR."""
+def _imports(module: str, file: Path) -> set[str]:
+    """Modules that a source imports anywhere, without those of Python and of CAVIAR.
+
+    Of ``from a import b`` both ``a`` and ``a.b``, which is perhaps a module.
+    """
     try:
         tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError):  # a file of a package that is never imported, or a compiled module
+    except (SyntaxError, ValueError):  # Python says so where it is imported
         return set()
-    found = set()
+    package = module.split(".") if file.name == "__init__.py" else module.split(".")[:-1]
+    found = set[str]()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found.update(alias.name.partition(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found.add(node.module.partition(".")[0])
-    return found - sys.stdlib_module_names - OWN
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            found.update((base, *(f"{base}.{alias.name}" for alias in node.names)))
+    return {name for name in found if _top(name) not in sys.stdlib_module_names | OWN | {""}}
+
+
+def _packages_of(module: str) -> list[str]:
+    """The packages that are imported with a module: ``a`` and ``a.b`` of ``a.b.c``."""
+    parts = module.split(".")
+    return [".".join(parts[:count]) for count in range(1, len(parts))]
 
 
 def _imported_distributions(modules: Iterable[str]) -> set[str]:
     """Distributions of which modules, or what they import, import something."""
-    imported = {name for module in modules for _, file in _sources(module) for name in _imports(file)}
-    return {distribution for name in imported for distribution in _distributions(name)}
-
-
-def _distributions(module: str) -> tuple[str, ...]:
-    """Names of the distributions that bring a top-level module."""
-    return tuple(sorted(set(_all_distributions().get(module, ()))))
+    imported = {
+        _top(name)
+        for module in modules
+        for source, file in _sources(module).items()
+        for name in _imports(source, file)
+    }
+    known = _distributions() if imported else {}
+    return {distribution for name in imported for distribution in known.get(name, ())}
 
 
 # Once a process: it reads the lists of files of everything that is installed.
 @cache
-def _all_distributions() -> Mapping[str, list[str]]:
+def _distributions() -> Mapping[str, list[str]]:
     return metadata.packages_distributions()
+
+
+def _is_installed(file: Path) -> bool:
+    return not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
+
+
+def _top(module: str) -> str:
+    return module.partition(".")[0]
