@@ -326,7 +326,7 @@ def test_a_dataset_at_an_address_has_the_bytes_of_a_folder(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "third-machine"))
     assert [(one.episode, one.what) for one in verify(address)] == [(3, "recording")]
     again = generate(scenario, address)
-    assert "1 recordings were removed, episode 3 the first" in again.stdout
+    assert "1 recording removed, episode 3 the first" in again.stdout
     assert list(verify(address)) == []
     other = generate(scenario, address, "--seed", "5")
     assert other.returncode == 1

@@ -286,7 +286,7 @@ def _dataset_above(path: Path) -> Path | None:
 
 def _numbers(episodes: Iterable[int]) -> tuple[int, ...]:
     if isinstance(episodes, str | bytes) or not isinstance(episodes, Iterable):
-        raise TypeError(f"episodes is {episodes!r}: write a list of numbers, as [{episodes}]")
+        raise TypeError(f"episodes is {episodes!r}: write a list of numbers, as [{episodes!r}]")
     found = list[int]()
     for number in episodes:
         try:
