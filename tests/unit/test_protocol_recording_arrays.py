@@ -131,14 +131,21 @@ def test_wideband_parts_are_there_for_carriers_that_have_them(tmp_path: Path) ->
     assert read.first_tap.tolist() == [[7, 6, 0, 0]]
 
 
-def test_a_wideband_part_that_was_not_recorded_is_asked_for_by_name(street: Path) -> None:
+def test_a_wideband_part_that_was_not_recorded_is_asked_for_by_name(street: Path, tmp_path: Path) -> None:
+    """Where no carrier could have it, `record` alone would not bring it."""
     rays = Recording(street)["channel"]
-    with pytest.raises(RecordingError, match=r"without channel\.hf: write it into `record`"):
+    with pytest.raises(RecordingError, match=r"no carrier of the run has subcarriers; write subcarriers = "):
         rays.hf  # noqa: B018
-    with pytest.raises(RecordingError, match=r"without channel\.taps: write it into `record`"):
+    with pytest.raises(RecordingError, match=r"no carrier of the run has taps; write taps = … into \[\[carr"):
         rays.first_tap  # noqa: B018
     assert "h: narrowband gain" in repr(rays)
     assert f"Here {rays.h.shape}" in repr(rays)
+    made, change = channel(0, 2), msgspec.structs.replace
+    wide = change(made, carriers=tuple(change(one, subcarriers=4, taps=2) for one in made.carriers))
+    record(tmp_path / "wide", [frame(0, product("channel", "rt", wide, 0))])
+    for name in ("hf", "taps"):
+        with pytest.raises(RecordingError, match=rf"without channel\.{name}: write it into `record`"):
+            getattr(Recording(tmp_path / "wide")["channel"], name)
 
 
 def test_several_carriers_are_users_of_their_own(tmp_path: Path) -> None:

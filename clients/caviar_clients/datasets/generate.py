@@ -183,8 +183,8 @@ def _generate(
     there = {*catalogue.episodes(), *outcome.failed}
     if lost := [number for number in left if number not in there]:
         raise RunError(
-            f"{counted(len(lost), 'episode')} ended without a result, episode {lost[0]} the first; the same command "
-            "goes on with them"
+            f"{counted(len(lost), 'episode')} ended without a result, episode {lost[0]} the first; the same "
+            "command goes on"
         )
     return outcome
 
@@ -246,7 +246,5 @@ def _agree_with_recordings(ledger: _Ledger, observer: Observer) -> None:
     for number in sorted(recorded - listed):
         ledger.add_unlisted(number)
     if gone := sorted(listed - recorded):
-        observer.note(
-            f"{counted(len(gone), 'recording')} removed, episode {gone[0]} the first: played again"
-        )
+        observer.note(f"{counted(len(gone), 'recording')} removed, episode {gone[0]} the first: played again")
         ledger.catalogue.forget(gone)
