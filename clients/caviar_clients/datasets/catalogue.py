@@ -100,12 +100,19 @@ class Catalogue:
     def settings(self) -> dict[str, Any]:
         """Settings of the dataset (`plan.DatasetPlan.settings`); empty where none were kept."""
         text = self._note("settings")
-        return msgspec.json.decode(text) if text else {}
+        try:
+            return msgspec.json.decode(text, type=dict[str, Any]) if text else {}
+        except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
+            raise RecordingError(f"{self.path}: settings in table dataset are not those of a dataset: {error}") from error
 
     @property
     def planned(self) -> int:
         """Episodes that the dataset shall have."""
-        return int(self._note("episodes") or 0)
+        text = self._note("episodes") or "0"
+        # Python refuses to read thousands of digits with an error of its own.
+        if not (text.isascii() and text.isdecimal() and len(text) < 20):
+            raise RecordingError(f"{self.path}: episodes in table dataset is {text!r:.80}: a number is needed")
+        return int(text)
 
     def plan(self, settings: Mapping[str, Any], episodes: int) -> None:
         """Keep the settings of the dataset, and how many episodes it shall have.

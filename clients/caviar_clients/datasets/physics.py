@@ -1,64 +1,63 @@
-"""What physics says about the scenes of a dataset, computed anew from positions, scenery and H."""
+"""What physics says about the scenes of a dataset, computed anew from positions, scenery and H.
+
+`path_checks` has what paths and H have to be, `beam_checks` beams and SNRs. Here stand lines of sight, reciprocity,
+and how objects move from one scene to the next.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.errors import AssetError
-from caviar_protocol.messages import GrantInput, Status
+from caviar_clients.datasets.beam_checks import BEAM, FROM_PATHS, User, arrays_fit, check_beams, check_snr
+from caviar_clients.datasets.findings import Finding
+from caviar_clients.datasets.path_checks import (
+    DELAY,
+    GAIN_DB,
+    Pair,
+    check_gains,
+    check_geometry,
+    check_matrix,
+    matrix_of,
+    pair_of,
+)
+from caviar_clients.datasets.recording_checks import lacking_assets
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.errors import AssetError, CaviarError
+from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
+from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import Boxes, Surfaces
-from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.link.beam_sweep import best_pairs, sweep
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_services.channel.propagation.patterns import Patterns
+from caviar_services.pattern_files import read_pattern
 from caviar_services.world.scenery import scenery_triangles
+
+__all__ = ["Finding", "PhysicsChecks"]
 
 T = TypeVar("T", Channel, Link)
 
-GAIN_DB = 0.5
-"""Of a line of sight from free space; air and foliage take no more over a street."""
-GREATEST_ELEMENT_DB = 8.0
-"""Gain of the strongest built-in element (3GPP TR 38.901, 8 dBi)."""
 TRACED = ("siso-rt", "spherical", "mimo-rt")
 """Rungs on which something can hide a line of sight."""
-DELAY = 1e-6
-"""Relative, of delays from lengths."""
-ANGLE_RAD = 1e-4
+POINTED = ("free-space", *TRACED)
+"""Rungs whose paths follow from their points."""
 ACCELERATION_M_S2 = 15.0
 JUMP_M = 0.5
 """Of an object between two scenes, beyond its velocity and that acceleration."""
 EDGE_M = 0.01
 """A line of sight that passes an edge within this may be decided either way."""
+WEAK = 1e-12
+"""Amplitude below which polarizations that do not match leave what rounding leaves."""
 BODY_SHARE = 0.4
 """Of the box of a vehicle, about its centre, which is inside of its mesh for sure."""
-BEAM = 1e-9
-"""Relative, of |y| from H."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that is wrong."""
-
-    episode: int
-    scene: int | None
-    """None: of the episode as a whole."""
-    user: str
-    """Receiver; empty: of the scene as a whole."""
-    what: str
-    expected: str
-    found: str
 
 
 class PhysicsChecks:
@@ -69,31 +68,41 @@ class PhysicsChecks:
         settings: Of the dataset.
     """
 
-    def __init__(self, assets: Path, settings: dict[str, Any]) -> None:
-        files = {str(file.relative_to(assets)): file for file in sorted(assets.rglob("*")) if file.is_file()}
+    def __init__(self, assets: Path, settings: Mapping[str, Any]) -> None:
+        self.files = {
+            file.relative_to(assets).as_posix(): file for file in sorted(assets.rglob("*")) if file.is_file()
+        }
+        """Of the dataset, by asset name."""
+        self.scenery_error = ""
+        """Why the scenery cannot be read; empty: it can, or there is none."""
         self._surfaces: Surfaces | None = None
         try:
-            triangles = scenery_triangles(dict(files))
-        except AssetError:
-            triangles = np.zeros((0, 3, 3))
+            triangles = scenery_triangles(dict(self.files))
+        except AssetError as error:
+            triangles, self.scenery_error = np.zeros((0, 3, 3)), str(error)
         if len(triangles):
             self._surfaces = Surfaces(triangles, outside=lambda number, normal: True)
-        self._free: FreeSpaceChannel | None = None
-        carriers = _carriers(settings)
-        if carriers:
-            run = RunInfo(name="free-space", carriers=carriers)
-            self._free = FreeSpaceChannel(FreeSpaceSettings(), run)
-            self._free.prepare(
-                Preparation(demand={"channel": frozenset()}, assets=files, producers={"scene": ("world",)})
-            )
+        self._carriers = _carriers(settings)
+        self._budget = _link_settings(settings)
+        self._patterns = Patterns()
+        try:
+            tables = {name: read_pattern(file) for name, file in self.files.items() if name.startswith(PATTERNS)}
+            self._patterns = Patterns(tables)
+        except CaviarError as error:
+            self.scenery_error = self.scenery_error or str(error)
 
     def episode(self, recording: Recording) -> Iterator[Finding]:
         """Check all scenes of an episode.
 
         Args:
             recording: Of the episode.
+
+        Raises:
+            RecordingError: A product cannot be read.
         """
         before: tuple[RecordedFrame, Scene] | None = None
+        assets = self.files.keys() | recording.assets.keys()
+        said: set[tuple[str, str]] = set()
         for frame in recording.frames():
             scene = frame.scene()
             if scene is None:
@@ -101,66 +110,67 @@ class PhysicsChecks:
             if before is not None:
                 yield from _continuity(*before, frame, scene)
             before = frame, scene
+            for name, asset in lacking_assets(scene, assets):
+                if (name, asset) not in said:  # in its first scene
+                    said.add((name, asset))
+                    what = f"file of {name}"
+                    yield Finding(frame.episode, frame.number, "", what, f"assets/{asset} in the dataset", "none")
             # A held product is that of an earlier scene, where it was looked at.
             for channel in _fresh(frame, "channel", Channel):
-                yield from self._channel(frame, scene, channel)
-                for link in _fresh(frame, "link", Link):
-                    yield from _beams(frame, scene, channel, link)
+                links = _fresh(frame, "link", Link)
+                yield from self._channel((frame.episode, frame.number), scene, channel, links)
 
-    def _channel(self, frame: RecordedFrame, scene: Scene, channel: Channel) -> Iterator[Finding]:
-        place = frame.episode, frame.number
-        devices = {device.name: device for device in scene.devices if isinstance(device, AntennaDevice)}
-        at = {
-            name: np.array(device_pose(scene, device).position)
-            for name, device in devices.items()
-            if name in (*channel.tx, *channel.rx)
-        }
-        free = self._free_space(frame, scene)
+    def _channel(
+        self, place: tuple[int, int], scene: Scene, channel: Channel, links: list[Link]
+    ) -> Iterator[Finding]:
+        carriers = [(carrier.name, carrier.frequency_hz) for carrier in channel.carriers]
+        if self._carriers and carriers != [(c.name, c.frequency_hz) for c in self._carriers]:
+            expected = ", ".join(f"{c.name} at {c.frequency_hz:g} Hz" for c in self._carriers)
+            found = ", ".join(f"{name} at {frequency:g} Hz" for name, frequency in carriers)
+            yield Finding(*place, "", "carriers of the channel", expected, found)
+            return
+        recorded = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
+        matrices: dict[User, tuple[Complex128Array, float]] = {}
+        for pair in self._pairs(place, scene, channel):
+            yield from self._sight(pair, scene)
+            yield from _paths(pair)
+            for c, carrier in enumerate(channel.carriers):
+                user = carrier.name, channel.tx[pair.tx], pair.user
+                h = recorded.get((c, pair.tx, pair.rx))
+                if h is not None:
+                    yield from check_matrix(pair, c, h)
+                    if arrays_fit(h, pair.ends[0].array, pair.ends[1].array):
+                        matrices[user] = h, BEAM
+                elif channel.rung in PLANE_WAVES and (summed := matrix_of(pair, c)) is not None:
+                    matrices[user] = summed, FROM_PATHS
+        yield from _reciprocity(place, channel)
+        for link in links:
+            yield from check_beams(place, scene, link, matrices)
+            if self._budget is not None:
+                yield from check_snr(place, scene, link, channel.carriers, self._budget)
+
+    def _pairs(self, place: tuple[int, int], scene: Scene, channel: Channel) -> Iterator[Pair]:
+        """All pairs of two devices of the scene."""
+        antennas: dict[str, Antenna] = {}
+        for device in scene.devices:
+            if isinstance(device, AntennaDevice) and device.name in (*channel.tx, *channel.rx):
+                pattern = device.array.pattern_file
+                if not pattern or pattern in self.files:
+                    antennas[device.name] = Antenna.of(scene, device, self._patterns)
         for t, tx in enumerate(channel.tx):
             for r, rx in enumerate(channel.rx):
-                if tx == rx or tx not in at or rx not in at:
-                    continue
-                cut = _cut(channel, t, r)
-                yield from self._sight(place, scene, channel, (t, r), at[tx], at[rx])
-                if channel.rung == "geometric":  # it draws its paths
-                    continue
-                bound = _bound_db(devices[tx]) + _bound_db(devices[rx])
-                yield from _lengths(place, channel, cut, rx, at[tx], at[rx], bound)
-                if free is not None and free.tx == channel.tx and free.rx == channel.rx:
-                    yield from _line_of_sight(place, channel, free, t, r)
-        yield from _reciprocity(place, channel)
+                if tx != rx and tx in antennas and rx in antennas:
+                    yield pair_of(place, scene, channel, (t, r), (antennas[tx], antennas[rx]))
 
-    def _free_space(self, frame: RecordedFrame, scene: Scene) -> Channel | None:
-        """The channel of the same scene without anything but antennas."""
-        if self._free is None:
-            return None
-        item = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=frame.number)
-        step = Frame(
-            episode=frame.episode,
-            number=frame.number,
-            t_ns=frame.t_ns,
-            inputs=(FrameInput(item, *encode_payload(scene)),),
-        )
-        found = self._free.step(step).products["channel"]
-        return found if isinstance(found, Channel) else None
-
-    def _sight(
-        self,
-        place: tuple[int, int],
-        scene: Scene,
-        channel: Channel,
-        pair: tuple[int, int],
-        start: Float64Array,
-        end: Float64Array,
-    ) -> Iterator[Finding]:
+    def _sight(self, pair: Pair, scene: Scene) -> Iterator[Finding]:
         """A line of sight that is hidden for sure and said to be free, or the other way round."""
-        if channel.rung not in TRACED:
+        if pair.channel.rung not in TRACED:
             return
-        is_free = bool(channel.los[pair])
-        hidden = self._hidden(scene, start, end)
+        is_free = bool(pair.channel.los[pair.tx, pair.rx])
+        hidden = self._hidden(scene, pair.ends[0].position, pair.ends[1].position)
         if hidden is not None and hidden == is_free:
             words = {True: "free", False: "hidden"}
-            yield Finding(*place, channel.rx[pair[1]], "line of sight", words[not is_free], words[is_free])
+            yield pair.finding("line of sight", words[not is_free], words[is_free])
 
     def _hidden(self, scene: Scene, start: Float64Array, end: Float64Array) -> bool | None:
         """Whether something stands between two points; None where that is a matter of `EDGE_M`, or of the
@@ -201,7 +211,7 @@ def _fresh(frame: RecordedFrame, topic: str, cls: type[T]) -> list[T]:
     ]
 
 
-def _carriers(settings: dict[str, Any]) -> tuple[Carrier, ...]:
+def _carriers(settings: Mapping[str, Any]) -> tuple[Carrier, ...]:
     """The carriers of a dataset; none where the settings are not of this version."""
     try:
         return msgspec.convert(settings.get("scenario", {}).get("carriers", ()), tuple[Carrier, ...])
@@ -209,77 +219,57 @@ def _carriers(settings: dict[str, Any]) -> tuple[Carrier, ...]:
         return ()
 
 
-def _bound_db(device: AntennaDevice) -> float:
-    """Greatest gain of an element [dB]; without a bound where a file says it."""
-    return math.inf if device.array.pattern_file else GREATEST_ELEMENT_DB
+def _link_settings(settings: Mapping[str, Any]) -> dict[str, float] | None:
+    """Noise figure and temperature of the shipped links; None where another link made the SNRs, or several did."""
+    services = settings.get("scenario", {}).get("services", {})
+    links = [spec for spec in services.values() if spec.get("role") == "link"]
+    if len(links) != 1 or links[0].get("use") not in ("beams", "cell"):
+        return None
+    given = links[0].get("settings", {})
+    names = ("noise_figure_db", "temperature_k")
+    return {name: given[name] for name in names if isinstance(given.get(name), int | float)}
 
 
-def _cut(channel: Channel, t: int, r: int) -> slice:
-    pair = t * len(channel.rx) + r
-    return slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
+def _paths(pair: Pair) -> Iterator[Finding]:
+    """Paths that do not follow from their points, or that bring too much."""
+    channel = pair.channel
+    if channel.rung in POINTED:
+        yield from check_geometry(pair)
+        yield from check_gains(pair)
+        yield from _line_of_sight(pair)
+    elif channel.rung != "geometric":  # which draws its paths
+        tau, (start, end) = channel.tau[pair.cut], (antenna.position for antenna in pair.ends)
+        least = float(np.linalg.norm(end - start)) / SPEED_OF_LIGHT
+        if len(tau) and tau.min() < least * (1 - DELAY):
+            yield pair.finding("delay", f"at least {least:.9g} s", f"{tau.min():.9g} s")
 
 
-def _lengths(
-    place: tuple[int, int],
-    channel: Channel,
-    cut: slice,
-    rx: str,
-    start: Float64Array,
-    end: Float64Array,
-    bound: float,
-) -> Iterator[Finding]:
-    """Paths shorter than the straight line, or stronger than free space over their length."""
-    tau = channel.tau[cut]
-    if not len(tau):
+def _line_of_sight(pair: Pair) -> Iterator[Finding]:
+    """A free line of sight without a direct path, or with one that is weaker than in free space."""
+    channel, (tx, rx), options = pair.channel, pair.ends, pair.channel.options
+    distance = float(np.linalg.norm(rx.position - tx.position))
+    # Nearer than a wavelength far-field gains do not hold, and there is no path.
+    if distance * min(carrier.frequency_hz for carrier in channel.carriers) < SPEED_OF_LIGHT:
         return
-    least = float(np.linalg.norm(end - start)) / SPEED_OF_LIGHT
-    if tau.min() < least * (1 - DELAY):
-        yield Finding(*place, rx, "delay", f"at least {least:.9g} s", f"{tau.min():.9g} s")
-    for c, carrier in enumerate(channel.carriers):
-        friis = SPEED_OF_LIGHT / carrier.frequency_hz / (4 * math.pi * SPEED_OF_LIGHT * tau)
-        over = 20 * np.log10(np.maximum(np.abs(channel.a[c, cut]), 1e-300) / friis)
-        if over.max() > bound + GAIN_DB:
-            yield Finding(
-                *place, rx, "path gain", f"at most {bound:.1f} dB above free space", f"{over.max():.1f} dB"
-            )
-
-
-def _line_of_sight(
-    place: tuple[int, int], channel: Channel, free: Channel, t: int, r: int
-) -> Iterator[Finding]:
-    """A direct path that is not that of free space: delay, directions, gain."""
-    cut, right = _cut(channel, t, r), _cut(free, t, r)
-    types = channel.interactions[cut]
-    direct = np.flatnonzero(~types.any(axis=1)) if types.shape[1:] and types.size else np.arange(len(types))
-    if right.stop == right.start:
-        return
-    rx = channel.rx[r]
+    direct = np.flatnonzero(~channel.interactions[pair.cut].any(axis=1))
     if not len(direct):
-        if channel.los[t, r] and channel.options.los:
-            yield Finding(*place, rx, "line of sight", "a direct path", "none")
+        if channel.los[pair.tx, pair.rx] and options.los:
+            yield pair.finding("line of sight", "a direct path", "none")
         return
-    path, line = cut.start + int(direct[0]), right.start
-    if not math.isclose(channel.tau[path], free.tau[line], rel_tol=DELAY):
-        yield Finding(*place, rx, "delay", f"{free.tau[line]:.9g} s", f"{channel.tau[path]:.9g} s")
+    if options.foliage or options.blockage or options.absorption_db_per_km:
         return
-    for name in ("aod", "aoa"):
-        got, expected = getattr(channel, name)[path], getattr(free, name)[line]
-        turned = np.abs(np.angle(np.exp(1j * (got - expected))))
-        if turned.max() > ANGLE_RAD and math.sin(float(expected[0])) > ANGLE_RAD:
-            yield Finding(*place, rx, name, _angles(expected), _angles(got))
+    if not tx.array.is_uniform or not rx.array.is_uniform:
+        return
+    along = pair.geometry.departure[direct[:1]]
+    # Friis 1946, with the mismatch of both polarizations.
+    element = abs(complex((tx.radiated(along) * rx.radiated(-along)).sum()))
     for c, carrier in enumerate(channel.carriers):
-        ratio = 20 * math.log10(max(abs(channel.a[c, path]), 1e-300) / max(abs(free.a[c, line]), 1e-300))
-        options = channel.options
-        lossy = bool(options.foliage or options.blockage or options.absorption_db_per_km)
-        is_wrong = ratio > GAIN_DB or (ratio < -GAIN_DB and not lossy)
-        if is_wrong and abs(free.a[c, line]) > 1e-30:
-            expected_db = 20 * math.log10(abs(free.a[c, line]))
-            what = f"gain of the line of sight, {carrier.name}"
-            yield Finding(*place, rx, what, f"{expected_db:.2f} dB", f"{expected_db + ratio:.2f} dB")
-
-
-def _angles(pair: Float64Array) -> str:
-    return ", ".join(f"{math.degrees(angle):.2f}°" for angle in pair.tolist())
+        free = element * SPEED_OF_LIGHT / carrier.frequency_hz / (4 * math.pi * distance)
+        found = abs(channel.a[c, pair.cut][direct[0]])
+        if free > WEAK and found < free * 10 ** (-GAIN_DB / 20):
+            expected = f"{20 * math.log10(free):.2f} dB"
+            got = f"{20 * math.log10(found):.2f} dB" if found else "0"
+            yield pair.finding(f"gain of the line of sight, {carrier.name}", expected, got)
 
 
 def _reciprocity(place: tuple[int, int], channel: Channel) -> Iterator[Finding]:
@@ -294,32 +284,6 @@ def _reciprocity(place: tuple[int, int], channel: Channel) -> Iterator[Finding]:
                 yield Finding(
                     *place, rx, f"H from and to {tx}", "transposes of each other", f"{worst:.2g} apart"
                 )
-
-
-def _beams(frame: RecordedFrame, scene: Scene, channel: Channel, link: Link) -> Iterator[Finding]:
-    """Best pairs of beams that are not those of H."""
-    arrays = {device.name: device.array for device in antennas(scene, "tx")}
-    arrays |= {device.name: device.array for device in antennas(scene, "rx")}
-    names = [carrier.name for carrier in channel.carriers]
-    h = {(names[m.carrier], channel.tx[m.tx], channel.rx[m.rx]): m.h for m in channel.h}
-    for row, user in enumerate(zip(link.carrier, link.tx, link.rx, strict=True)):
-        matrix = h.get(user)
-        if matrix is None or not link.has_path[row] or not link.top_abs_y.shape[1]:
-            continue
-        _, tx, rx = user
-        best = best_pairs(sweep(matrix[None], arrays[tx], arrays[rx]), 1)
-        expected = int(best.tx_beam[0, 0]), int(best.rx_beam[0, 0]), float(best.abs_y[0, 0])
-        found = int(link.top_tx_beam[row, 0]), int(link.top_rx_beam[row, 0]), float(link.top_abs_y[row, 0])
-        same = math.isclose(expected[2], found[2], rel_tol=BEAM)
-        if expected[:2] != found[:2] or not same:
-            yield Finding(
-                frame.episode,
-                frame.number,
-                rx,
-                "best pair of beams",
-                f"TX {expected[0]}, RX {expected[1]}, |y| {expected[2]:.6g}",
-                f"TX {found[0]}, RX {found[1]}, |y| {found[2]:.6g}",
-            )
 
 
 def _continuity(

@@ -1,27 +1,36 @@
 """Verification of a dataset: what is missing, altered, or does not follow from physics.
 
-`verify` compares files with the catalogue, and `physics` the content of each scene with what is computed anew
-from positions, scenery and H.
+`verify` compares files with the catalogue (`catalogue_checks`), looks at what each recording has to have
+(`recording_checks`), and at the content of each scene, computed anew from positions, scenery and H (`physics`).
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from caviar_clients.datasets.catalogue import TABLES, Catalogue
+from caviar_clients.datasets.catalogue import MEASURED_TABLES, Catalogue
+from caviar_clients.datasets.catalogue_checks import (
+    against_recording,
+    check_structure,
+    impossible_values,
+    missing_episodes,
+    orphans,
+)
+from caviar_clients.datasets.checked_settings import checked_settings
 from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.physics import Finding, PhysicsChecks
+from caviar_clients.datasets.findings import Finding, as_rows, listed, runs
+from caviar_clients.datasets.physics import PhysicsChecks
+from caviar_clients.datasets.recording_checks import lacking_scenery, products, scenes_and_stamps, seeds
 from caviar_clients.datasets.remote import RemoteDataset, located
-from caviar_clients.datasets.rows import EpisodeRows, rows_of
+from caviar_clients.datasets.rows import rows_of
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 
-TOLERANCE = 1e-12
-"""Of figures of the catalogue that are computed anew, relative: they are the same arithmetic."""
+__all__ = ["Finding", "as_rows", "verify", "whole_recording"]
 
 
 def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: None) -> Iterator[Finding]:
@@ -32,37 +41,48 @@ def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: N
         progress: Called after each episode with how many are verified, and how many there are.
 
     Yields:
-        What is wrong, episode by episode.
+        What is wrong: of the dataset as a whole, then episode by episode.
 
     Raises:
-        RecordingError: The folder is no dataset.
+        RecordingError: The folder is no dataset, or its catalogue is none that can be read.
     """
     directory, remote = located(path)
     catalogue = Catalogue(directory.catalogue)
-    listed = catalogue.episodes()
-    on_disk = set(directory.finished() if remote is None else remote.episodes())
-    failed = dict(catalogue.failures())
-    for number in range(catalogue.planned):
-        if number not in listed:
-            found = f"none; it failed: {failed[number]}" if number in failed else "none"
-            yield Finding(number, None, "", "episode", "a row of the catalogue", found)
-    for number in sorted(on_disk - set(listed)):
-        yield Finding(number, None, "", "episode", "no recording that is not in the catalogue", "a recording")
-    settings = catalogue.settings
-    checks = PhysicsChecks(directory.assets, settings)
-    for done, number in enumerate(listed, 1):
-        if remote is None:
-            yield from _episode(directory, catalogue, checks, settings, number)
-        else:
-            yield from _fetched(remote, catalogue, checks, settings, number)
-        progress(done, len(listed))
+    try:
+        check_structure(catalogue)
+        settings = checked_settings(catalogue)
+        yield from impossible_values(catalogue, MEASURED_TABLES)
+        known = catalogue.episodes()
+        yield from missing_episodes(catalogue, known)
+        yield from _not_listed(directory.finished() if remote is None else remote.episodes(), known)
+        yield from orphans(catalogue)
+        checks = PhysicsChecks(directory.assets, settings)
+        scenery = list(lacking_scenery(settings, checks.files))
+        if checks.scenery_error and not scenery:
+            scenery = [Finding(-1, None, "", "scenery", "files that can be read", checks.scenery_error)]
+        yield from scenery
+        for done, number in enumerate(known, 1):
+            if remote is None:
+                yield from _episode(directory, catalogue, checks, settings, number)
+            else:
+                yield from _fetched(remote, catalogue, checks, settings, number)
+            progress(done, len(known))
+    finally:
+        catalogue.close()
+
+
+def _not_listed(there: list[int], known: list[int]) -> Iterator[Finding]:
+    """Recordings that are not in the catalogue."""
+    if more := sorted(set(there).difference(known)):
+        found = f"{listed(runs(more), 'episode')}; the generate command adds what is whole"
+        yield Finding(more[0], None, "", "episode", "no recording that is not in the catalogue", found)
 
 
 def _fetched(
     remote: RemoteDataset,
     catalogue: Catalogue,
     checks: PhysicsChecks,
-    settings: dict[str, Any],
+    settings: Mapping[str, Any],
     number: int,
 ) -> Iterator[Finding]:
     """Verify an episode as it is at the address now, whatever the cache has."""
@@ -71,7 +91,7 @@ def _fetched(
         try:
             remote.fetch_episode(number, directory)
         except RecordingError as error:
-            yield Finding(number, None, "", "recording", "a whole recording", str(error))
+            yield _damaged(number, str(error), f"{remote.address}/episodes")
             return
         yield from _episode(directory, catalogue, checks, settings, number)
 
@@ -80,94 +100,48 @@ def _episode(
     directory: DatasetDirectory,
     catalogue: Catalogue,
     checks: PhysicsChecks,
-    settings: dict[str, Any],
+    settings: Mapping[str, Any],
     number: int,
 ) -> Iterator[Finding]:
     folder = directory.episode(number)
     try:
-        with warnings.catch_warnings(action="ignore"):  # of damage, which is a finding
-            recording = Recording(folder)
-        damage = [*recording.damage, *recording.run_digest().damage]
+        recording = whole_recording(folder)
+        rows = rows_of(recording)
     except RecordingError as error:
-        yield Finding(number, None, "", "recording", "a whole recording", str(error))
+        yield _damaged(number, str(error), str(folder.parent))
         return
-    if damage or not recording.complete:
-        said = damage[0] if damage else "it breaks off"
-        yield Finding(number, None, "", "recording", "a whole recording", said)
-        return
+    run = settings.get("scenario", {}).get("run", {})
+    yield from against_recording(catalogue, rows, number)
+    yield from scenes_and_stamps(recording, run, number)
+    yield from seeds(recording, run, number)
+    yield from products(recording, run, number)
     try:
-        yield from _against_catalogue(catalogue, rows_of(recording), number)
-        yield from _stamps(recording, settings, number)
         yield from checks.episode(recording)
     except RecordingError as error:
         yield Finding(number, None, "", "recording", "products that can be read", str(error))
 
 
-def _against_catalogue(catalogue: Catalogue, rows: EpisodeRows, number: int) -> Iterator[Finding]:
-    """Rows of the catalogue that are not those of the recording, the first of each table."""
-    anew = {
-        "episodes": (rows.episode,),
-        "scenes": rows.scenes,
-        "users": rows.users,
-        "products": rows.products,
-    }
-    for table, (_, key) in TABLES.items():
-        order = ", ".join(key)
-        columns, listed = catalogue.query(
-            f"SELECT * FROM {table} WHERE episode = ? ORDER BY {order}",  # noqa: S608 - names of our own
-            (number,),
-        )
-        places = [columns.index(name) for name in key]
-        expected = sorted(anew[table], key=lambda row: [row[place] for place in places])
-        if len(expected) != len(listed):
-            yield Finding(number, None, "", f"catalogue: {table}", f"{len(expected)} rows", f"{len(listed)}")
-            continue
-        for right, row in zip(expected, listed, strict=True):
-            different = [at for at, name in enumerate(columns) if not _same(right[at], row[at])]
-            if different:
-                at = different[0]
-                scene = row[columns.index("scene")] if "scene" in columns else None
-                user = row[columns.index("rx")] if "rx" in columns else ""
-                what = f"catalogue: {table}.{columns[at]}"
-                yield Finding(number, scene, user, what, str(right[at]), str(row[at]))
-                break
+def whole_recording(folder: Path) -> Recording:
+    """Open a recording of which every byte is as it was written.
+
+    Args:
+        folder: Of the recording.
+
+    Raises:
+        RecordingError: It is damaged or breaks off; says where.
+    """
+    with warnings.catch_warnings(action="ignore"):  # of damage, which is the error
+        recording = Recording(folder)
+    damage = [*recording.damage, *recording.run_digest().damage]
+    if damage:
+        raise RecordingError(damage[0])
+    if not recording.complete:
+        raise RecordingError(f"{folder} breaks off")
+    return recording
 
 
-def _same(right: object, value: object) -> bool:
-    if isinstance(right, float) and isinstance(value, float):
-        return abs(right - value) <= TOLERANCE * max(abs(right), abs(value))
-    return right == value
-
-
-def _stamps(recording: Recording, settings: dict[str, Any], number: int) -> Iterator[Finding]:
-    """Scenes that are missing, or stamped with another instant than the scenario has."""
-    run = settings.get("scenario", {}).get("run", {})
-    period, instants = int(run.get("sampling_period_ns", 0)), run.get("instants_s", ())
-    expected = int(run.get("frames", len(recording)))
-    frames = [recording.entry(index) for index in range(len(recording))]
-    if [entry.frame for entry in frames] != list(range(expected)):
-        has = ", ".join(str(entry.frame) for entry in frames[:8])
-        more = ", …" if len(frames) > 8 else ""
-        yield Finding(number, None, "", "scenes", f"0 to {expected - 1}", has + more)
-        return
-    for entry in frames:
-        right = round(instants[entry.frame] * 1e9) if instants else entry.frame * period
-        if entry.t_ns != right:
-            yield Finding(number, entry.frame, "", "stamp", f"{right} ns", f"{entry.t_ns} ns")
-        if entry.episode != number:
-            yield Finding(number, entry.frame, "", "episode", str(number), str(entry.episode))
-
-
-def as_rows(findings: list[Finding]) -> list[dict[str, Any]]:
-    """Findings as plain values, for a file."""
-    return [
-        {
-            "episode": one.episode,
-            "scene": one.scene,
-            "user": one.user,
-            "what": one.what,
-            "expected": one.expected,
-            "found": one.found,
-        }
-        for one in findings
-    ]
+def _damaged(number: int, said: str, folder: str) -> Finding:
+    """A recording that cannot be used, and what to do about it."""
+    name = DatasetDirectory(Path()).episode(number).name
+    way_out = f"remove {folder}/{name}, and the generate command plays the episode again"
+    return Finding(number, None, "", "recording", "a whole recording", f"{said}; {way_out}")
