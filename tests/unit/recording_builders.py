@@ -239,18 +239,19 @@ def recorder(
     assets: Mapping[str, Path] | None = None,
     *,
     run: Mapping[str, object] | None = None,
+    seed: int = 7,
     again: bool = False,
     **settings: object,
 ) -> McapRecorder:
     """A prepared recorder that writes to ``folder``.
 
-    ``run`` replaces keys of that table of the scenario; ``again`` says that the recorder died and was started
+    ``run`` replaces keys of that table of the scenario, ``seed`` is that of the run; ``again`` says that the recorder died and was started
     anew.
     """
     info = RunInfo(
         name="recorder",
         run="sample-1",
-        seed=7,
+        seed=seed,
         sampling_period_ns=PERIOD_NS,
         frames=10,
         scenario=SCENARIO | {"run": {**SCENARIO["run"], **(run or {})}},

@@ -1,4 +1,4 @@
-"""What a link has to say about beams: |y| of every pair that it lists, by H, in the order of |y|, and SNR by |y|."""
+"""What a link has to say about beams: |y| of every pair that it lists, by H and in order, and SNR by |y|."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def check_beams(
 def _wrong_pairs(
     link: Link, row: int, abs_y: Float64Array, tolerance: float
 ) -> Iterator[tuple[str, str, str]]:
-    """What of a user's pairs is wrong, what it should be, and what it is: the first of the list, and the chosen.
+    """What of a user's pairs is wrong, what it should be and is: the first of the list, and the chosen one.
 
     Beams of equal |y| may stand in either order, as rounding has it.
     """
@@ -90,7 +90,11 @@ def _pair_text(tx_beam: int, rx_beam: int, abs_y: float) -> str:
 
 
 def check_snr(
-    place: tuple[int, int], scene: Scene, link: Link, carriers: tuple[Carrier, ...], settings: Mapping[str, Any]
+    place: tuple[int, int],
+    scene: Scene,
+    link: Link,
+    carriers: tuple[Carrier, ...],
+    settings: Mapping[str, Any],
 ) -> Iterator[Finding]:
     """SNRs that are not P·|y|²/(k·T·B·F) (`topics.Link`).
 

@@ -103,7 +103,9 @@ class Catalogue:
         try:
             return msgspec.json.decode(text, type=dict[str, Any]) if text else {}
         except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
-            raise RecordingError(f"{self.path}: settings in table dataset are not those of a dataset: {error}") from error
+            raise RecordingError(
+                f"{self.path}: settings in table dataset are not those of a dataset: {error}"
+            ) from error
 
     @property
     def planned(self) -> int:
@@ -111,7 +113,9 @@ class Catalogue:
         text = self._note("episodes") or "0"
         # Python refuses to read thousands of digits with an error of its own.
         if not (text.isascii() and text.isdecimal() and len(text) < 20):
-            raise RecordingError(f"{self.path}: episodes in table dataset is {text!r:.80}: a number is needed")
+            raise RecordingError(
+                f"{self.path}: episodes in table dataset is {text!r:.80}: a number is needed"
+            )
         return int(text)
 
     def plan(self, settings: Mapping[str, Any], episodes: int) -> None:

@@ -1,8 +1,8 @@
 """What a catalogue says that cannot be, and what of it does not follow from the recordings.
 
-`check_structure` and `impossible_values` look at the database alone: a catalogue comes from anywhere, and SQLite
-keeps an infinite number, or a text in a column of numbers, where another program wrote it. The others compare
-its tables with one another and with the rows of a recording.
+`check_structure` and `impossible_values` look at the database alone: a catalogue comes from anywhere, and
+SQLite keeps an infinite number, or a text in a column of numbers, where another program wrote it. The others
+compare its tables with one another and with the rows of a recording.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from types import UnionType
 from typing import Any, get_args, get_type_hints
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
+from caviar_clients.datasets.checked_settings import checked_settings
 from caviar_clients.datasets.findings import Finding, gaps, listed, runs
 from caviar_clients.datasets.rows import EpisodeRows
 from caviar_protocol.errors import RecordingError
@@ -74,6 +75,27 @@ def impossible_values(catalogue: Catalogue, tables: tuple[str, ...]) -> Iterator
                 )
 
 
+def refuse_impossible(catalogue: Catalogue) -> None:
+    """Check a catalogue before a page is made of it.
+
+    Args:
+        catalogue: Of the dataset.
+
+    Raises:
+        RecordingError: It lacks a table or a column, or has values or settings that cannot be; names the
+            first one.
+    """
+    check_structure(catalogue)
+    checked_settings(catalogue)
+    for one in impossible_values(catalogue, (*TABLES, *MEASURED_TABLES)):
+        at = "" if one.scene is None else f", scene {one.scene}"
+        user = f", user {one.user}" if one.user else ""
+        raise RecordingError(
+            f"{catalogue.path}: {one.what.removeprefix('catalogue: ')} of episode {one.episode}{at}{user} is "
+            f"{one.found}, not {one.expected}; caviar verify says all that is wrong"
+        )
+
+
 def _number(value: object) -> int:
     return value if isinstance(value, int) else -1
 
@@ -97,7 +119,9 @@ def _rules(table: str) -> dict[str, tuple[str, str]]:
             words, right = "a whole number from 0 on", f"typeof({name}) = 'integer' AND {name} >= 0"
         else:
             limit = MAX_COORDINATE_M if name in _PLACES else 1e30
-            words, low = (f"a number within ±{limit:g}", -limit) if name in _SIGNED else ("a number from 0 on", 0)
+            words, low = (
+                (f"a number within ±{limit:g}", -limit) if name in _SIGNED else ("a number from 0 on", 0)
+            )
             right = f"typeof({name}) IN ('real', 'integer') AND {name} BETWEEN {low:g} AND {limit:g}"
         if optional.get(name, table not in TABLES):
             words, right = f"{words}, or none", f"({name} IS NULL OR {right})"
@@ -152,7 +176,9 @@ def orphans(catalogue: Catalogue) -> Iterator[Finding]:
         for episode, count, scene, *rx in rows:
             rows_of_it = f"{count:,} row{'s' * (count != 1)} without it"
             what = f"catalogue: {table}"
-            yield Finding(episode, scene, rx[0] if rx else "", what, "a row of the episode in episodes", rows_of_it)
+            yield Finding(
+                episode, scene, rx[0] if rx else "", what, "a row of the episode in episodes", rows_of_it
+            )
 
 
 def against_recording(catalogue: Catalogue, rows: EpisodeRows, number: int) -> Iterator[Finding]:

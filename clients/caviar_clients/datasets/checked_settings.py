@@ -1,7 +1,7 @@
 """Settings of a dataset as its catalogue has them, checked before anything is made of them.
 
-They are JSON in a database that comes from anywhere. Of a scenario only what `verify` and `look` read is looked at, so
-that datasets of other versions, with more keys or fewer, can be read.
+They are JSON in a database that comes from anywhere. Of a scenario only what `verify` and `look` read is
+looked at, so that datasets of other versions, with more keys or fewer, can be read.
 """
 
 from __future__ import annotations
@@ -95,13 +95,13 @@ def checked_settings(catalogue: Catalogue) -> dict[str, Any]:
             msgspec.convert(spec.settings.get("obstacles", ()), tuple[_Box, ...])
     except msgspec.ValidationError as error:
         raise RecordingError(
-            f"{catalogue.path}: settings in table dataset are not those of a dataset: {error}; generate it anew with "
-            "--overwrite"
+            f"{catalogue.path}: settings in table dataset are not those of a dataset: {error}; generate it "
+            "anew with --overwrite"
         ) from error
     instants = found.scenario.run.instants_s
     if instants and (len(instants) < found.scenario.run.frames or not all(map(math.isfinite, instants))):
         raise RecordingError(
-            f"{catalogue.path}: settings in table dataset: scenario.run.instants_s has {len(instants)} instants for "
-            f"{found.scenario.run.frames} scenes; generate it anew with --overwrite"
+            f"{catalogue.path}: settings in table dataset: scenario.run.instants_s has {len(instants)} "
+            f"instants for {found.scenario.run.frames} scenes; generate it anew with --overwrite"
         )
     return settings

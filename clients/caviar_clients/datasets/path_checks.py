@@ -1,10 +1,10 @@
 """What the paths of a channel have to be: lengths, directions and Doppler shifts by their points, gains below
 those of free space, and H as their sum.
 
-Points of interaction are recorded, so the geometry of each path is computed anew from them: delay, departure,
-arrival and Doppler shift (`caviar_services.channel.propagation.geometry`). What happens at a point takes power and
-brings none: |a| of a path is at most λ/(4πcτ) times the amplitudes of both elements towards it (Friis 1946), of
-which reflection and transmission take the part that Fresnel's coefficients say, all of them at most 1.
+Points of interaction are recorded, so the geometry of each path is computed anew from them: delay,
+departure, arrival and Doppler shift (`caviar_services.channel.propagation.geometry`). What happens at a point
+takes power and brings none: |a| of a path is at most c/(4πf·cτ) times the amplitudes of both elements towards
+it (Friis 1946), of which reflection and transmission leave the part that Fresnel's coefficients say.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from caviar_services.channel.propagation.geometry import PathGeometry, path_geom
 GAIN_DB = 0.5
 """Of a line of sight from free space; air and foliage take no more over a street."""
 DIFFRACTED_DB = 6.1
-"""Above free space that a diffraction may bring a path: the uniform theory of diffraction adds four terms, each of at
-most 1/2 of the wave that arrives (Kouyoumjian and Pathak 1974)."""
+"""Above free space that a diffraction may bring a path: the uniform theory of diffraction adds four terms,
+each of at most 1/2 of the wave that arrives (Kouyoumjian and Pathak 1974)."""
 DELAY = 1e-6
 """Relative, of delays from lengths."""
 ANGLE_RAD = 1e-4
@@ -38,8 +38,8 @@ DOPPLER_HZ = 1e-3
 MATRIX = 1e-5
 """Of H from the sum of its paths, relative; a channel may round H to single precision."""
 PROPORTION = 0.3
-"""Of an H of spherical waves, or of paths for each element, from the sum of its paths with plane waves, relative, up
-to which the factor between both is looked at."""
+"""Of an H of spherical waves, or of paths for each element, from the sum of its paths with plane waves,
+relative, up to which the factor between both is looked at."""
 FACTOR_DB = 3.0
 """Of that factor, from 1."""
 
@@ -80,7 +80,11 @@ def cut_of(channel: Channel, tx: int, rx: int) -> slice:
 
 
 def pair_of(
-    place: tuple[int, int], scene: Scene, channel: Channel, pair: tuple[int, int], ends: tuple[Antenna, Antenna]
+    place: tuple[int, int],
+    scene: Scene,
+    channel: Channel,
+    pair: tuple[int, int],
+    ends: tuple[Antenna, Antenna],
 ) -> Pair:
     """Make a `Pair`: the geometry of its paths is computed.
 
@@ -137,7 +141,9 @@ def check_geometry(pair: Pair) -> Iterator[Finding]:
     off = np.abs(tau - right.tau) - DELAY * right.tau
     worst = int(off.argmax())
     if off[worst] > 0:
-        yield pair.finding(f"delay of {_name(pair, worst)}", f"{right.tau[worst]:.9g} s", f"{tau[worst]:.9g} s")
+        yield pair.finding(
+            f"delay of {_name(pair, worst)}", f"{right.tau[worst]:.9g} s", f"{tau[worst]:.9g} s"
+        )
     for name, directions in (("aod", right.departure), ("aoa", right.arrival)):
         angles = getattr(channel, name)[cut]
         apart = np.linalg.norm(unit_vectors(angles) - directions, axis=1)
@@ -253,8 +259,8 @@ def matrix_of(pair: Pair, carrier: int) -> Complex128Array | None:
 def check_matrix(pair: Pair, carrier: int, h: Complex128Array) -> Iterator[Finding]:
     """An H that is not the sum of its paths.
 
-    Of spherical waves, and of paths for each element, H differs from that sum; where it is nearly proportional to
-    it, it has its magnitude.
+    Of spherical waves, and of paths for each element, H differs from that sum; where it is nearly
+    proportional to it, it has its magnitude.
 
     Args:
         pair: Its paths.
@@ -266,7 +272,9 @@ def check_matrix(pair: Pair, carrier: int, h: Complex128Array) -> Iterator[Findi
         return
     name = f"H, {pair.channel.carriers[carrier].name}"
     if right.shape != h.shape:
-        yield pair.finding(name, f"{right.shape[0]} × {right.shape[1]} elements", f"{h.shape[0]} × {h.shape[1]}")
+        yield pair.finding(
+            name, f"{right.shape[0]} × {right.shape[1]} elements", f"{h.shape[0]} × {h.shape[1]}"
+        )
         return
     size, scale = float(np.linalg.norm(h)), float(np.linalg.norm(right))
     # Waves that cancel leave what rounding leaves: the amplitudes are the scale of errors.

@@ -1,7 +1,7 @@
 """What physics says about the scenes of a dataset, computed anew from positions, scenery and H.
 
-`path_checks` has what paths and H have to be, `beam_checks` beams and SNRs. Here stand lines of sight, reciprocity,
-and how objects move from one scene to the next.
+`path_checks` has what paths and H have to be, `beam_checks` beams and SNRs. Here stand lines of sight,
+reciprocity, and how objects move from one scene to the next.
 """
 
 from __future__ import annotations
@@ -86,7 +86,9 @@ class PhysicsChecks:
         self._budget = _link_settings(settings)
         self._patterns = Patterns()
         try:
-            tables = {name: read_pattern(file) for name, file in self.files.items() if name.startswith(PATTERNS)}
+            tables = {
+                name: read_pattern(file) for name, file in self.files.items() if name.startswith(PATTERNS)
+            }
             self._patterns = Patterns(tables)
         except CaviarError as error:
             self.scenery_error = self.scenery_error or str(error)
@@ -114,7 +116,9 @@ class PhysicsChecks:
                 if (name, asset) not in said:  # in its first scene
                     said.add((name, asset))
                     what = f"file of {name}"
-                    yield Finding(frame.episode, frame.number, "", what, f"assets/{asset} in the dataset", "none")
+                    yield Finding(
+                        frame.episode, frame.number, "", what, f"assets/{asset} in the dataset", "none"
+                    )
             # A held product is that of an earlier scene, where it was looked at.
             for channel in _fresh(frame, "channel", Channel):
                 links = _fresh(frame, "link", Link)
@@ -220,7 +224,7 @@ def _carriers(settings: Mapping[str, Any]) -> tuple[Carrier, ...]:
 
 
 def _link_settings(settings: Mapping[str, Any]) -> dict[str, float] | None:
-    """Noise figure and temperature of the shipped links; None where another link made the SNRs, or several did."""
+    """Noise figure and temperature of a shipped link; None where another made the SNRs, or several did."""
     services = settings.get("scenario", {}).get("services", {})
     links = [spec for spec in services.values() if spec.get("role") == "link"]
     if len(links) != 1 or links[0].get("use") not in ("beams", "cell"):

@@ -109,7 +109,7 @@ def lacking_scenery(settings: Mapping[str, Any], assets: Mapping[str, Path]) -> 
     for spec in services.values() if isinstance(services, dict) else ():
         given = spec.get("settings", {}) if isinstance(spec, dict) and spec.get("role") == "world" else {}
         scenery = given.get("scenery") if isinstance(given, dict) else None
-        if not isinstance(scenery, str) or not scenery.endswith(".xml") and not scenery.startswith(_BUNDLED):
+        if not isinstance(scenery, str) or not (scenery.endswith(".xml") or scenery.startswith(_BUNDLED)):
             continue
         # Of a user's file the folder is left out, and the file of a bundled scene may have another name.
         if scenery.startswith(_BUNDLED):

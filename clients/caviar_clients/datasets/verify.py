@@ -1,7 +1,8 @@
 """Verification of a dataset: what is missing, altered, or does not follow from physics.
 
 `verify` compares files with the catalogue (`catalogue_checks`), looks at what each recording has to have
-(`recording_checks`), and at the content of each scene, computed anew from positions, scenery and H (`physics`).
+(`recording_checks`), and at the content of each scene, computed anew from positions, scenery and H
+(`physics`).
 """
 
 from __future__ import annotations

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import random
+import warnings
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.look.units import time_text
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.plots.rays import Footprints
 from caviar_clients.plots.sensors import object_colours
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
-from caviar_protocol.recording import RecordedFrame
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import (
     Camera,
@@ -43,6 +44,9 @@ SCANS, PICTURED_EPISODES, CAMERAS = 3, 2, 4
 
 PICTURE_PX = 640
 """Width of a picture at most [pixels]; of larger ones each second or third pixel is shown."""
+
+MOST_TRANSMITTERS = 2000
+"""Places of transmitters that are kept."""
 
 _ROWS_AT_ONCE = 200_000
 """Rows of the catalogue that are read at once, about: each takes 1 kB until it is in an array."""
@@ -120,90 +124,6 @@ def read_users(catalogue: Catalogue, progress: Progress) -> UserColumns:
     return UserColumns(tuple(pairs), *arrays)
 
 
-# --- times -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Throughput:
-    """How fast the episodes were played."""
-
-    edges_s: Float64Array
-    """Limits of the intervals, from the first episode, interruptions left out [s], Shape ``[N + 1]``."""
-    rate: Float64Array
-    """Scenes per second, Shape ``[N]``."""
-    interruptions_s: tuple[float, ...]
-    """Where nothing was played for long, on the same axis [s]."""
-    scenes: int
-    """Of the episodes whose times are known."""
-    episodes: int
-    busy_s: float
-    """Wall time of the episodes, added up: with two workers two seconds pass in one [s]."""
-    services_s: Mapping[str, float]
-    """Wall time of each service, added up; what is left of ``busy_s`` is start, reset and saving [s]."""
-    hosts: int
-    processes: int
-
-    @property
-    def elapsed_s(self) -> float:
-        """Without interruptions [s]."""
-        return float(self.edges_s[-1])
-
-
-INTERVALS = 60
-_INTERRUPTION_S = 60.0
-
-
-def read_throughput(catalogue: Catalogue) -> Throughput | None:
-    """Read how fast the episodes were played; None where no times are known."""
-    _, rows = catalogue.query(
-        "SELECT t.started, t.wall_s, t.host, t.pid, t.detail, e.scenes FROM timings t JOIN episodes e "
-        "USING (episode) WHERE t.started IS NOT NULL AND t.wall_s > 0"
-    )
-    if not rows:
-        return None
-    started, wall, hosts, pids, details, scenes = zip(*rows, strict=True)
-    begin = np.array([datetime.fromisoformat(text).timestamp() for text in started])
-    walls, counts = np.array(wall), np.array(scenes, dtype=float)
-    begin, interruptions = _without_interruptions(begin, walls)
-    edges = np.linspace(0.0, float((begin + walls).max()), _intervals(len(rows)) + 1)
-    # Scenes of an episode are spread evenly over its time.
-    played = [float((counts * np.clip((edge - begin) / walls, 0.0, 1.0)).sum()) for edge in edges]
-    services: dict[str, float] = {}
-    for detail in details:
-        for name, seconds in msgspec.json.decode(detail or "{}").get("services_s", {}).items():
-            services[name] = services.get(name, 0.0) + seconds
-    return Throughput(
-        edges_s=edges,
-        rate=np.diff(played) / np.diff(edges),
-        interruptions_s=interruptions,
-        scenes=int(counts.sum()),
-        episodes=len(rows),
-        busy_s=float(walls.sum()),
-        services_s=services,
-        hosts=len(set(hosts)),
-        processes=len(set(zip(hosts, pids, strict=True))),
-    )
-
-
-def _intervals(episodes: int) -> int:
-    """Of two episodes or more each, unless there are few."""
-    return min(INTERVALS, max(episodes // 2, min(episodes, 10)))
-
-
-def _without_interruptions(begin: Float64Array, wall: Float64Array) -> tuple[Float64Array, tuple[float, ...]]:
-    """Times from the first one, moved together where nothing was played for long, and where that was."""
-    longest = max(_INTERRUPTION_S, 10.0 * float(np.median(wall)))
-    order = np.argsort(begin, kind="stable")
-    moved, cut, busy_until, places = np.zeros(len(begin)), float(begin[order[0]]), -np.inf, list[float]()
-    for at in order:
-        if begin[at] - busy_until > longest and np.isfinite(busy_until):
-            cut += float(begin[at] - busy_until)
-            places.append(float(begin[at]) - cut)
-        moved[at] = begin[at] - cut
-        busy_until = max(busy_until, float(begin[at] + wall[at]))
-    return moved, tuple(places)
-
-
 # --- a sample of the recordings --------------------------------------------------------------------------
 
 AZIMUTH_EDGES = np.linspace(-180.0, 180.0, 181)
@@ -265,6 +185,8 @@ class Sample:
 
     episodes: tuple[int, ...]
     there: int
+    left_out: list[tuple[int, str]] = field(default_factory=list)
+    """Episodes of these whose recordings cannot be read, and why; nothing of them is in what follows."""
     scenes: int = 0
     cut: bool = False
     """Whether the episodes have more scenes than were read."""
@@ -285,51 +207,88 @@ class Sample:
     scans: list[Scan] = field(default_factory=list)
     shots: list[Shot] = field(default_factory=list)
 
+    @property
+    def read(self) -> int:
+        """How many episodes were read."""
+        return len(self.episodes) - len(self.left_out)
+
+    def add(self, other: Sample) -> None:
+        """Add what was read of an episode."""
+        self.scenes += other.scenes
+        self.cut |= other.cut
+        self.paths += other.paths
+        for name in ("departure", "arrival", "strongest_departure", "strongest_arrival"):
+            counts, more = getattr(self, name), getattr(other, name)
+            counts.zenith += more.zenith
+            counts.azimuth += more.azimuth
+        self.has_h |= other.has_h
+        self.apart_s += other.apart_s
+        self.correlation += other.correlation
+        self.consecutive += other.consecutive
+        self.transmitters |= set(sorted(other.transmitters)[: MOST_TRANSMITTERS - len(self.transmitters)])
+        self.scans += other.scans
+        self.shots += other.shots
+
 
 def read_sample(data: Dataset, topics: set[str], progress: Progress) -> Sample:
-    """Read recorded arrays of a seeded sample of the episodes.
+    """Read recorded arrays of a seeded sample of the episodes; one that is damaged is left out as a whole.
 
     Args:
         data: The dataset.
         topics: Which it has.
         progress: Is told of the episodes.
-
-    Raises:
-        RecordingError: A recording cannot be read.
     """
     there = numbers = data.finished()
     if len(there) > SAMPLE_EPISODES:
         numbers = sorted(random.Random(0).sample(numbers, SAMPLE_EPISODES))  # noqa: S311 - no secret
     sample = Sample(tuple(numbers), there=len(there))
     for at, number in enumerate(numbers):
-        recording = data.episode(number)
-        sample.cut |= len(recording) > SAMPLE_SCENES
-        before = deque[tuple[int, dict[Any, Any]]](maxlen=LAGS)
-        scanned = len(sample.scans) >= SCANS or "lidar" not in topics
-        pictured = at >= PICTURED_EPISODES or not topics & {"camera", "depth", "segmentation"}
-        length = min(len(recording), SAMPLE_SCENES)
-        # Not always the first scene: episodes may begin alike.
-        scan_from, picture_from = length * len(sample.scans) // SCANS, length * at // PICTURED_EPISODES
-        for place, frame in zip(range(length), recording.frames(), strict=False):
-            sample.scenes += 1
-            scene = frame.scene()
-            if scene is not None:
-                _add_transmitters(sample, scene)
-            for channel in frame.payloads("channel", Channel).values() if "channel" in topics else ():
-                _add_angles(sample, channel)
-                _add_correlation(sample, frame.t_ns, channel, before)
-            if not scanned and place >= scan_from:
-                scanned = _add_scan(sample, frame, scene)
-            if not pictured and place >= picture_from:
-                pictured = _add_shots(sample, frame, scene)
+        part = Sample((number,), there=1)
+        try:
+            _read_episode(part, _whole(data, number), topics, at, scans=len(sample.scans))
+            sample.add(part)
+        except RecordingError as error:
+            sample.left_out.append((number, str(error)))
         progress("sample of the recordings", at + 1, len(numbers))
     return sample
+
+
+def _whole(data: Dataset, number: int) -> Recording:
+    """The recording of an episode, without a gap."""
+    with warnings.catch_warnings(action="ignore"):  # of damage, which is the error
+        recording = data.episode(number)
+    if recording.damage or not recording.complete:
+        raise RecordingError(recording.damage[0] if recording.damage else f"{recording.path} breaks off")
+    return recording
+
+
+def _read_episode(part: Sample, recording: Recording, topics: set[str], at: int, scans: int) -> None:
+    """Read the first scenes of an episode, which is the ``at``-th of the sample."""
+    part.cut = len(recording) > SAMPLE_SCENES
+    before = deque[tuple[int, dict[Any, Any]]](maxlen=LAGS)
+    scanned = scans >= SCANS or "lidar" not in topics
+    pictured = at >= PICTURED_EPISODES or not topics & {"camera", "depth", "segmentation"}
+    length = min(len(recording), SAMPLE_SCENES)
+    # Not always the first scene: episodes may begin alike.
+    scan_from, picture_from = length * scans // SCANS, length * at // PICTURED_EPISODES
+    for place, frame in zip(range(length), recording.frames(), strict=False):
+        part.scenes += 1
+        scene = frame.scene()
+        if scene is not None:
+            _add_transmitters(part, scene)
+        for channel in frame.payloads("channel", Channel).values() if "channel" in topics else ():
+            _add_angles(part, channel)
+            _add_correlation(part, frame.t_ns, channel, before)
+        if not scanned and place >= scan_from:
+            scanned = _add_scan(part, frame, scene)
+        if not pictured and place >= picture_from:
+            pictured = _add_shots(part, frame, scene)
 
 
 def _add_transmitters(sample: Sample, scene: Scene) -> None:
     for device in antennas(scene, "tx"):
         x, y, _ = device_pose(scene, device).position
-        if len(sample.transmitters) < 2000:
+        if len(sample.transmitters) < MOST_TRANSMITTERS:
             sample.transmitters.add((round(x, 1), round(y, 1)))
 
 
@@ -432,7 +391,7 @@ def _depth_picture(depth: Any) -> UInt8Array:
 
 
 def _moment(frame: RecordedFrame) -> str:
-    return f"episode {frame.episode}, scene {frame.number}, t = {frame.t_ns * 1e-9:g} s"
+    return f"episode {frame.episode}, scene {frame.number}, t = {time_text(frame.t_ns * 1e-9)}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,14 +9,25 @@ from typing import Any
 import msgspec
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.look.data import Sample
 from caviar_clients.datasets.look.html import absent, facts, folded, table
+from caviar_clients.datasets.look.units import time_text
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.texts import bytes_text, counted
 
+SHOWN_LEFT_OUT = 20
 _MAIN_VERSIONS = ("caviar-sim", "python", "numpy", "sionna", "sionna-rt", "mitsuba", "drjit", "eclipse-sumo")
 
 
-def what_it_is(data: Dataset, catalogue: Catalogue, users: int, there: int) -> Iterator[str]:
+def what_it_is(data: Dataset, catalogue: Catalogue, users: int, sample: Sample) -> Iterator[str]:
+    """Facts and tables of a dataset, and what of it cannot be read.
+
+    Args:
+        data: The dataset.
+        catalogue: Its catalogue.
+        users: How many rows of users there are.
+        sample: What was read of its recordings.
+    """
     scenario, settings = scenario_of(data), data.settings
     run, versions = scenario.get("run", {}), settings.get("versions", {})
     _, ((episodes, scenes, size, least, most),) = catalogue.query(
@@ -29,7 +40,7 @@ def what_it_is(data: Dataset, catalogue: Catalogue, users: int, there: int) -> I
     planned = catalogue.planned
     of_planned = f" of {planned:,} that are planned" if planned > episodes else ""
     each = f"{least}" if least == most else f"{least:,} to {most:,}"
-    carried = f", on {objects:,} objects" if objects else ""
+    carried = f", on {counted(objects, 'object')}" if objects else ""
     versioned = [f"{name} {versions[name]}" for name in _MAIN_VERSIONS if name in versions]
     known = {
         "Scenario": name_of(data),
@@ -47,7 +58,8 @@ def what_it_is(data: Dataset, catalogue: Catalogue, users: int, there: int) -> I
         "Versions": ", ".join(versioned) or "not kept",
     }
     yield facts(known)
-    if gone := episodes - there:
+    yield from _left_out(sample)
+    if gone := episodes - sample.there:
         yield absent(
             f"The recordings of {counted(gone, 'episode')} are not in the folder: of them there is what the "
             "catalogue says."
@@ -66,11 +78,25 @@ def what_it_is(data: Dataset, catalogue: Catalogue, users: int, there: int) -> I
         yield folded("The whole scenario", f"<pre>{escape(text)}</pre>")
 
 
+def _left_out(sample: Sample) -> Iterator[str]:
+    """Recordings that cannot be read."""
+    if not sample.left_out:
+        return
+    number = counted(len(sample.left_out), "recording")
+    yield absent(
+        f"{number} of the sample cannot be read, and {'is' if len(sample.left_out) == 1 else 'are'} left "
+        "out: remove the folder of such an episode, and the generate command plays it again. caviar verify "
+        "looks at all of them."
+    )
+    shown = [(str(episode), text) for episode, text in sample.left_out[:SHOWN_LEFT_OUT]]
+    yield table(("episode", "why"), shown, right=(0,))
+
+
 def _period(run: Mapping[str, Any]) -> str:
     if run.get("instants_s"):
-        return f"as listed in run.instants_s, {len(run['instants_s'])} instants"
+        return f"as listed in run.instants_s, {counted(len(run['instants_s']), 'instant')}"
     period = run.get("sampling_period_ns")
-    return f"{period * 1e-9:g} s" if period else "not kept"
+    return time_text(period * 1e-9) if period else "not kept"
 
 
 def _products(catalogue: Catalogue) -> Iterator[str]:
@@ -153,7 +179,7 @@ def _settings(settings: Mapping[str, Any]) -> str:
     for key, value in settings.items():
         text = msgspec.json.encode(value).decode()
         long = len(text) > 80 and isinstance(value, list | tuple | dict)
-        found.append(f"{key}: {len(value)} entries" if long else f"{key} = {text}")
+        found.append(f"{key}: {counted(len(value), 'entry', 'entries')}" if long else f"{key} = {text}")
     return ", ".join(found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,6 @@ from caviar_clients.datasets.look.data import (
     AZIMUTH_EDGES,
     ZENITH_EDGES,
     Sample,
-    Throughput,
 )
 from caviar_clients.datasets.look.pictures import (
     Draw,
@@ -21,6 +20,7 @@ from caviar_clients.datasets.look.pictures import (
     panel_axes,
     share_axis,
 )
+from caviar_clients.datasets.look.units import time_unit
 from caviar_clients.plots.style import BLUE
 from caviar_protocol.arrays import BoolArray, Float64Array
 
@@ -259,7 +259,8 @@ def draw_correlation(sample: Sample) -> Draw:
         share_axis(axes, "users")
         if len(found) > 1:
             axes = panels[1]
-            apart = [lag.apart_s for lag in found]
+            unit, name = time_unit(found[-1].apart_s)
+            apart = [lag.apart_s / unit for lag in found]
             axes.fill_between(
                 apart, [lag.low for lag in found], [lag.high for lag in found], color=theme.first, alpha=0.25,
                 linewidth=0, label="10 % to 90 %",
@@ -268,68 +269,12 @@ def draw_correlation(sample: Sample) -> Draw:
                 apart, [lag.median for lag in found], "o-", color=theme.first, markersize=4, label="median"
             )
             axes.set(
-                xlim=(0.0, None), ylim=(0.0, 1.03), xlabel="Time between the scenes [s]", ylabel="Correlation"
+                xlim=(0.0, None),
+                ylim=(0.0, 1.03),
+                xlabel=f"Time between the scenes [{name}]",
+                ylabel="Correlation",
             )
             axes.grid(axis="y")
             axes.legend(loc="lower left", frameon=False)
 
     return draw
-
-
-# --- sensors ---------------------------------------------------------------------------------------------
-
-
-def draw_throughput(found: Throughput) -> Draw:
-    """Scenes per second over the time of the generation."""
-
-    def draw(drawn: Any, theme: Theme) -> None:
-        unit, name = _time_unit(found.elapsed_s)
-        axes = drawn.subplots()
-        axes.stairs(found.rate, found.edges_s / unit, fill=True, color=theme.first, alpha=0.8)
-        mean = found.scenes / found.elapsed_s
-        axes.axhline(mean, color=theme.second, linewidth=1.4, label=f"mean, {mean:.3g} scenes/s")
-        for at, place in enumerate(found.interruptions_s):
-            axes.axvline(
-                place / unit, color=theme.muted, linewidth=1.0, linestyle=":",
-                label=None if at else "interrupted; the time without work is left out",
-            )  # fmt: skip
-        axes.set(
-            xlim=(0.0, found.elapsed_s / unit), xlabel=f"Time at work [{name}]", ylabel="Scenes per second"
-        )
-        axes.set_ylim(0.0, max(float(found.rate.max()), mean) * 1.12)
-        axes.grid(axis="y")
-        handles, labels = axes.get_legend_handles_labels()
-        drawn.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
-
-    return draw
-
-
-def draw_services(shares: Mapping[str, float], scenes: int) -> Draw:
-    """A bar for each service: its wall time for a scene.
-
-    Args:
-        shares: Seconds of each service.
-        scenes: Of which they are the time.
-    """
-
-    def draw(drawn: Any, theme: Theme) -> None:
-        axes = drawn.subplots()
-        names = list(shares)
-        each = [1e3 * seconds / scenes for seconds in shares.values()]
-        total = sum(each)
-        axes.barh(names, each, color=theme.first, height=0.62)
-        for row, value in enumerate(each):
-            text = f" {value:.3g} ms, {value / total:.1%}".replace("%", " %")
-            axes.text(value, row, text, va="center", fontsize=9)
-        axes.set(xlabel="Wall time for a scene [ms]", xlim=(0.0, 1.28 * max(each)))
-        axes.invert_yaxis()
-        axes.spines["left"].set_visible(False)
-        axes.tick_params(axis="y", length=0)
-
-    return draw
-
-
-def _time_unit(seconds: float) -> tuple[float, str]:
-    if seconds < 180.0:
-        return 1.0, "s"
-    return (60.0, "min") if seconds < 3 * 3600.0 else (3600.0, "h")

@@ -192,7 +192,7 @@ def cell_m(place: MapOf) -> float:
     """Edge of the cells of a map [m]."""
     (left, right), (bottom, top) = place.view
     edge = max(right - left, top - bottom) / CELLS
-    steps = [step * 10.0**power for power in range(-1, 5) for step in (1.0, 2.0, 5.0)]
+    steps = [step * 10.0**power for power in range(-1, 9) for step in (1.0, 2.0, 5.0)]
     return float(next((step for step in steps if step >= edge), steps[-1]))
 
 

@@ -5,6 +5,7 @@ The file is whole: pictures are in it, nothing is loaded from elsewhere, and it 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.catalogue_checks import refuse_impossible
 from caviar_clients.datasets.look.data import (
     Content,
     Progress,
     UserColumns,
     read_sample,
-    read_throughput,
     read_users,
 )
 from caviar_clients.datasets.look.description import name_of, scenario_of, what_it_is
@@ -28,11 +29,10 @@ from caviar_clients.datasets.look.distributions import (
     draw_correlation,
     draw_counts,
     draw_histograms,
-    draw_services,
     draw_shares,
-    draw_throughput,
     lags,
 )
+from caviar_clients.datasets.look.generation import generation_section
 from caviar_clients.datasets.look.html import Section, absent, document, figure, table
 from caviar_clients.datasets.look.maps import cell_m, draw_gain, draw_sight_map, map_height, map_of
 from caviar_clients.datasets.look.pictures import PANELS, picture
@@ -41,8 +41,9 @@ from caviar_clients.datasets.look.scans import (
     lidar_section,
     sampled,
 )
+from caviar_clients.datasets.look.units import small_time_unit, time_text
 from caviar_clients.datasets.reader import Dataset
-from caviar_clients.datasets.texts import counted, decimal, duration_text, percent
+from caviar_clients.datasets.texts import counted, decimal, percent
 from caviar_clients.files import reserved, write_file
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_protocol.errors import AssetError
@@ -51,7 +52,8 @@ from caviar_services.mesh.scenery import find_scenery, read_scenery
 CLASSES = 12
 """Classes of objects with a bar of their own at most."""
 
-SHOWN_FAILURES = 50
+MOST_PAIRS = 2**24
+"""Pairs of beams of a picture: more are finer than its pixels, and take the memory of the machine."""
 
 
 def _quiet(_what: str, _done: int, _of: int) -> None:
@@ -70,7 +72,7 @@ def write_page(dataset: str | Path, out: Path | None = None, progress: Progress 
         The file.
 
     Raises:
-        RecordingError: The folder is no dataset, or a recording in it cannot be read.
+        RecordingError: The folder is no dataset, or its catalogue has what cannot be.
         SetupError: Matplotlib is not installed.
         RunError: The file cannot be written.
 
@@ -96,11 +98,12 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
         HTML.
 
     Raises:
-        RecordingError: The catalogue or a recording cannot be read.
+        RecordingError: The catalogue cannot be read, or has what cannot be; names table, row and column.
         SetupError: Matplotlib is not installed.
     """
     catalogue = Catalogue(data.directory.catalogue)
     try:
+        refuse_impossible(catalogue)
         _, rows = catalogue.query("SELECT DISTINCT topic FROM products WHERE status <> 'absent'")
         topics = {topic for (topic,) in rows}
         found, error = _scenery(data)
@@ -138,7 +141,7 @@ _NO_CHANNEL = "No channel is recorded: there are no users."
 
 
 def _what_it_is(content: Content) -> Iterator[str]:
-    return what_it_is(content.data, content.catalogue, len(content.users), content.sample.there)
+    return what_it_is(content.data, content.catalogue, len(content.users), content.sample)
 
 
 def _coverage(content: Content) -> Iterator[str]:
@@ -172,7 +175,7 @@ def _coverage(content: Content) -> Iterator[str]:
             height,
             map_like=True,
         ),
-        f"Where the {number} were, coloured by the median gain {where}. Gain is the sum of |a|² over the "
+        f"Where users were, {number}, coloured by the median gain {where}. Gain is the sum of |a|² over the "
         f"paths{span}.{without}",
     )
     share = float(users.los[placed].mean())
@@ -213,9 +216,8 @@ def _sight(content: Content) -> Iterator[str]:
     count, sight, hidden, none = total
     shares = f"{percent(sight / count)} have a line of sight, {percent(hidden / count)} other paths only"
     names, _, *parts = zip(*bars, strict=True)
-    left_out = (
-        f" The {len(rows) - CLASSES} classes with fewest users have no bar." if len(rows) > CLASSES else ""
-    )
+    few = counted(len(rows) - CLASSES, "class", "classes")
+    left_out = f" Without a bar: {few} with fewest users." if len(rows) > CLASSES else ""
     yield figure(
         picture(
             draw_shares(names, *parts),
@@ -255,12 +257,14 @@ def _gain(content: Content) -> Iterator[str]:
         return
     yield _histogram(users, users.gain_db, some, "Gain", "dB", "sum of |a|² over the paths of a user")
     # Of a single path it is 0 but for rounding.
-    spread_ns = np.where(users.spread_s < _NO_SPREAD_S, 0.0, 1e9 * users.spread_s)
-    if not spread_ns[some].any():
+    spread = np.where(users.spread_s < _NO_SPREAD_S, 0.0, users.spread_s)
+    some &= np.isfinite(spread)
+    if not spread[some].any():
         yield absent("The delay spread of all users is 0: each has one path, or paths of equal length.")
         return
     explained = "square root of the second central moment of the power delay profile"
-    yield _histogram(users, spread_ns, some, "Delay spread", "ns", explained)
+    unit, name = small_time_unit(float(np.percentile(spread[some], 95)))
+    yield _histogram(users, spread / unit, some, "Delay spread", name, explained)
 
 
 _NO_SPREAD_S = 1e-15
@@ -306,8 +310,9 @@ def _angles(content: Content) -> Iterator[str]:
                 "paths and of the strongest path of each user.",
                 5.6,
             ),
-            f"{sample.paths:,} paths of {sampled(content)}. Angles are in world axes: zenith from +z, "
-            "azimuth counter-clockwise from +x (east); arrival is the direction that the wave comes from.",
+            f"{counted(sample.paths, 'path')} of {sampled(content)}. Angles are in world axes: zenith from "
+            "+z, azimuth counter-clockwise from +x (east); arrival is the direction that the wave comes "
+            "from.",
         )
 
 
@@ -320,6 +325,13 @@ def _beams(content: Content) -> Iterator[str]:
     if not some.any():
         yield absent("No user has a best pair of beams.")
         return
+    beams = [
+        max(_codebook(content, role), int(column[some].max()) + 1)
+        for role, column in (("tx", users.tx_beam), ("rx", users.rx_beam))
+    ]
+    if math.prod(beams) > MOST_PAIRS:
+        yield absent(f"Codebooks of {beams[0]:,} and {beams[1]:,} beams have too many pairs to be drawn.")
+        return
     counts = np.bincount(users.group[some], minlength=len(users.groups))
     shown = [int(group) for group in np.argsort(-counts, kind="stable")[:PANELS] if counts[group]]
     panels = []
@@ -327,14 +339,14 @@ def _beams(content: Content) -> Iterator[str]:
         mask = some & (users.group == group)
         carrier, tx = users.groups[group]
         panels.append((f"{tx}, {carrier}", users.tx_beam[mask], users.rx_beam[mask]))
-    codebooks = _codebook(content, "tx"), _codebook(content, "rx")
+    codebooks = beams[0], beams[1]
     pairs, numbers = np.unique(
         np.stack([users.group, users.tx_beam, users.rx_beam])[:, some], axis=1, return_counts=True
     )
     at = int(numbers.argmax())
     carrier, tx = users.groups[pairs[0, at]]
     left = int((counts > 0).sum()) - len(shown)
-    left_out = f" {left} more with fewer users are left out." if left else ""
+    left_out = f" Left out: {left} more with fewer users." if left else ""
     yield figure(
         picture(
             draw_beams(panels, codebooks),
@@ -342,9 +354,9 @@ def _beams(content: Content) -> Iterator[str]:
             f"{pairs[1, at]} of {tx} with beam {pairs[2, at]} of the receiver.",
             beams_height(panels),
         ),
-        f"How often a pair of beams is the best of all, on a logarithmic scale: {pairs.shape[1]:,} pairs "
-        f"occur, most often ({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam "
-        f"{pairs[2, at]} of the receiver, on carrier {carrier}.{left_out}",
+        f"How often a pair of beams is the best of all, on a logarithmic scale: of "
+        f"{counted(pairs.shape[1], 'pair')} that occur, most often "
+        f"({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam {pairs[2, at]} of the receiver, on carrier {carrier}.{left_out}",
     )
 
 
@@ -364,8 +376,8 @@ def _correlation(content: Content) -> Iterator[str]:
         yield absent("No channel is recorded: there is nothing to compare.")
     elif (most or 0) < 2:
         yield absent("Episodes have one scene: there are no consecutive scenes to compare.")
-    elif not sample.episodes:
-        yield absent("No recording is in the folder: there is nothing to compare.")
+    elif not sample.read:
+        yield absent("No recording in the folder can be read: there is nothing to compare.")
     elif not sample.has_h:
         yield absent("The matrices H are not recorded (channel.h): they cannot be compared.")
     elif not any(sample.consecutive):
@@ -373,7 +385,7 @@ def _correlation(content: Content) -> Iterator[str]:
     else:
         values = np.array(sample.correlation)[np.array(sample.consecutive)]
         *others, last = lags(sample)
-        later = f"; of scenes {last.apart_s:g} s apart {last.median:.3f}" if others else ""
+        later = f"; of scenes {time_text(last.apart_s)} apart {last.median:.3f}" if others else ""
         median = float(np.median(values))
         yield figure(
             picture(
@@ -384,60 +396,7 @@ def _correlation(content: Content) -> Iterator[str]:
             ),
             "|⟨H(k), H(k+1)⟩| / (‖H(k)‖ ‖H(k+1)‖) of the same user in two scenes of "
             f"{sampled(content)}: 1 where the channel has not changed but for a factor. Median of the "
-            f"{len(values):,} pairs of consecutive scenes {median:.3f}{later}.",
-        )
-
-
-def _generation(content: Content) -> Iterator[str]:
-    found = read_throughput(content.catalogue)
-    if found is None:
-        yield absent("No times are kept: how fast the episodes were played is not known.")
-    else:
-        rate = found.scenes / found.elapsed_s
-        where = counted(found.processes, "process", "processes")
-        where = f"{where} of {counted(found.hosts, 'machine')}"
-        text = (
-            f"{found.scenes:,} scenes of {counted(found.episodes, 'episode')} in "
-            f"{duration_text(found.elapsed_s)} at work, by {where}: {rate:.3g} scenes/s"
-        )
-        yield figure(
-            picture(
-                draw_throughput(found), f"Scenes per second over the time of the generation; {text}.", 3.1
-            ),
-            f"{text}. Scenes of an episode are spread evenly over its wall time.",
-        )
-        if found.services_s:
-            shares = dict(sorted(found.services_s.items(), key=lambda item: -item[1]))
-            rest = found.busy_s - sum(shares.values())
-            if rest > 0.0:
-                shares["start, reset, saving"] = rest
-            longest = max(shares, key=lambda name: shares[name])
-            yield figure(
-                picture(
-                    draw_services(shares, found.scenes),
-                    "Bars of the wall time that each service takes for a scene; the longest is that of "
-                    f"{longest}, {percent(shares[longest] / sum(shares.values()))} of all.",
-                    0.9 + 0.36 * len(shares),
-                ),
-                "Wall time for a scene, by service, on average of all episodes; what is left is loading, "
-                "resetting and saving an episode.",
-            )
-    _, ((attempts,),) = content.catalogue.query("SELECT count(*) FROM failures")
-    failures = content.catalogue.failures()
-    if failures:
-        yield f"<p>{counted(len(failures), 'episode')} failed; the same command tries again:</p>"
-        yield table(
-            ("episode", "error"), [(str(n), text) for n, text in failures[:SHOWN_FAILURES]], right=(0,)
-        )
-        if len(failures) > SHOWN_FAILURES:
-            yield f"<p>… and {len(failures) - SHOWN_FAILURES:,} more, in table <code>failures</code>.</p>"
-    else:
-        yield (
-            "<p>No episode failed.</p>"
-            if not attempts
-            else (
-                f"<p>No episode is missing; {counted(attempts, 'time')} one failed and was played again.</p>"
-            )
+            f"{counted(len(values), 'pair')} of consecutive scenes {median:.3f}{later}.",
         )
 
 
@@ -451,5 +410,5 @@ _SECTIONS: tuple[tuple[str, str, Callable[[Content], Iterator[str]]], ...] = (
     ("correlation", "Correlation of consecutive scenes", _correlation),
     ("lidar", "LIDAR", lidar_section),
     ("cameras", "Cameras", camera_section),
-    ("generation", "Generation", _generation),
+    ("generation", "Generation", generation_section),
 )

@@ -59,6 +59,8 @@ class Theme:
         ink = ("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.color", "ytick.color")
         paper = ("figure.facecolor", "axes.facecolor", "savefig.facecolor", "legend.facecolor")
         return {
+            # Names are the user's: a dollar sign in one is no formula.
+            "text.parse_math": False,
             **dict.fromkeys(ink, self.ink),
             **dict.fromkeys(paper, self.paper),
             "axes.edgecolor": self.muted,

@@ -121,7 +121,7 @@ def _scan_view(scan: Scan) -> View:
 
 def sampled(content: Content) -> str:
     """The sample in words."""
-    sample, read = content.sample, len(content.sample.episodes)
+    sample, read = content.sample, content.sample.read
     episodes = counted(read, "recorded episode")
     if read < sample.there:
         episodes = f"{read:,} of the {counted(sample.there, 'recorded episode')}, drawn with seed 0"
