@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sqlite3
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +20,8 @@ from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.look import data as look_data
 from caviar_clients.datasets.look import maps
-from caviar_clients.datasets.look.data import Scan, UserColumns, read_throughput, read_users
+from caviar_clients.datasets.look.data import Scan, UserColumns, read_users
+from caviar_clients.datasets.look.generation import read_throughput
 from caviar_clients.datasets.look.maps import cell_m, draw_gain, map_of
 from caviar_clients.datasets.look.page import write_page
 from caviar_clients.datasets.look.pictures import picture
@@ -27,6 +29,7 @@ from caviar_clients.datasets.look.scans import draw_scans, scans_height
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_protocol.errors import RecordingError, SetupError
+from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
 
 pytest.importorskip("matplotlib", reason="pictures need Matplotlib: extra plot")
@@ -232,9 +235,14 @@ def test_throughput_leaves_interruptions_out_and_adds_workers_up(tmp_path: Path)
     assert found.rate[-1] == pytest.approx(2.0)
 
 
-def test_failures_are_listed(folder: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "d"
-    shutil.copytree(folder, copy)
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    """Of the dataset, without its page."""
+    shutil.copytree(folder, tmp_path / "d", ignore=shutil.ignore_patterns("look.html"))
+    return tmp_path / "d"
+
+
+def test_failures_are_listed(copy: Path) -> None:
     catalogue = Catalogue(DatasetDirectory(copy).catalogue, writable=True)
     catalogue.add_failure(7, "2026-11-24T00:00:00", "the <world> ended", "host")
     catalogue.close()
@@ -248,7 +256,7 @@ def test_a_catalogue_without_recordings_has_its_tables_on_the_page(folder: Path,
     page = Page(write_page(tmp_path))
     assert "recordings of 3 episodes are not in the folder" in page.texts["dataset"]
     assert page.pictures == {"coverage": 2, "sight": 2, "gain": 1, "beams": 1, "generation": 2}
-    assert "No recording is in the folder" in page.texts["correlation"]
+    assert "No recording in the folder can be read" in page.texts["correlation"]
 
 
 def test_a_dataset_without_an_episode_says_so(tmp_path: Path) -> None:
@@ -261,6 +269,102 @@ def test_a_dataset_without_an_episode_says_so(tmp_path: Path) -> None:
     assert all("No episode is there yet." in page.texts[name] for name in SECTIONS[1:-1])
     assert "no <world>" in page.texts["generation"]
     assert "smoke" in page.texts["dataset"]
+
+
+def damaged(folder: Path, *episodes: int) -> None:
+    """Flip a bit of each of these recordings."""
+    for number in episodes:
+        file = RunDirectory(DatasetDirectory(folder).episode(number)).segment(0)
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 4
+        file.write_bytes(content)
+
+
+def test_a_damaged_recording_is_left_out_and_named(copy: Path) -> None:
+    damaged(copy, 1)
+    page = Page(write_page(copy))
+    assert "1 recording of the sample cannot be read, and is left out" in page.texts["dataset"]
+    assert "the generate command plays it again" in page.texts["dataset"]
+    assert re.search(r"why1.*recording-0000\.mcap", page.texts["dataset"], re.DOTALL)
+    assert "2 of the 3 recorded episodes, drawn with seed 0 (8 scenes)" in page.texts["angles"]
+
+
+def test_a_dataset_of_damaged_recordings_alone_has_its_tables_on_the_page(copy: Path) -> None:
+    damaged(copy, 0, 1, 2)
+    page = Page(write_page(copy))
+    assert "3 recordings of the sample cannot be read, and are left out" in page.texts["dataset"]
+    assert "No recording in the folder can be read" in page.texts["correlation"]
+    assert page.pictures == {"coverage": 2, "sight": 2, "gain": 1, "beams": 1, "generation": 2}
+
+
+def edit(folder: Path, sql: str) -> None:
+    with sqlite3.connect(DatasetDirectory(folder).catalogue) as connection:
+        assert connection.execute(sql).rowcount > 0
+
+
+@pytest.mark.parametrize(
+    ("sql", "said"),
+    [
+        (
+            "UPDATE users SET gain_db = 9e999 WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'",
+            "users.gain_db of episode 1, scene 2, user car/rx is inf, not a number within",
+        ),
+        ("UPDATE users SET x_m = 1e300", "users.x_m of episode 0, scene 0"),
+        ("UPDATE users SET paths = -1", "users.paths of episode 0, scene 0"),
+        ("UPDATE scenes SET users = -5", "scenes.users of episode 0, scene 0 is -5"),
+        ("UPDATE timings SET started = 'x'", "timings.started is 'x'"),
+        ("UPDATE timings SET detail = '[]'", "timings.detail is '[]'"),
+        ("UPDATE dataset SET value = '{'", "settings in table dataset"),
+        (
+            "UPDATE dataset SET value = json_set(value, '$.scenario.carriers[0].frequency_hz', 'x')",
+            "$.scenario.carriers[0].frequency_hz",
+        ),
+        (
+            "UPDATE dataset SET value = json_set(value, '$.scenario.services.channel.settings.obstacles', 5)",
+            "settings in table dataset",
+        ),
+    ],
+)
+def test_a_catalogue_with_what_cannot_be_is_an_error_that_names_it(sql: str, said: str, copy: Path) -> None:
+    edit(copy, f"{sql} WHERE key = 'settings'" if "UPDATE dataset" in sql else sql)
+    with pytest.raises(RecordingError) as caught:
+        write_page(copy)
+    assert said in str(caught.value)
+    assert str(DatasetDirectory(copy).catalogue) in str(caught.value)
+    assert not DatasetDirectory(copy).page.exists()
+
+
+def test_a_column_of_texts_is_no_column_of_numbers(copy: Path) -> None:
+    with sqlite3.connect(DatasetDirectory(copy).catalogue) as connection:
+        connection.executescript(
+            "CREATE TABLE loose AS SELECT * FROM users; DROP TABLE users; ALTER TABLE loose RENAME TO users;"
+            "UPDATE users SET gain_db = 'loud' WHERE episode = 2"
+        )
+    with pytest.raises(
+        RecordingError, match=r"users\.gain_db of episode 2, scene 0, .* is 'loud', and 7 more"
+    ):
+        write_page(copy)
+
+
+def test_names_are_no_formulas_and_units_fit_the_numbers(copy: Path) -> None:
+    edit(copy, r"UPDATE users SET carrier = '$\frac{', delay_spread_s = 2.5e-6")
+    edit(copy, "UPDATE users SET tx_beam = 1099511627776 WHERE episode = 0")
+    page = Page(write_page(copy))
+    assert "median 2.5 µs" in page.texts["gain"]
+    assert "have too many pairs to be drawn" in page.texts["beams"]
+    edit(copy, "UPDATE users SET tx_beam = 3")
+    assert r"on carrier $\frac{" in Page(write_page(copy)).texts["beams"]
+
+
+def test_one_is_no_plural(tmp_path: Path) -> None:
+    page = Page(write_page(make(tmp_path / "d", 1, 1)))
+    assert "2 paths of 1 recorded episode (1 scene)" in page.texts["angles"]
+    assert "1 scene of 1 episode in" in page.texts["generation"]
+    assert "on 2 objects" in page.texts["dataset"]
+    edit(tmp_path / "d", "DELETE FROM users WHERE rx = 'car/rx'")
+    page = Page(write_page(tmp_path / "d"))
+    assert "on 1 object" in page.texts["dataset"]
+    assert "on 1 objects" not in page.texts["dataset"]
 
 
 def test_a_folder_that_is_no_dataset_stays_as_it_is(tmp_path: Path) -> None:

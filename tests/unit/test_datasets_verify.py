@@ -347,7 +347,7 @@ def test_an_episode_that_was_never_played_and_one_too_many_are_found(data: Path)
 
 def test_episodes_that_are_missing_are_one_line_whatever_their_number(data: Path) -> None:
     catalogue = Catalogue(DatasetDirectory(data).catalogue, writable=True)
-    catalogue.plan(catalogue.settings, 10**14)
+    catalogue.plan(catalogue.settings, 10**7)
     for number in (5, 6, 8):
         catalogue.add_failure(number, "2026-11-24", "agent 'agent' failed", "here")
     catalogue.close()
@@ -355,8 +355,7 @@ def test_episodes_that_are_missing_are_one_line_whatever_their_number(data: Path
         (
             3,
             "episode",
-            "episodes 3–4, 7, 9–99999999999999 (99,999,999,999,994) are missing: "
-            "run the generate command again",
+            "episodes 3–4, 7, 9–9999999 (9,999,994) are missing: run the generate command again",
         ),
         (5, "episode", "episodes 5–6, 8 (3) failed: agent 'agent' failed"),
     ]
@@ -387,8 +386,9 @@ def edit(data: Path, sql: str) -> None:
         assert connection.execute(sql).rowcount == 1
 
 
-COPY_OF_CAR = """INSERT INTO users SELECT 7, scene, carrier, tx, rx, object, object_class, 0, 0, 0, 1, 1, 1, 0,
-    0, 0, 0, 0, 0, 0 FROM users {OF_CAR}"""
+COPY_OF_CAR = """
+INSERT INTO users SELECT 7, scene, carrier, tx, rx, object, object_class, 0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0
+FROM users {OF_CAR}"""
 OF_CAR = "WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'"
 
 

@@ -356,7 +356,8 @@ def _beams(content: Content) -> Iterator[str]:
         ),
         f"How often a pair of beams is the best of all, on a logarithmic scale: of "
         f"{counted(pairs.shape[1], 'pair')} that occur, most often "
-        f"({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam {pairs[2, at]} of the receiver, on carrier {carrier}.{left_out}",
+        f"({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam {pairs[2, at]} of the "
+        f"receiver, on carrier {carrier}.{left_out}",
     )
 
 
