@@ -18,6 +18,7 @@ from caviar_clients.datasets.look.pictures import (
     Theme,
     all_handles,
     panel_axes,
+    plain,
     share_axis,
 )
 from caviar_clients.datasets.look.units import time_unit
@@ -45,7 +46,7 @@ def draw_shares(
                         color="white" if colour == BLUE else "#1a1a1a",
                     )  # fmt: skip
             left = left + part
-        axes.set(yticks=at, yticklabels=names, xlim=(0, 100), xlabel="Share of users [%]")
+        axes.set(yticks=at, yticklabels=list(map(plain, names)), xlim=(0, 100), xlabel="Share of users [%]")
         axes.invert_yaxis()
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
@@ -103,7 +104,7 @@ def draw_histograms(panels: Sequence[tuple[str, Float64Array, BoolArray]], label
                     labels.append(name)
             weights = [np.full(len(part), 100.0 / len(numbers)) for part in parts]
             axes.hist(parts, edges, weights=weights, stacked=True, color=colours, label=labels)
-            axes.set(xlabel=label, title=title)
+            axes.set(xlabel=label, title=plain(title))
             share_axis(axes)
         handles, labels = all_handles(drawn)
         drawn.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
@@ -195,7 +196,7 @@ def draw_beams(panels: Sequence[tuple[str, Any, Any]], codebooks: tuple[int, int
             )  # fmt: skip
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_major_locator(MaxNLocator(9, integer=True, min_n_ticks=1))
-            axes.set(xlabel="Beam of the transmitter", ylabel="Beam of the receiver", title=title)
+            axes.set(xlabel="Beam of the transmitter", ylabel="Beam of the receiver", title=plain(title))
         bar = drawn.colorbar(shown, ax=list(found), label="Users", pad=0.01)
         ticks = [tick for power in range(8) for tick in (10**power, 3 * 10**power) if tick <= most]
         bar.set_ticks(ticks if len(ticks) < 9 else ticks[::2])
@@ -259,7 +260,7 @@ def draw_correlation(sample: Sample) -> Draw:
         share_axis(axes, "users")
         if len(found) > 1:
             axes = panels[1]
-            unit, name = time_unit(found[-1].apart_s)
+            unit, name = time_unit(found[0].apart_s)
             apart = [lag.apart_s / unit for lag in found]
             axes.fill_between(
                 apart, [lag.low for lag in found], [lag.high for lag in found], color=theme.first, alpha=0.25,

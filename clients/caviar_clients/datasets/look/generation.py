@@ -13,7 +13,7 @@ import numpy as np
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.look.data import Content
 from caviar_clients.datasets.look.html import absent, figure, table
-from caviar_clients.datasets.look.pictures import Draw, Theme, picture
+from caviar_clients.datasets.look.pictures import Draw, Theme, picture, plain
 from caviar_clients.datasets.look.units import rate_unit, small_time_unit, time_unit
 from caviar_clients.datasets.texts import counted, duration_text, percent
 from caviar_protocol.arrays import Float64Array
@@ -164,9 +164,9 @@ def draw_services(shares: Mapping[str, float], scenes: int) -> Draw:
 
     def draw(drawn: Any, theme: Theme) -> None:
         axes = drawn.subplots()
-        names = list(shares)
+        names = list(map(plain, shares))
         each = [seconds / max(scenes, 1) for seconds in shares.values()]
-        unit, unit_name = small_time_unit(max(each))
+        unit, unit_name = small_time_unit(max(each) / 10)  # as numbers that need no zeros after the point
         each = [seconds / unit for seconds in each]
         total = sum(each)
         axes.barh(names, each, color=theme.first, height=0.62)

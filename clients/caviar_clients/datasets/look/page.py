@@ -175,7 +175,7 @@ def _coverage(content: Content) -> Iterator[str]:
             height,
             map_like=True,
         ),
-        f"Where users were, {number}, coloured by the median gain {where}. Gain is the sum of |a|² over the "
+        f"Where users were ({number}), coloured by the median gain {where}. Gain is the sum of |a|² over the "
         f"paths{span}.{without}",
     )
     share = float(users.los[placed].mean())

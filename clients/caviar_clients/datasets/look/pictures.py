@@ -59,8 +59,6 @@ class Theme:
         ink = ("text.color", "axes.labelcolor", "axes.titlecolor", "xtick.color", "ytick.color")
         paper = ("figure.facecolor", "axes.facecolor", "savefig.facecolor", "legend.facecolor")
         return {
-            # Names are the user's: a dollar sign in one is no formula.
-            "text.parse_math": False,
             **dict.fromkeys(ink, self.ink),
             **dict.fromkeys(paper, self.paper),
             "axes.edgecolor": self.muted,
@@ -154,6 +152,16 @@ def _uri(data: bytes, kind: str) -> str:
 
 
 # --- maps ------------------------------------------------------------------------------------------------
+
+
+def plain(name: str) -> str:
+    """A name of the user's, in which a dollar sign begins no formula.
+
+    Example:
+        >>> print(plain("$a"))
+        \\$a
+    """
+    return name.replace("$", r"\$")
 
 
 def panel_axes(drawn: Any, count: int) -> list[Any]:

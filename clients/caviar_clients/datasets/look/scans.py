@@ -20,6 +20,7 @@ from caviar_clients.datasets.look.pictures import (
     all_handles,
     picture,
     pixels,
+    plain,
 )
 from caviar_clients.datasets.texts import counted
 from caviar_clients.plots.map import View
@@ -44,7 +45,8 @@ def draw_scans(scans: Sequence[Scan]) -> Draw:
             )  # fmt: skip
             (left, right), (bottom, top) = _scan_view(scan)
             axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-            axes.set_title(scan.title.replace("\n", ", ") if columns == 1 else scan.title, fontsize=9.5)
+            title = plain(scan.title)
+            axes.set_title(title.replace("\n", ", ") if columns == 1 else title, fontsize=9.5)
         for axes in panels[-1]:
             axes.set_xlabel("x, east [m]")
         for axes in panels[:, 0]:
