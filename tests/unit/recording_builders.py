@@ -245,8 +245,8 @@ def recorder(
 ) -> McapRecorder:
     """A prepared recorder that writes to ``folder``.
 
-    ``run`` replaces keys of that table of the scenario, ``seed`` is that of the run; ``again`` says that the recorder died and was started
-    anew.
+    ``run`` replaces keys of that table of the scenario, ``seed`` is that of the run; ``again`` says that
+    the recorder died and was started anew.
     """
     info = RunInfo(
         name="recorder",

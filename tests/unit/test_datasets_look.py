@@ -93,6 +93,13 @@ def page(folder: Path) -> Page:
     return Page(write_page(folder))
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are one pixel each: the texts of a page are looked at."""
+    header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (1).to_bytes(4) * 2
+    monkeypatch.setattr(pictures, "_png", lambda *_: header)
+
+
 def test_a_page_has_every_section_that_its_recordings_allow(page: Page) -> None:
     assert [name for name in page.texts if name] == list(SECTIONS)
     assert page.pictures == {
@@ -143,6 +150,7 @@ def test_a_dataset_of_scenes_alone_says_what_is_missing(tmp_path: Path) -> None:
         assert words in page.texts[name], name
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_channel_without_link_has_paths_and_no_beams(tmp_path: Path) -> None:
     text = Path(load_scenario("smoke").source.file).read_text()
     kept = re.sub(r"(?ms)^\[services\.(agent|link)\]\n.*?(?=^\[|\Z)", "", text)
@@ -207,6 +215,7 @@ def test_users_are_read_in_parts(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_sample_of_many_episodes_is_stated(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -243,6 +252,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return tmp_path / "d"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_failures_are_listed(copy: Path) -> None:
     catalogue = Catalogue(DatasetDirectory(copy).catalogue, writable=True)
     catalogue.add_failure(7, "2026-11-24T00:00:00", "the <world> ended", "host")
@@ -252,6 +262,7 @@ def test_failures_are_listed(copy: Path) -> None:
     assert "the <world> ended" in page.texts["generation"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_catalogue_without_recordings_has_its_tables_on_the_page(folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "catalogue.sqlite", tmp_path)
     page = Page(write_page(tmp_path))
@@ -281,13 +292,6 @@ def damaged(folder: Path, *episodes: int) -> None:
         file.write_bytes(content)
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are one pixel each: the texts of a page are looked at."""
-    header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (1).to_bytes(4) * 2
-    monkeypatch.setattr(pictures, "_png", lambda *_: header)
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_damaged_recording_is_left_out_and_named(copy: Path) -> None:
     damaged(copy, 1)
@@ -312,6 +316,7 @@ def edit(folder: Path, sql: str) -> None:
         assert connection.execute(sql).rowcount > 0
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("sql", "said"),
     [

@@ -387,7 +387,8 @@ def edit(data: Path, sql: str) -> None:
 
 
 COPY_OF_CAR = """
-INSERT INTO users SELECT 7, scene, carrier, tx, rx, object, object_class, 0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0
+INSERT INTO users
+SELECT 7, scene, carrier, tx, rx, object, object_class, 0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0
 FROM users {OF_CAR}"""
 OF_CAR = "WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'"
 
