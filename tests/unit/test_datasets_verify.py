@@ -193,6 +193,19 @@ CONTENT: dict[str, tuple[dict[str, Change], str, str]] = {
         "car/rx",
         "line of sight",
     ),
+    "a free line of sight that is said to be hidden, in all products": (
+        {
+            "channel": of_channel(los=lambda c: changed(c.los, (0, 0), False)),
+            "link": lambda link: replace(link, los=changed(link.los, 0, False)),
+        },
+        "car/rx",
+        "line of sight",
+    ),
+    "a line of sight that the link has otherwise": (
+        {"link": lambda link: replace(link, los=changed(link.los, 0, False))},
+        "car/rx",
+        "line of sight of the link",
+    ),
     "another carrier": (
         {"channel": of_channel(carriers=lambda c: (replace(c.carriers[0], frequency_hz=30e9),))},
         "",

@@ -223,7 +223,8 @@ def verify_command(
     )
     for one in findings[:SHOWN_FINDINGS]:
         scene = "" if one.scene is None else str(one.scene)
-        cells = (str(one.episode), scene, one.user, one.what, one.expected, one.found)
+        episode = "" if one.episode < 0 else str(one.episode)  # of the dataset as a whole
+        cells = (episode, scene, one.user, one.what, one.expected, one.found)
         table.add_row(*(Text(printable(cell)) for cell in cells))
     console.print(table)
     more = f", the first {SHOWN_FINDINGS} are above" if len(findings) > SHOWN_FINDINGS else ""

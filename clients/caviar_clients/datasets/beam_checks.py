@@ -10,7 +10,7 @@ import numpy as np
 from caviar_clients.datasets.findings import Finding
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.space.scene import antennas
-from caviar_protocol.topics import AntennaArray, Carrier, Link, Scene
+from caviar_protocol.topics import AntennaArray, Carrier, Channel, Link, Scene
 from caviar_services.link.beam_sweep import best_pairs, sweep
 from caviar_services.link.link_budget import noise_power
 
@@ -23,6 +23,22 @@ SNR = 1e-9
 
 User = tuple[str, str, str]
 """Carrier, transmitter and receiver."""
+
+
+def check_flags(place: tuple[int, int], channel: Channel, link: Link) -> Iterator[Finding]:
+    """Lines of sight of a link that are not those of its channel.
+
+    Args:
+        place: Episode and scene.
+        channel: Of the scene.
+        link: Of the scene.
+    """
+    for row, (tx, rx) in enumerate(zip(link.tx, link.rx, strict=True)):
+        if tx in channel.tx and rx in channel.rx:
+            right = bool(channel.los[channel.tx.index(tx), channel.rx.index(rx)])
+            if right != bool(link.los[row]):
+                words = {True: "free", False: "hidden"}
+                yield Finding(*place, rx, "line of sight of the link", words[right], words[not right])
 
 
 def check_beams(

@@ -14,7 +14,15 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_clients.datasets.beam_checks import BEAM, FROM_PATHS, User, arrays_fit, check_beams, check_snr
+from caviar_clients.datasets.beam_checks import (
+    BEAM,
+    FROM_PATHS,
+    User,
+    arrays_fit,
+    check_beams,
+    check_flags,
+    check_snr,
+)
 from caviar_clients.datasets.findings import Finding
 from caviar_clients.datasets.path_checks import (
     DELAY,
@@ -149,6 +157,7 @@ class PhysicsChecks:
                     matrices[user] = summed, FROM_PATHS
         yield from _reciprocity(place, channel)
         for link in links:
+            yield from check_flags(place, channel, link)
             yield from check_beams(place, scene, link, matrices)
             if self._budget is not None:
                 yield from check_snr(place, scene, link, channel.carriers, self._budget)
@@ -249,7 +258,8 @@ def _paths(pair: Pair) -> Iterator[Finding]:
 
 
 def _line_of_sight(pair: Pair) -> Iterator[Finding]:
-    """A free line of sight without a direct path, or with one that is weaker than in free space."""
+    """A free line of sight without a direct path, or with one weaker than in free space; a hidden one with a
+    direct path."""
     channel, (tx, rx), options = pair.channel, pair.ends, pair.channel.options
     distance = float(np.linalg.norm(rx.position - tx.position))
     # Nearer than a wavelength far-field gains do not hold, and there is no path.
@@ -260,7 +270,12 @@ def _line_of_sight(pair: Pair) -> Iterator[Finding]:
         if channel.los[pair.tx, pair.rx] and options.los:
             yield pair.finding("line of sight", "a direct path", "none")
         return
-    if options.foliage or options.blockage or options.absorption_db_per_km:
+    # Foliage and people weaken a line of sight that is not free, and let it through.
+    if options.foliage or options.blockage:
+        return
+    if not channel.los[pair.tx, pair.rx]:
+        yield pair.finding("line of sight", "free, as of a direct path", "hidden")
+    if options.absorption_db_per_km:
         return
     if not tx.array.is_uniform or not rx.array.is_uniform:
         return

@@ -152,7 +152,7 @@ def lidar_section(content: Content) -> Iterator[str]:
                 scans_height(scans),
                 map_like=True,
             ),
-            f"Scans from above: {what}.",
+            f"{'Scan' if len(scans) == 1 else 'Scans'} from above: {what}.",
         )
 
 
