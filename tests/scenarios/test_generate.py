@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +20,13 @@ import psutil
 import pytest
 
 import caviar
+from caviar_clients.datasets import cluster_watch
+from caviar_clients.datasets.generate import Outcome
+from caviar_clients.datasets.generate import generate as generate_dataset
+from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.verify import verify
+from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
@@ -134,7 +142,7 @@ def test_killed_workers_and_commands_change_no_byte(scenario: Path, reference: P
     done = generate(scenario, out)
     assert done.returncode == 0, done.stdout + done.stderr
     assert content(out) == content(reference)
-    assert list((out / ".work").iterdir()) == []
+    assert not (out / ".work").exists()
 
 
 @contextmanager
@@ -257,7 +265,7 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
     assert "Traceback" not in errors
     gone, alive = psutil.wait_procs(workers, timeout=10.0)
     assert (len(gone) >= 2, alive) == (True, [])
-    assert list((out / ".work").iterdir()) == []
+    assert not (out / ".work").exists()
 
 
 @pytest.mark.parametrize("small_disk", ["4m"], indirect=True)
@@ -342,3 +350,114 @@ def test_addresses_that_cannot_be_used_are_refused(scenario: Path, tmp_path: Pat
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "cannot be written" in done.stderr
+
+
+class Notes:
+    """Keeps what a generation tells."""
+
+    def __init__(self) -> None:
+        self.texts = list[str]()
+        self.is_estimated = False
+
+    def note(self, text: str) -> None:
+        self.texts.append(text)
+
+    def traffic(self, now_s: float, end_s: float) -> None: ...
+
+    def estimated(self, *_: object) -> None:
+        self.is_estimated = True
+
+    def ended(self, _: object) -> None: ...
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds in place of minutes."""
+    limits = {"LOOK_S": 0.5, "NOTE_S": 2.0, "SILENT_S": 4.0, "NO_WORKER_S": 6.0, "STALLED_S": 8.0}
+    for name, seconds in limits.items():
+        monkeypatch.setattr(cluster_watch, name, seconds)
+
+
+@pytest.fixture
+def sleeper(tmp_path: Path) -> Path:
+    """A scenario whose agent never answers in a late scene of episode 1, which no trial has."""
+    (tmp_path / "sleeping_agent.py").write_text(
+        "import time\n"
+        "from caviar_services.agent.baselines import RandomAgent\n"
+        "class Sleeper(RandomAgent):\n"
+        "    def step(self, frame):\n"
+        "        while frame.episode == 1 and frame.number == 4:\n"
+        "            time.sleep(0.1)\n"
+        "        return super().step(frame)\n"
+    )
+    file = tmp_path / "sleeper.toml"
+    file.write_text(SMOKE.read_text().replace('use = "los-beam"', 'use = "sleeping_agent:Sleeper"', 1))
+    return file
+
+
+def generated(scenario: Path, out: Path, notes: Notes, scheduler: str = "", scenes: int = 5) -> Outcome:
+    plan = plan_dataset(load_scenario(scenario), episodes=3, scenes=scenes)
+    return generate_dataset(plan, out, notes, workers=1, scheduler=scheduler)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.usefixtures("impatient")
+def test_an_agent_that_never_answers_costs_its_episode_alone(sleeper: Path, tmp_path: Path) -> None:
+    notes = Notes()
+    outcome = generated(sleeper, tmp_path / "d", notes)
+    assert (outcome.episodes, list(outcome.failed)) == (2, [1])
+    assert "in one step, 8 s are the limit: waiting for agent 'agent' in frame 4" in outcome.failed[1]
+    assert "sleeping_agent.py:6 in step" in outcome.failed[1]
+    assert any("no episode has ended for" in text and "waiting for agent" in text for text in notes.texts)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("when", ["before", "trials", "play"])
+def test_a_cluster_whose_workers_are_gone_ends_the_command(
+    scenario: Path, tmp_path: Path, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = str(free_port())
+    address = f"tcp://127.0.0.1:{port}"
+    start = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    arguments = ("worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny", "--host", "127.0.0.1")
+    notes = Notes()
+    with dask(*start), dask(*arguments) as worker:
+        monkeypatch.setattr(notes, "estimated", lambda *_: worker.kill() if when == "play" else None)
+        if when == "before":
+            worker.kill()
+            said = f"no Dask scheduler answers at {address}|or it has no worker"
+        elif when == "trials":
+            worker_of_trials(worker)
+            said = "a process that tried a scene beforehand died|has had no worker"
+        else:
+            said = f"{address} has had no worker for .* s: start one with dask worker {address} --nthreads 1"
+        with pytest.raises(RunError, match=said):
+            generated(scenario, tmp_path / "d", notes, address, scenes=100)
+
+
+def worker_of_trials(worker: subprocess.Popen[bytes]) -> None:
+    """Kill a worker two seconds from now, in the scenes that are tried."""
+    threading.Timer(2.0, worker.kill).start()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.usefixtures("impatient")
+def test_workers_that_are_stopped_are_named(scenario: Path, tmp_path: Path) -> None:
+    notes = Notes()
+    pids = list[int]()
+
+    def stop(*_: object) -> None:
+        pids.extend(child.pid for child in children(psutil.Process()))
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        threading.Timer(12.0, wake).start()
+
+    def wake() -> None:
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+
+    notes.estimated = stop  # type: ignore[method-assign]
+    outcome = generated(scenario, tmp_path / "d", notes)
+    assert (outcome.episodes, outcome.failed) == (3, {})
+    assert any("1 of 1 workers give no sign of life: tcp://127.0.0.1:" in text for text in notes.texts)

@@ -91,7 +91,7 @@ def test_a_twin_leaves_the_recording_that_is_there(tmp_path: Path) -> None:
     assert result.rows is not None
     assert result.rows.episode[:2] == (0, 3)
     assert DatasetDirectory(tmp_path).episode(0).stat().st_ino == before
-    assert list(DatasetDirectory(tmp_path).work.iterdir()) == []
+    assert not DatasetDirectory(tmp_path).work.exists()
 
 
 def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> No
     assert "the agent has no answer" in result.error
     assert "frame 2" in result.error
     assert DatasetDirectory(tmp_path).finished() == []
-    assert list(DatasetDirectory(tmp_path).work.iterdir()) == []
+    assert not DatasetDirectory(tmp_path).work.exists()
 
 
 def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:
@@ -118,11 +118,40 @@ def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:
 
 def test_what_a_killed_command_left_half_written_is_removed(tmp_path: Path) -> None:
     directory = DatasetDirectory(tmp_path)
-    with writing_dataset(directory):
-        pass
     (directory.work / "3-abc" / "episode-000003").mkdir(parents=True)
     with writing_dataset(directory):
         assert list(directory.work.iterdir()) == []
+        (directory.work / "4-abc").mkdir()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes"]
+
+
+def interrupted(directory: DatasetDirectory, *begun: str) -> None:
+    with writing_dataset(directory):
+        for name in begun:
+            (directory.work / name).mkdir()
+        raise KeyboardInterrupt
+
+
+def test_what_workers_elsewhere_still_write_is_left_after_a_fault(tmp_path: Path) -> None:
+    directory = DatasetDirectory(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(directory, "4-abc")
+    assert [path.name for path in directory.work.iterdir()] == ["4-abc"]
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(directory)
+    assert not directory.work.exists()
+
+
+def test_a_folder_that_is_named_nearly_like_an_episode_is_refused(tmp_path: Path) -> None:
+    directory = DatasetDirectory(tmp_path)
+    for name in ("episode-000009", "episode-1000000", ".hidden", "notes"):
+        (directory.episodes / name).mkdir(parents=True)
+    assert directory.finished() == [9, 1000000]
+    for name in ("episode-9", "episode-0000009", "episode-9999999999999999999", "episode-000009.old"):
+        (directory.episodes / name).mkdir()
+        with pytest.raises(RunError, match=rf"{name} is named like an episode.*episode-000009 for number 9"):
+            directory.finished()
+        (directory.episodes / name).rmdir()
 
 
 def test_a_scenario_that_makes_no_dataset_is_refused() -> None:

@@ -242,7 +242,7 @@ def _remove(out: str) -> None:
         remote = RemoteDataset(out)
         remote.remove()
         directory = remote.written()
-    if not directory.catalogue.exists():
+    if not directory.catalogue.exists() and not directory.finished():
         return
     with writing_dataset(directory):
         for folder in (directory.episodes, directory.assets, directory.tables):

@@ -10,16 +10,24 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing
 from dataclasses import fields
 from pathlib import Path
 from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import msgspec
 
+from caviar_clients.datasets.database import REBUILT, database_errors
 from caviar_clients.datasets.rows import Episode, EpisodeRows, ProductRow, SceneRow, UserRow
 from caviar_protocol.errors import RecordingError
+
+FORMAT = 1
+"""Version of the layout of a dataset: of its catalogue, its files and its settings."""
+
+_TYPES_DIFFER = "has columns of other types, or another key"
+LOCKED_S = 5.0
+"""[s] for which the lock of another process is waited for."""
 
 TABLES: dict[str, tuple[type[Any], tuple[str, ...]]] = {
     "episodes": (Episode, ("episode",)),
@@ -34,25 +42,53 @@ MEASURED_TABLES = ("timings", "failures")
 
 _SQL_TYPES = {int: "INTEGER", float: "REAL", str: "TEXT", bool: "INTEGER"}
 _MEASURED = """
-CREATE TABLE IF NOT EXISTS dataset (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS timings (
+CREATE TABLE dataset (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID;
+CREATE TABLE timings (
     episode INTEGER PRIMARY KEY, started TEXT, host TEXT, pid INTEGER, wall_s REAL, cpu_s REAL, detail TEXT
 ) STRICT;
-CREATE TABLE IF NOT EXISTS failures (
+CREATE TABLE failures (
     episode INTEGER NOT NULL, failed TEXT NOT NULL, error TEXT NOT NULL, host TEXT
 ) STRICT;
 """
 
 
+class _Run(msgspec.Struct):
+    frames: Annotated[int, msgspec.Meta(ge=1)]
+    sampling_period_ns: Annotated[int, msgspec.Meta(ge=0)]
+    instants_s: list[float] = []
+
+
+class _Scenario(msgspec.Struct):
+    run: _Run
+    services: dict[str, dict[str, Any]]
+    devices: list[dict[str, Any]] = []
+    carriers: list[dict[str, Any]] = []
+
+
+class _Settings(msgspec.Struct):
+    """What readers of a dataset rely on in its settings, whatever else these have."""
+
+    format: int
+    scenario: _Scenario
+    files: dict[str, Any]
+    versions: dict[str, Any]
+    device: str
+
+
 class Catalogue:
     """The catalogue of a dataset.
+
+    Its tables, their columns, the settings and the numbers of episodes are checked when it is opened, so that
+    what reads it meets nothing else.
 
     Args:
         path: Of the database.
         writable: Whether it is made where it is not there, and may be written.
+        name: As errors call it, where that is not its path: its address.
 
     Raises:
-        RecordingError: It is not a catalogue, or cannot be read.
+        RecordingError: It is not a catalogue, one of another version, or cannot be read; the text says what
+            to do.
 
     Example:
         >>> catalogue = Catalogue(Path("d/catalogue.sqlite"))  # doctest: +SKIP
@@ -60,8 +96,8 @@ class Catalogue:
         [0, 1, 2]
     """
 
-    def __init__(self, path: Path, *, writable: bool = False) -> None:
-        self.path, self._is_writable = path, writable
+    def __init__(self, path: Path, *, writable: bool = False, name: str = "") -> None:
+        self.path, self._is_writable, self._name = path, writable, name or str(path)
         if not writable and not path.is_file():
             raise RecordingError(
                 f"{path.parent} is no dataset, it has no {path.name}; make one with: "
@@ -69,16 +105,52 @@ class Catalogue:
             )
         with self._errors():
             mode = "rwc" if writable else "ro"
-            self._connection = sqlite3.connect(f"file:{_quoted(path)}?mode={mode}", uri=True)
-            if writable:
-                self._connection.execute("PRAGMA journal_mode = WAL")
-                self._connection.execute("PRAGMA synchronous = NORMAL")
-                self._connection.execute(
-                    "PRAGMA wal_autocheckpoint = 100"
-                )  # pages of 4 KiB beside the database
-                self._connection.executescript(_schema())
-            else:
-                self._connection.execute("SELECT count(*) FROM dataset").fetchone()
+            self._connection = sqlite3.connect(
+                f"file:{_quoted(path)}?mode={mode}", uri=True, timeout=LOCKED_S
+            )
+        try:
+            self._open()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def _open(self) -> None:
+        """Make the tables of a new database; check those of any other, before anything is changed."""
+        with self._errors():
+            is_new = not self._connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]
+        if not is_new or not self._is_writable:
+            self._check()
+        if not self._is_writable:
+            return
+        with self._errors():
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = NORMAL")
+            self._connection.execute("PRAGMA wal_autocheckpoint = 100")  # pages of 4 KiB beside the database
+            if is_new:  # all tables or none, wherever a kill comes
+                self._connection.executescript(f"BEGIN;{_schema()}COMMIT;")
+
+    def _check(self) -> None:
+        """Raise `RecordingError` where this is no catalogue of this version.
+
+        One whose columns have other types may be read, since `verify` looks at the values, but not written.
+        """
+        with self._errors(), closing(sqlite3.connect(":memory:")) as model:
+            model.executescript(_schema())
+            expected = {name: _described(model, name) for name in ("dataset", *TABLES, *MEASURED_TABLES)}
+            found = {name: _described(self._connection, name) for name in expected}
+        if found["dataset"] == expected["dataset"]:  # its format says more than a table of another version
+            _, _ = self.settings, self.planned
+        for table in expected:
+            wrong = _difference(found[table], expected[table])
+            if wrong and (self._is_writable or wrong != _TYPES_DIFFER):
+                raise self._no_catalogue(f"table {table} {wrong}")
+        for table in (*TABLES, *MEASURED_TABLES):
+            (least,) = self._rows(f"SELECT min(episode) FROM {table}")[0]  # noqa: S608 - names of our own
+            if least is not None and least < 0:
+                raise self._no_catalogue(f"table {table} has an episode {least}, and they count from 0")
+
+    def _no_catalogue(self, why: str, remedy: str = REBUILT) -> RecordingError:
+        return RecordingError(f"{self._name} is no catalogue that can be used: {why}; {remedy}")
 
     def close(self) -> None:
         """Close the database; what was added stays."""
@@ -98,24 +170,40 @@ class Catalogue:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings of the dataset (`plan.DatasetPlan.settings`); empty where none were kept."""
+        """Settings of the dataset (`plan.DatasetPlan.settings`); empty where none were kept.
+
+        Raises:
+            RecordingError: They are not what a dataset of this version has.
+        """
         text = self._note("settings")
+        if not text:
+            return {}
         try:
-            return msgspec.json.decode(text, type=dict[str, Any]) if text else {}
+            settings: dict[str, Any] = msgspec.json.decode(text, type=dict[str, Any])
+            made_as = settings.get("format", FORMAT)
+            if made_as != FORMAT and isinstance(made_as, int):
+                remedy = (
+                    "read it with that version of CAVIAR, or generate it anew with another --out"
+                    if made_as < FORMAT
+                    else "install a newer version of CAVIAR"
+                )
+                raise self._no_catalogue(f"it has format {made_as}, and this version reads {FORMAT}", remedy)
+            msgspec.convert(settings, _Settings)
         except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
-            raise RecordingError(
-                f"{self.path}: settings in table dataset are not those of a dataset: {error}"
-            ) from error
+            raise self._no_catalogue(f"the settings in table dataset are damaged: {error}") from error
+        return settings
 
     @property
     def planned(self) -> int:
-        """Episodes that the dataset shall have."""
+        """Episodes that the dataset shall have.
+
+        Raises:
+            RecordingError: It is no number of episodes.
+        """
         text = self._note("episodes") or "0"
-        # Python refuses to read thousands of digits with an error of its own.
-        if not (text.isascii() and text.isdecimal() and len(text) < 20):
-            raise RecordingError(
-                f"{self.path}: episodes in table dataset is {text!r:.80}: a number is needed"
-            )
+        # SQLite's integers, which number the episodes, end below 2^63.
+        if not (text.isascii() and text.isdecimal()) or len(text) > 18:
+            raise self._no_catalogue(f"the number of episodes in table dataset is {text[:40]!r}")
         return int(text)
 
     def plan(self, settings: Mapping[str, Any], episodes: int) -> None:
@@ -135,6 +223,10 @@ class Catalogue:
     def episodes(self) -> list[int]:
         """Numbers of the episodes that are there, in order."""
         return [number for (number,) in self._rows("SELECT episode FROM episodes ORDER BY episode")]
+
+    def sizes(self) -> dict[int, int]:
+        """Size of the recording of each episode [B], by its number, in order."""
+        return dict(self._rows("SELECT episode, bytes FROM episodes ORDER BY episode"))
 
     def add(self, rows: EpisodeRows, measured: Mapping[str, Any]) -> None:
         """Add an episode in one transaction; one that is there is replaced.
@@ -204,6 +296,8 @@ class Catalogue:
         """
         with self._errors():
             cursor = self._connection.execute(sql, parameters)
+            if cursor.description is None:
+                raise RecordingError(f"{self._name}: {sql!r} asks for no columns; write a SELECT")
             return tuple(column[0] for column in cursor.description), cursor.fetchall()
 
     def table(self, name: str) -> tuple[tuple[str, ...], list[Any]]:
@@ -227,14 +321,8 @@ class Catalogue:
         marks = ", ".join("?" * len(fields(TABLES[table][0])))
         self._connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            is_full = getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
-            remedy = "; free space there: the same command then goes on" if is_full else ""
-            raise RecordingError(f"{self.path}: {error}{remedy}") from error
+    def _errors(self) -> AbstractContextManager[None]:
+        return database_errors(self.path, self._name)
 
 
 def _quoted(path: Path) -> str:
@@ -254,14 +342,41 @@ def columns_of(table: str) -> dict[str, str]:
     """
     if table in TABLES:
         return {column.split()[0]: column.split()[1] for column in _columns(TABLES[table][0])}
-    with sqlite3.connect(":memory:") as connection:
+    with closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(_MEASURED)
-        return {name: kind for _, name, kind, *_ in connection.execute(f"PRAGMA table_info({table})")}
+        return {name: kind for name, kind, *_ in _described(connection, table)}
+
+
+def _described(connection: sqlite3.Connection, table: str) -> list[tuple[Any, ...]]:
+    """Name, type, whether NULL is refused, and place in the key of each column; empty where no table is.
+
+    A table whose types bind nothing (not ``STRICT``), or that is a view, has columns of the kind ``ANY``.
+    """
+    about = connection.execute("SELECT type, strict FROM pragma_table_list(?)", (table,)).fetchall()
+    columns = connection.execute('SELECT name, type, "notnull", pk FROM pragma_table_info(?)', (table,))
+    return [
+        (name, kind if about == [("table", 1)] else "ANY", *others)
+        for name, kind, *others in columns.fetchall()
+    ]
+
+
+def _difference(found: Sequence[tuple[Any, ...]], expected: Sequence[tuple[Any, ...]]) -> str:
+    """What is wrong with a table, by the descriptions of its columns; empty where nothing is."""
+    if not found:
+        return "is missing"
+    names, right = [column[0] for column in found], [column[0] for column in expected]
+    if lacking := [name for name in right if name not in names]:
+        return f"has no column {lacking[0]}"
+    if strange := [name for name in names if name not in right]:
+        return f"has a column {strange[0]} too many"
+    if names != right:
+        return f"has its columns in the order {', '.join(names)}"
+    return "" if found == expected else _TYPES_DIFFER
 
 
 def _schema() -> str:
     return _MEASURED + "".join(
-        f"CREATE TABLE IF NOT EXISTS {name} ({', '.join(_columns(cls))}, PRIMARY KEY ({', '.join(key)})) "
+        f"CREATE TABLE {name} ({', '.join(_columns(cls))}, PRIMARY KEY ({', '.join(key)})) "
         "STRICT, WITHOUT ROWID;\n"
         for name, (cls, key) in TABLES.items()
     )

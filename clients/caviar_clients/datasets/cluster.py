@@ -6,16 +6,18 @@ may be played twice without harm: so a worker that dies, hangs or loses its sche
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
+from caviar_clients.datasets.cluster_watch import NOTE_S, TOPIC, ClusterWatch, Stall
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_services.drjit_setup import THREADS_VARIABLE
 
 # Part of the extra `datasets`: imported where it is used.
@@ -29,6 +31,8 @@ QUEUED = 2
 CONNECT_S = 10.0
 RECONNECT_S = 600.0
 """[s] for which a scheduler that is gone is waited for."""
+ANSWER_S = 20.0
+"""[s] within which a scheduler answers, and a worker hands over what came of an episode."""
 STRAGGLER = 6.0
 """An episode that takes so many times as long as the mean, when no other is left to begin, is begun on a
 second worker."""
@@ -36,6 +40,8 @@ second worker."""
 _CONFIG = {
     # Episodes are begun again by `Episodes`, which counts: one that kills its worker does so a few times.
     "distributed.scheduler.allowed-failures": 0,
+    # [s] without a sign of life after which a process of this machine is started anew.
+    "distributed.scheduler.worker-ttl": "120s",
     "distributed.worker.daemon": True,
     # Its samples of stacks grow by 0.3 MB an episode, for good (distributed 2026.8).
     "distributed.worker.profile.enabled": False,
@@ -75,6 +81,7 @@ class Episodes:
         """Processes that play; of a scheduler elsewhere it is known once it is connected."""
         self._scheduler, self._note = scheduler, on_note
         self._client: Client | None = None
+        self._watch = ClusterWatch(scheduler, dict, on_note)
         self._stack = ExitStack()
 
     def __enter__(self) -> Episodes:
@@ -89,7 +96,11 @@ class Episodes:
             "tornado",
         ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._connect()
+        try:
+            self._connect()
+        except BaseException:
+            self._disconnect()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -103,24 +114,46 @@ class Episodes:
             arguments: Of it.
 
         Returns:
-            What it returned, by worker.
+            What it returned, by worker; those that are gone meanwhile are left out.
+
+        Raises:
+            RunError: A worker died, all are gone, or a step of a service does not end.
         """
         client = self._connected
-        addresses = list(client.scheduler_info(n_workers=-1)["workers"])
-        futures = [
-            client.submit(function, *arguments, workers=[address], pure=False, allow_other_workers=False)
-            for address in addresses
-        ]
+        pending = {
+            client.submit(
+                function, *arguments, workers=[address], pure=False, allow_other_workers=False
+            ): address
+            for address in self._last_seen()
+        }
+        self._watch.progressed(time.monotonic())
         try:
-            return list(client.gather(futures))
-        except Exception as error:
-            # Of Dask: the process died, or its machine is gone.
-            if type(error).__name__ != "KilledWorker":
-                raise
+            found = list(self._tried(pending))
+        except (LostSchedulerError, OSError, TimeoutError) as error:
             raise RunError(
-                "a process that tried a scene beforehand died, of a signal, a lack of memory or an exit of a "
-                "service; play it alone with --workers 1 to see it"
+                f"the Dask scheduler {self._where} was lost while scenes were tried "
+                f"({error or 'it does not answer'}); start it again, and run the same command"
             ) from error
+        if not found:
+            raise RunError(
+                f"all workers of the Dask scheduler {self._where} that tried scenes are gone; start others, "
+                "with --nthreads 1, and run the same command"
+            )
+        return found
+
+    def _tried(self, pending: dict[Future, str]) -> Iterator[Any]:
+        """What came of trials, as they end, by the address of their workers."""
+        what = "scenes have been tried beforehand, at every worker,"
+        while pending:
+            for future in self._ended(pending):
+                del pending[future]
+                yield _result_of_trial(future)
+            for stall in self._watch.look(time.monotonic(), what, None).values():
+                raise RunError(f"no scene can be played: {stall.error}")
+            # No other worker may have the task of one that is gone.
+            if there := self._watch.present:
+                for future in [one for one, address in pending.items() if address not in there]:
+                    del pending[future]
 
     def play(self, tasks: Iterable[EpisodeTask]) -> Iterator[EpisodeResult]:
         """Play episodes, and yield what came of each, as they end.
@@ -129,16 +162,17 @@ class Episodes:
             tasks: The episodes, in the order in which they begin.
 
         Raises:
-            RunError: The scheduler is gone and does not come back.
+            RunError: The scheduler is gone and does not come back, or has no workers any more.
         """
         waiting, playing = deque[EpisodeTask](), _Playing()
         source = iter(tasks)
+        self._watch.progressed(time.monotonic())
         while True:
             try:
                 self._fill(source, waiting, playing)
                 if not playing.tasks:
                     return
-                for future in self._ended(playing):
+                for future in self._ended(playing.tasks):
                     task = playing.end(future)
                     if task is None:  # its twin was quicker
                         continue
@@ -150,7 +184,13 @@ class Episodes:
                     if result is None:
                         waiting.append(task)
                     else:
+                        self._watch.progressed(time.monotonic())
                         yield result
+                        self._watch.progressed(time.monotonic())
+                for episode, stall in self._stalls(playing).items():
+                    playing.give_up(episode)
+                    yield EpisodeResult(episode, stall.error)
+                    self._end_process(stall.worker)
             except (LostSchedulerError, OSError, TimeoutError) as error:
                 waiting.extend(playing.clear())
                 self._reconnect(error)
@@ -175,16 +215,37 @@ class Episodes:
         future: Future = self._connected.submit(play_episode, task, pure=False)
         return future
 
-    def _ended(self, playing: _Playing) -> list[Future]:
+    def _stalls(self, playing: _Playing) -> dict[int, Stall]:
+        episodes = {task.episode for task in playing.tasks.values()}
+        now = time.monotonic()
+        return self._watch.look(now, "no episode has ended", episodes, mean_s=playing.mean_s)
+
+    def _end_process(self, worker: str) -> None:
+        """End the process of a worker, which nothing else gets out of a step; Dask's nanny starts it anew.
+
+        One that you started without a nanny is lost.
+        """
+        # The loop of a worker goes on beside a step. Dask's own restart waits for the step to end.
+        with suppress(OSError, TimeoutError):
+            self._connected.run(_exit, workers=[worker], wait=False, on_error="ignore")
+
+    def _last_seen(self) -> dict[str, float]:
+        """Workers by address, with the scheduler's time of their last sign of life [s]."""
+        client = self._connected
+        found = client.sync(client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
+        return {address: about["last_seen"] for address, about in found["workers"].items()}
+
+    def _ended(self, tasks: Mapping[Future, object]) -> list[Future]:
+        """Those of some tasks that have ended, after a second at most."""
         from distributed import wait
         from distributed.client import FuturesCancelledError
 
         try:
             with suppress(TimeoutError), self._connected.as_current():
-                wait(list(playing.tasks), timeout=1.0, return_when="FIRST_COMPLETED")
+                wait(list(tasks), timeout=1.0, return_when="FIRST_COMPLETED")
         except FuturesCancelledError as error:
             raise LostSchedulerError("the connection to it is lost") from error
-        ended = [future for future in playing.tasks if future.status != "pending"]
+        ended = [future for future in tasks if future.status != "pending"]
         if any(future.status in ("cancelled", "lost") for future in ended) or (
             self._connected.status not in ("running", "connecting")
         ):
@@ -194,21 +255,30 @@ class Episodes:
     def _result(self, future: Future, task: EpisodeTask, playing: _Playing) -> EpisodeResult | None:
         """What came of a task; None: it is begun once more."""
         if future.status == "finished":
-            found: EpisodeResult = future.result()
+            try:
+                found: EpisodeResult = future.result(timeout=ANSWER_S)
+            except TimeoutError:  # the worker that has it is stopped; the recording is there
+                return self._again(task, playing, "whose results could not be had")
             return found
         error = future.exception()
         name = type(error).__name__
         if name != "KilledWorker":
             return EpisodeResult(task.episode, f"{name}: {error}")
+        return self._again(task, playing, "which died, of a signal or a lack of memory")
+
+    def _again(self, task: EpisodeTask, playing: _Playing, why: str) -> EpisodeResult | None:
         if playing.attempts[task.episode] < ATTEMPTS:
             return None
         return EpisodeResult(
             task.episode,
-            f"the process that played it died {ATTEMPTS} times, of a signal or a lack of memory; play "
-            "it alone with --workers 1 to see it",
+            f"it was played {ATTEMPTS} times by processes {why}; play it alone with --workers 1 to see it",
         )
 
     # --- connection --------------------------------------------------------------------------------
+
+    @property
+    def _where(self) -> str:
+        return self._scheduler or "of this machine"
 
     @property
     def _connected(self) -> Client:
@@ -222,6 +292,7 @@ class Episodes:
         if self._scheduler:
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)
+                self._stack.callback(self._client.close, timeout=5)
                 self._client.wait_for_workers(1, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as error:
                 raise RunError(
@@ -229,8 +300,8 @@ class Episodes:
                     f"worker: start it with "
                     "dask scheduler, and workers with dask worker ADDRESS --nthreads 1"
                 ) from error
-            self._stack.callback(self._client.close, timeout=5)
-            self.workers = len(self._client.scheduler_info(n_workers=-1)["workers"])
+            self._watch_workers()
+            self.workers = len(self._last_seen())
             return
         cluster = self._stack.enter_context(
             LocalCluster(
@@ -244,17 +315,23 @@ class Episodes:
             )
         )
         self._client = self._stack.enter_context(Client(cluster, set_as_default=False))
+        self._watch_workers()
+
+    def _watch_workers(self) -> None:
+        self._watch = ClusterWatch(self._scheduler, self._last_seen, self._note)
+        self._watch.progressed(time.monotonic())
+        self._connected.subscribe_topic(TOPIC, self._watch.tell)
 
     def _disconnect(self) -> None:
         self._client = None
         self._stack.close()
 
     def _reconnect(self, cause: Exception) -> None:
-        where = self._scheduler or "of this machine"
         self._note(
-            f"the Dask scheduler {where} is gone ({cause}): waiting for it, {RECONNECT_S:.0f} s at most"
+            f"the Dask scheduler {self._where} is gone ({cause or 'it does not answer'}): waiting for it, "
+            f"{RECONNECT_S:.0f} s at most"
         )
-        end = time.monotonic() + RECONNECT_S
+        began = noted = time.monotonic()
         while True:
             with suppress(Exception):  # what is left of a broken connection
                 self._disconnect()
@@ -262,8 +339,12 @@ class Episodes:
             try:
                 self._connect()
             except (RunError, OSError, TimeoutError):
-                if time.monotonic() > end:
+                now = time.monotonic()
+                if now > began + RECONNECT_S:
                     raise
+                if now > noted + NOTE_S:
+                    noted = now
+                    self._note(f"waiting for the Dask scheduler {self._where} for {now - began:.0f} s")
                 time.sleep(1.0)
             else:
                 return
@@ -278,7 +359,8 @@ class _Playing:
         self._begun: dict[Future, float] = {}
         self._twins: set[int] = set()
         self._ended = 0
-        self._mean_s = 0.0
+        self.mean_s = 0.0
+        """Time of an episode at the cluster so far [s]."""
 
     def begin(self, future: Future, task: EpisodeTask) -> None:
         self.tasks[future] = task
@@ -292,12 +374,18 @@ class _Playing:
         if task is None:
             return None
         self._ended += 1
-        self._mean_s += (time.monotonic() - self._begun.pop(future) - self._mean_s) / self._ended
+        self.mean_s += (time.monotonic() - self._begun.pop(future) - self.mean_s) / self._ended
         twins = [other for other, its in self.tasks.items() if its.episode == task.episode]
         for twin in twins if future.status == "finished" else ():
             del self.tasks[twin], self._begun[twin]
             twin.release()
         return None if twins and future.status != "finished" else task
+
+    def give_up(self, episode: int) -> None:
+        """Take an episode from the workers."""
+        for future in [one for one, task in self.tasks.items() if task.episode == episode]:
+            del self.tasks[future], self._begun[future]
+            future.release()
 
     def straggler(self, workers: int) -> EpisodeTask | None:
         """An episode that is worth a second worker."""
@@ -305,7 +393,7 @@ class _Playing:
             return None
         now = time.monotonic()
         for future, task in self.tasks.items():
-            late = now - self._begun[future] > STRAGGLER * max(self._mean_s, 1.0)
+            late = now - self._begun[future] > STRAGGLER * max(self.mean_s, 1.0)
             if late and task.episode not in self._twins:
                 self._twins.add(task.episode)
                 return task
@@ -318,3 +406,23 @@ class _Playing:
         self._begun.clear()
         self._twins.clear()
         return list(found.values())
+
+
+async def _exit() -> None:
+    """End this process, as a fault would."""
+    await asyncio.sleep(0.1)  # the scheduler has its answer first
+    os._exit(1)
+
+
+def _result_of_trial(future: Future) -> Any:
+    if future.status == "finished":
+        return future.result(timeout=ANSWER_S)
+    error = future.exception(timeout=ANSWER_S)
+    if isinstance(error, CaviarError):
+        raise error
+    if type(error).__name__ != "KilledWorker":  # of Dask: the process died, or its machine is gone
+        raise RunError(f"no scene can be played: {type(error).__name__}: {error}") from error
+    raise RunError(
+        "a process that tried a scene beforehand died, of a signal, a lack of memory or an exit of a "
+        "service; play it alone with --workers 1 to see it"
+    ) from error

@@ -6,12 +6,13 @@ import errno
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from caviar_protocol.errors import RunError
+from caviar_protocol.run_directory import RunDirectory
 
 _EPISODE = "episode-"
 
@@ -68,18 +69,36 @@ class DatasetDirectory:
         """Numbers of the episodes whose recordings are there, in order.
 
         Raises:
-            RunError: The folder cannot be read.
+            RunError: The folder cannot be read, or has a folder whose name is nearly that of an episode.
         """
         try:
             with os.scandir(self.episodes) as entries:
                 names = [entry.name for entry in entries]
+            return sorted(self.numbers_of(names, self.episodes))
         except FileNotFoundError:
             return []
         except OSError as error:
             raise RunError(
                 f"{self.episodes} cannot be read: {error.strerror} (errno {error.errno})"
             ) from error
-        return sorted(number for name in names if (number := self.number_of(name)) is not None)
+
+    def size_of(self, number: int) -> int:
+        """Size of the recording of an episode, from its directory entries [B]; 0 where it has no manifest.
+
+        Args:
+            number: Of the episode.
+
+        Raises:
+            RunError: The folder cannot be read.
+        """
+        run = RunDirectory(self.episode(number))
+        try:
+            return sum(file.stat().st_size for file in run.segments()) if run.manifest.is_file() else 0
+        except OSError as error:
+            raise RunError(
+                f"{run.path} cannot be read: {error.strerror} (errno {error.errno}); allow reading it, or "
+                "remove it: the same command plays the episode again"
+            ) from error
 
     @staticmethod
     def number_of(name: str) -> int | None:
@@ -89,16 +108,41 @@ class DatasetDirectory:
             name: Last part of a path.
 
         Example:
-            >>> DatasetDirectory.number_of("episode-000007"), DatasetDirectory.number_of(".work")
+            >>> DatasetDirectory.number_of("episode-000007"), DatasetDirectory.number_of("episode-7")
             (7, None)
         """
         digits = name.removeprefix(_EPISODE)
-        return int(digits) if digits != name and digits.isascii() and digits.isdecimal() else None
+        if digits == name or not digits.isascii() or not digits.isdecimal() or len(digits) > 18:
+            return None
+        return int(digits) if name == f"{_EPISODE}{int(digits):06d}" else None
+
+    @classmethod
+    def numbers_of(cls, names: Iterable[str], place: str | Path) -> Iterator[int]:
+        """Numbers of the episodes that have folders; other names are passed over.
+
+        Args:
+            names: In the folder of the recordings.
+            place: Of that folder, for an error.
+
+        Raises:
+            RunError: A name begins like that of an episode, and is none.
+        """
+        for name in names:
+            number = cls.number_of(name)
+            if number is not None:
+                yield number
+            elif name.startswith(_EPISODE):
+                raise RunError(
+                    f"{place}/{name} is named like an episode, which would be {_EPISODE}000009 for number 9: "
+                    "rename it, or move it out of there"
+                )
 
 
 @contextmanager
 def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
     """Hold a dataset for as long as the block lasts, and remove what killed processes left half-written.
+
+    The folder of half-written recordings goes with the block, unless one is left in it.
 
     Args:
         directory: Of the dataset; it is made where it is not there.
@@ -107,9 +151,9 @@ def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
         RunError: Another process writes it, or it cannot be written.
     """
     try:
-        for folder in (directory.episodes, directory.work):
-            folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(directory.work, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        directory.episodes.mkdir(parents=True, exist_ok=True)
+        # Not the folder of what is half-written, which is removed: a lock on it would bind no other process.
+        lock = os.open(directory.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
         raise unwritable(error.filename or directory.path, error) from error
     try:
@@ -119,9 +163,17 @@ def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
             raise RunError(
                 f"another process writes the dataset {directory.path}: wait for it, or give another --out"
             ) from error
-        clear_work(directory)
-        yield
-        clear_work(directory)
+        try:
+            directory.work.mkdir(exist_ok=True)
+            clear_work(directory)
+        except OSError as error:
+            raise unwritable(error.filename or directory.work, error) from error
+        try:
+            yield
+            clear_work(directory)
+        finally:
+            with suppress(OSError):  # after a fault, workers elsewhere may still write there
+                directory.work.rmdir()
     finally:
         os.close(lock)
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import msgspec
 
+from caviar_clients.datasets.cluster_watch import StepWatch
 from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there, unwritable
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
@@ -36,6 +37,8 @@ from caviar_services.recorder.provenance import installed_versions
 
 MEASURED = "measured.json"
 """Beside the recording of an episode: times, host and start, which differ from run to run."""
+SETTINGS = "settings"
+"""Key in that file of the digest of the settings of the dataset."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,9 @@ class EpisodeTask:
     """Where the recording of a trial is moved to; empty: it is removed."""
     cached: Mapping[str, bytes] = field(default_factory=dict)
     """Files that the cache of the process's user needs, by their names in it (`traffic.saved_states`)."""
+    settings: str = ""
+    """Digest of the settings of the dataset (`catalogue.fingerprint`): kept beside the recording, so that a
+    catalogue can be made from recordings; empty: not known."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +114,7 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
         used = {"wall_s": time.monotonic() - began, "cpu_s": time.process_time() - cpu}
         measured |= {**used, "memory_mib": resident_mib(), **times}
         if not task.trial:
-            _put_into_place(folder, remote or target, task.episode, measured)
+            _put_into_place(folder, remote or target, task, measured)
         else:
             measured["disk_b"] = _on_disk(folder)
             if task.kept:
@@ -130,7 +136,15 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
             file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(file, content, durable=False, concurrent=True)
     scenario = check_implementations(task.scenario)
-    run = EmbeddedRun(scenario, folder, episode=task.episode, with_journal=False)
+    watch = StepWatch(task.episode)
+    run = EmbeddedRun(
+        scenario,
+        folder,
+        on_frame=watch.frame_finished,
+        on_wait=watch.waits,
+        episode=task.episode,
+        with_journal=False,
+    )
     outcome = run.run()
     if outcome.error:
         raise CaviarError(outcome.error)
@@ -161,14 +175,16 @@ def work_folder(out: str, prefix: str) -> Path:
 
 
 def _put_into_place(
-    folder: Path, target: Path | RemoteDataset, episode: int, measured: dict[str, Any]
+    folder: Path, target: Path | RemoteDataset, task: EpisodeTask, measured: dict[str, Any]
 ) -> None:
     """Have the disk hold a recording, and rename it in one step; upload it where the dataset is elsewhere."""
     # The recording names what it was computed with; this is everything that was installed.
     beside = {**measured, "versions": installed_versions()}
+    if task.settings:
+        beside[SETTINGS] = task.settings
     replace_file(folder / MEASURED, msgspec.json.encode(beside) + b"\n", durable=False)
     if isinstance(target, RemoteDataset):
-        target.put_episode(episode, folder)
+        target.put_episode(task.episode, folder)
         return
     for file in (*RunDirectory(folder).segments(), RunDirectory(folder).manifest, folder):
         sync_file(file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,12 @@ ROW_B = 200
 """[B] of a row of the catalogue, with its index."""
 SPARE = 1.05
 """So much more than the estimate has to be free on the disk."""
+LEAST_B = 4096
+"""[B] of a recording, which has a folder and three files, at the least."""
+LEAST_SCENE_B = 100
+"""[B] of the catalogue's rows of a scene, at the least."""
+LEAST_FILES = 4
+"""Of a recording, folder included."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,29 @@ def _put_scenery(scenario: Scenario, out: str, episode: int, cached: Mapping[str
 def _shortened(scenario: Scenario, scenes: int) -> Scenario:
     run = msgspec.structs.replace(scenario.run, frames=scenes, instants_s=scenario.run.instants_s[:scenes])
     return msgspec.structs.replace(scenario, run=run)
+
+
+def check_least(folder: Path, episodes: int, scenes: int, *, has_recordings: bool) -> None:
+    """Check that a dataset may fit the disk at all, before time is spent on traffic and trials.
+
+    Args:
+        folder: Of the dataset, or of the catalogue alone.
+        episodes: That are left.
+        scenes: Of each.
+        has_recordings: Whether they lie there too.
+
+    Raises:
+        RunError: Its disk is too small, or has no room for so many files.
+    """
+    check_disk(folder, episodes * (scenes * LEAST_SCENE_B + LEAST_B * has_recordings))
+    about = os.statvfs(folder)
+    needed = episodes * LEAST_FILES
+    # File systems that make room for files as they come say 0.
+    if has_recordings and about.f_files and needed > about.f_favail:
+        raise RunError(
+            f"the disk of {folder} has room for {about.f_favail:,} files, and {episodes:,} episodes are "
+            f"{needed:,} files and folders; give another --out, or fewer --episodes of more --scenes"
+        )
 
 
 def check_disk(folder: Path, needed: int) -> int:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,14 +13,16 @@ from caviar_clients.datasets.catalogue import Catalogue, fingerprint
 from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask
-from caviar_clients.datasets.estimate import Estimate, check_disk, estimate, try_worker
-from caviar_clients.datasets.plan import DatasetPlan, differences
+from caviar_clients.datasets.estimate import Estimate, check_disk, check_least, estimate, try_worker
+from caviar_clients.datasets.ledger import Ledger, MissingEpisodes
+from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset, is_address
-from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.texts import counted
 from caviar_clients.datasets.traffic import SharedTraffic
 from caviar_protocol.errors import RunError
-from caviar_protocol.recording import Recording
+
+MOST_EPISODES = 10**18 - 1
+"""That a catalogue can number."""
 
 
 class Observer(Protocol):
@@ -74,114 +74,84 @@ def generate(
         What was played, and what failed.
 
     Raises:
-        RunError: The folder holds another dataset, or cannot be written; the disk is too small; no scene can
-            be played.
+        RecordingError: The catalogue that is there cannot be used.
+        RunError: The folder holds another dataset or damaged recordings, or cannot be written; the disk is
+            too small; no scene can be played; the workers are gone.
     """
+    if plan.episodes > MOST_EPISODES:
+        raise RunError(f"a dataset has {MOST_EPISODES:.0e} episodes at most, and not {plan.episodes}")
     remote = RemoteDataset(str(out)) if is_address(out) else None
     directory = DatasetDirectory(Path(out)) if remote is None else remote.written()
     with writing_dataset(directory):
         if remote is not None:
             _fetch_catalogue(remote, directory)
+        settings = plan.settings()
         catalogue = Catalogue(directory.catalogue, writable=True)
-        ledger = _Ledger(str(out), directory, remote, catalogue)
+        ledger = Ledger(plan, settings, str(out), directory, remote, catalogue)
         try:
-            _agree(plan, ledger)  # what is refused here changes nothing at an address
+            ledger.refuse_other_dataset()  # what is refused here changes nothing at an address
             try:
-                return _generate(plan, ledger, observer, workers, scheduler)
+                return _generate(ledger, observer, workers, scheduler)
             finally:
                 ledger.upload()
         finally:
+            began = ledger.began
             catalogue.close()
+            if not began:  # it was refused before anything was there
+                _remove_catalogue(directory)
 
 
 def _fetch_catalogue(remote: RemoteDataset, directory: DatasetDirectory) -> None:
     """Have the catalogue of an address, where this machine has none, or that of another dataset."""
     fetched = directory.path / "fetched.sqlite"
     if not remote.fetch_catalogue(fetched):
-        directory.catalogue.unlink(missing_ok=True)
+        _remove_catalogue(directory)
         return
     try:
+        settings = _settings(fetched, f"{remote.address}/{directory.catalogue.name}")
         # Of the same dataset the one of this machine may know of more: a killed command uploads nothing.
-        if not directory.catalogue.exists() or _settings(fetched) != _settings(directory.catalogue):
+        if not directory.catalogue.exists() or settings != _settings(directory.catalogue):
+            _remove_catalogue(directory)
             fetched.replace(directory.catalogue)
     finally:
         fetched.unlink(missing_ok=True)
 
 
-def _settings(file: Path) -> str:
-    catalogue = Catalogue(file)
+def _remove_catalogue(directory: DatasetDirectory) -> None:
+    """Remove a catalogue, and what a killed command left beside it: it would be taken for the next one's."""
+    for end in ("", "-wal", "-shm"):
+        directory.catalogue.with_name(f"{directory.catalogue.name}{end}").unlink(missing_ok=True)
+
+
+def _settings(file: Path, name: str = "") -> str:
+    catalogue = Catalogue(file, name=name)
     try:
         return fingerprint(catalogue.settings)
     finally:
         catalogue.close()
 
 
-@dataclass(frozen=True)
-class _Ledger:
-    """What is there of a dataset, and where."""
-
-    out: str
-    """Folder or address, as the user wrote it."""
-    directory: DatasetDirectory
-    """Of the catalogue; of a folder that of the recordings too."""
-    remote: RemoteDataset | None
-    catalogue: Catalogue
-
-    @property
-    def place(self) -> str:
-        """Folder or address, as every process of this machine sees it."""
-        return self.out if self.remote is not None else str(self.directory.path.resolve())
-
-    def finished(self) -> list[int]:
-        """Numbers of the episodes whose recordings are there."""
-        return self.directory.finished() if self.remote is None else self.remote.episodes()
-
-    def add_unlisted(self, number: int) -> None:
-        """List a recording that is there, and that a killed command had not listed."""
-        if self.remote is not None:
-            self.remote.fetch_episode(number, self.directory)
-        folder = self.directory.episode(number)
-        rows = rows_of(Recording(folder))
-        if rows.episode[0] != number:
-            raise RunError(
-                f"{folder} has the recording of episode {rows.episode[0]}, not of {number}: remove it, and "
-                "the episode is played"
-            )
-        self.catalogue.add(rows, {})
-        if self.remote is not None:
-            shutil.rmtree(folder)
-
-    def upload(self) -> None:
-        """Have the catalogue of now at the address."""
-        if self.remote is None or not self.catalogue.settings:
-            return
-        with tempfile.TemporaryDirectory(dir=self.directory.work) as folder:
-            copy = Path(folder) / self.directory.catalogue.name
-            self.catalogue.copy_to(copy)
-            self.remote.put_catalogue(copy)
-
-
-def _generate(
-    plan: DatasetPlan, ledger: _Ledger, observer: Observer, workers: int, scheduler: str
-) -> Outcome:
-    catalogue = ledger.catalogue
-    _agree_with_recordings(ledger, observer)
-    there = set(catalogue.episodes())
-    left = [number for number in range(plan.episodes) if number not in there]
+def _generate(ledger: Ledger, observer: Observer, workers: int, scheduler: str) -> Outcome:
+    plan, catalogue = ledger.plan, ledger.catalogue
+    ledger.compare_with_recordings(observer.note)
+    there = catalogue.episodes()
+    left = MissingEpisodes(there, plan.episodes)
     outcome = Outcome(before=len(there))
     if not left:
+        ledger.keep_plan()
         return outcome
+    check_least(ledger.directory.path, len(left), plan.scenes, has_recordings=ledger.remote is None)
     traffic = SharedTraffic(plan.scenario)
     traffic.save(plan.episodes, observer.traffic)
     with Episodes(workers, scheduler, observer.note) as episodes:
-        _estimate(plan, ledger, left, traffic, episodes, observer)
+        _estimate(ledger, left, traffic, episodes, observer)
+        ledger.keep_plan()
         began = time.monotonic()
-        for result in episodes.play(_tasks(plan, ledger.place, left, traffic)):
+        for result in episodes.play(_tasks(ledger, left, traffic)):
             _keep(result, catalogue, outcome)
             outcome.wall_s = time.monotonic() - began
             observer.ended(result)
-    there = {*catalogue.episodes(), *outcome.failed}
-    if lost := [number for number in left if number not in there]:
+    if lost := MissingEpisodes([*catalogue.episodes(), *outcome.failed], plan.episodes):
         raise RunError(
             f"{counted(len(lost), 'episode')} ended without a result, episode {lost[0]} the first; the same "
             "command goes on"
@@ -189,9 +159,11 @@ def _generate(
     return outcome
 
 
-def _tasks(plan: DatasetPlan, out: str, left: list[int], traffic: SharedTraffic) -> Iterator[EpisodeTask]:
+def _tasks(ledger: Ledger, left: Sequence[int], traffic: SharedTraffic) -> Iterator[EpisodeTask]:
+    settings = fingerprint(ledger.settings)
     for number in left:
-        yield EpisodeTask(plan.scenario, number, out, cached=traffic.states_of(number))
+        cached = traffic.states_of(number)
+        yield EpisodeTask(ledger.plan.scenario, number, ledger.place, cached=cached, settings=settings)
 
 
 def _keep(result: EpisodeResult, catalogue: Catalogue, outcome: Outcome) -> None:
@@ -207,13 +179,9 @@ def _keep(result: EpisodeResult, catalogue: Catalogue, outcome: Outcome) -> None
 
 
 def _estimate(
-    plan: DatasetPlan,
-    ledger: _Ledger,
-    left: list[int],
-    traffic: SharedTraffic,
-    episodes: Episodes,
-    observer: Observer,
+    ledger: Ledger, left: Sequence[int], traffic: SharedTraffic, episodes: Episodes, observer: Observer
 ) -> None:
+    plan = ledger.plan
     tried = [left[len(left) * quarter // 4] for quarter in (1, 2, 3)]
     cached = {name: data for number in tried for name, data in traffic.states_of(number).items()}
     trials = episodes.run_on_each(try_worker, plan.scenario, ledger.place, tried, cached)
@@ -223,28 +191,3 @@ def _estimate(
     found = estimate(good, len(left), plan.scenes)
     free = check_disk(ledger.directory.path, found.bytes) if ledger.remote is None else None
     observer.estimated(found, free, len(left), episodes.workers)
-
-
-def _agree(plan: DatasetPlan, ledger: _Ledger) -> None:
-    """Raise `RunError` where another dataset is there; note the plan where none is."""
-    catalogue = ledger.catalogue
-    settings, before = plan.settings(), catalogue.settings
-    if (catalogue.episodes() or ledger.finished()) and fingerprint(before) != fingerprint(settings):
-        found = list(differences(before, settings))
-        more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
-        raise RunError(
-            f"{ledger.out} holds another dataset: {'; '.join(found[:3])}{more}; give another --out "
-            "(--overwrite deletes the dataset that is there, with all its episodes)"
-        )
-    catalogue.plan(settings, max(plan.episodes, catalogue.planned))
-    ledger.upload()  # so that another machine can go on where this one is lost
-
-
-def _agree_with_recordings(ledger: _Ledger, observer: Observer) -> None:
-    """List the recordings that a killed command had not listed, and forget those that were removed."""
-    recorded, listed = set(ledger.finished()), set(ledger.catalogue.episodes())
-    for number in sorted(recorded - listed):
-        ledger.add_unlisted(number)
-    if gone := sorted(listed - recorded):
-        observer.note(f"{counted(len(gone), 'recording')} removed, episode {gone[0]} the first: played again")
-        ledger.catalogue.forget(gone)

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from caviar_clients.datasets.catalogue import FORMAT
 from caviar_clients.session.checks import check_implementations
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import ScenarioError
@@ -19,9 +20,6 @@ from caviar_services.drjit_setup import choose_variant
 from caviar_services.recorder.provenance import code_digests, used_versions
 from caviar_services.registry import load
 from caviar_services.world.scenery import scenery_assets
-
-FORMAT = 1
-"""Version of the layout of a dataset."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ end.
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import os
 import re
@@ -16,6 +15,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 
 import msgspec
@@ -25,6 +25,7 @@ from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_th
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.host import install_command
+from caviar_protocol.run_directory import SEGMENT_PATTERN
 
 _CATALOGUE = DatasetDirectory(Path()).catalogue.name
 MARKER = "complete.json"
@@ -97,13 +98,36 @@ class RemoteDataset:
         """Numbers of the episodes that are there whole, in order.
 
         Raises:
-            RunError: The store does not answer.
+            RunError: The store does not answer, or has a folder whose name is nearly that of an episode.
         """
+        return list(self.sizes())
+
+    def sizes(self) -> dict[int, int | None]:
+        """Size of the recording of each episode that has its marker [B], by its number, in order.
+
+        Returns:
+            None where the store does not tell sizes.
+
+        Raises:
+            RunError: The store does not answer, or has a folder whose name is nearly that of an episode.
+        """
+        place = self._at("episodes")
         with self._errors("cannot be read"):
             # One listing: a question for each episode takes minutes for some thousand of them.
-            pattern = "/".join((glob.escape(self._at("episodes")), "*", MARKER))
-            names = (str(path).split("/")[-2] for path in self._files.glob(pattern))
-            return sorted(n for name in names if (n := DatasetDirectory.number_of(name)) is not None)
+            try:
+                found = self._files.find(place, detail=True)
+            except FileNotFoundError:
+                found = {}
+        sizes, marked = dict[str, int | None](), list[str]()
+        for path, about in found.items():
+            *_, folder, file = str(path).split("/")
+            if file == MARKER:
+                marked.append(folder)
+            elif fnmatch(file, SEGMENT_PATTERN):
+                size, before = about.get("size"), sizes.get(folder, 0)
+                sizes[folder] = None if size is None or before is None else before + int(size)
+        numbers = sorted(DatasetDirectory.numbers_of(marked, f"{self.address}/episodes"))
+        return {n: sizes.get(DatasetDirectory(Path()).episode(n).name, 0) for n in numbers}
 
     def put_episode(self, number: int, folder: Path) -> None:
         """Upload the recording of an episode, its marker last.
@@ -165,19 +189,19 @@ class RemoteDataset:
                 shutil.rmtree(work, ignore_errors=True)
 
     def remove(self) -> None:
-        """Remove all episodes, catalogue and scenery; nothing where there is no catalogue.
+        """Remove all episodes, catalogue and scenery; nothing where there is neither catalogue nor episode.
 
         Raises:
             RunError: The store refuses.
         """
         with self._errors("cannot be written"):
-            if not self._files.exists(self._at(_CATALOGUE)):
-                return
-            for number in self.episodes():
+            has_catalogue, numbers = self._files.exists(self._at(_CATALOGUE)), self.episodes()
+            for number in numbers:
                 self._files.rm(self._at(_episode(number)), recursive=True)
-            if self._files.exists(self._at("assets")):
+            if (has_catalogue or numbers) and self._files.exists(self._at("assets")):
                 self._files.rm(self._at("assets"), recursive=True)
-            self._files.rm(self._at(_CATALOGUE))
+            if has_catalogue:
+                self._files.rm(self._at(_CATALOGUE))
 
     # --- the rest ----------------------------------------------------------------------------------
 
@@ -274,7 +298,7 @@ class RemoteDataset:
                 f"caviar generate SCENARIO --out {self.address}"
             )
         try:
-            catalogue = Catalogue(fetched)
+            catalogue = Catalogue(fetched, name=f"{self.address}/{_CATALOGUE}")
             # A recording follows from the settings and its number: what was fetched for these stays right.
             directory = DatasetDirectory(top / f"{self._key}-{fingerprint(catalogue.settings)[:16]}")
             catalogue.close()

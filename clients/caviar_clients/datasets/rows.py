@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.digest import file_digest
+from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.recording.integrity import declared_digest
@@ -144,9 +145,11 @@ def rows_of(recording: Recording) -> EpisodeRows:
         recording: Complete, of one episode.
 
     Raises:
-        RecordingError: It cannot be read.
+        RecordingError: It cannot be read, or has no scene.
     """
     entries = [recording.entry(index) for index in range(len(recording))]
+    if not entries:
+        raise RecordingError(f"{recording.path} has no scene: it breaks off before the first one")
     scenes, users, products = list[Any](), list[Any](), list[Any]()
     for frame in recording.frames():
         scene, channel = frame.scene(), _only(frame, "channel", Channel)

@@ -1,0 +1,172 @@
+"""What a generation tells while it waits, and when it stops waiting."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from caviar_clients.datasets import cluster_watch
+from caviar_clients.datasets.cluster_watch import (
+    LOOK_S,
+    NO_PROCESS_S,
+    NO_WORKER_S,
+    STALLED_S,
+    ClusterWatch,
+    StepWatch,
+)
+from caviar_protocol.errors import RunError
+
+ADDRESS = "tcp://10.0.0.1:8786"
+
+
+class Cluster:
+    """A scheduler whose workers a test has, the time, and what the user was told."""
+
+    def __init__(self, scheduler: str = ADDRESS, workers: int = 2) -> None:
+        self.now = 1000.0
+        self.seen = {f"tcp://10.0.0.2:{port}": 0.0 for port in range(workers)}
+        self.stopped = set[str]()
+        self.asked = 0
+        self.told = list[tuple[float, str]]()
+        self.watch = ClusterWatch(scheduler, self.last_seen, self.note, lambda: self.now)
+        self.watch.progressed(self.now)
+
+    def last_seen(self) -> dict[str, float]:
+        self.asked += 1
+        # Its clock is another one.
+        self.seen |= dict.fromkeys(self.seen.keys() - self.stopped, self.now - 7e5)
+        return dict(self.seen)
+
+    def note(self, text: str) -> None:
+        self.told.append((self.now - 1000.0, text))
+
+    def wait(self, seconds: float, mean_s: float = 0.0) -> dict[int, cluster_watch.Stall]:
+        """Let time pass, second by second, until an episode is given up."""
+        for _ in range(round(seconds)):
+            self.now += 1.0
+            if found := self.watch.look(self.now, "no episode has ended", [4, 3, 5], mean_s=mean_s):
+                return found
+        return {}
+
+    def stands(self, episode: int, stands_s: float) -> None:
+        about = {"episode": episode, "text": "waiting for agent 'a'", "stands_s": stands_s, "worker": "w"}
+        self.watch.tell((0.0, about))
+
+
+def test_every_wait_is_told_each_half_minute_with_what_is_waited_for() -> None:
+    cluster = Cluster()
+    cluster.wait(100.0)
+    what = "3 episodes are at the workers, episode 3 the first"
+    assert cluster.told == [(s, f"no episode has ended for {s:.0f} s: {what}") for s in (30.0, 60.0, 90.0)]
+    assert cluster.asked == 100 // LOOK_S
+    cluster.watch.progressed(cluster.now)
+    cluster.wait(20.0)
+    assert len(cluster.told) == 3
+
+
+def test_a_wait_that_episodes_of_such_length_explain_is_not_told() -> None:
+    cluster = Cluster()
+    cluster.wait(79.0, mean_s=40.0)
+    assert cluster.told == []
+    cluster.wait(1.0, mean_s=40.0)
+    assert len(cluster.told) == 1
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "limit_s", "said"),
+    [
+        (
+            ADDRESS,
+            NO_WORKER_S,
+            rf"{ADDRESS} has had no worker for 60 s: start one with dask worker {ADDRESS}",
+        ),
+        ("", NO_PROCESS_S, "there has been no process that plays for 300 s"),
+    ],
+)
+def test_a_cluster_without_workers_ends_the_command(scheduler: str, limit_s: float, said: str) -> None:
+    cluster = Cluster(scheduler)
+    cluster.seen.clear()
+    cluster.wait(limit_s - 1.0)
+    assert [at for at, _ in cluster.told][:1] == [30.0]
+    assert "no worker for 30 s" in cluster.told[0][1] or not scheduler
+    with pytest.raises(RunError, match=f"{said}.*the same command goes on with what is left"):
+        cluster.wait(LOOK_S)
+
+
+def test_a_worker_that_comes_back_in_time_is_waited_for() -> None:
+    cluster = Cluster()
+    workers = cluster.seen.copy()
+    for _ in range(5):
+        cluster.seen.clear()
+        cluster.wait(NO_WORKER_S - 10.0)
+        cluster.seen |= workers
+        cluster.wait(10.0)
+    assert cluster.watch.present == set(workers)
+
+
+def test_workers_that_are_stopped_are_named() -> None:
+    cluster = Cluster(workers=3)
+    cluster.wait(20.0)
+    cluster.stopped = {"tcp://10.0.0.2:0", "tcp://10.0.0.2:1"}
+    cluster.wait(70.0)
+    said = [text.partition("; ")[2] for _, text in cluster.told]
+    assert said[0] == ""
+    assert said[2] == (
+        "2 of 3 workers give no sign of life: tcp://10.0.0.2:0 for 70 s, tcp://10.0.0.2:1 for 70 s"
+    )
+
+
+def test_a_step_that_takes_long_is_told_and_in_the_end_its_episode_is_given_up() -> None:
+    cluster = Cluster()
+    since = cluster.now
+    for stands_s in (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0):
+        assert cluster.wait(since + stands_s - cluster.now) == {}
+        cluster.stands(3, stands_s)
+    assert all("; episode 3: waiting for agent 'a'" in text for _, text in cluster.told)
+    cluster.stands(9, 2.0 * STALLED_S)  # of another command at the same scheduler
+    assert cluster.wait(since + 640.0 - cluster.now) == {}
+    cluster.stands(3, 640.0)
+    found = cluster.wait(10.0)
+    assert (list(found), found[3].worker, found[3].stands_s) == ([3], "w", 640.0)
+    assert cluster.wait(10.0) == {}
+
+
+def test_a_step_that_has_ended_is_not_told_any_more() -> None:
+    cluster = Cluster()
+    cluster.stands(3, 5.0)
+    cluster.wait(60.0)
+    assert not any("waiting for agent" in text for _, text in cluster.told)
+
+
+def test_what_a_worker_of_another_version_tells_is_left_aside() -> None:
+    cluster = Cluster()
+    cluster.watch.tell((0.0, {"episode": "3"}))
+    cluster.watch.tell((0.0, None))
+    assert cluster.wait(40.0) == {}
+
+
+def test_outside_of_a_worker_waits_are_warnings(caplog: pytest.LogCaptureFixture) -> None:
+    StepWatch(3).waits("waiting for agent 'a'")
+    assert [(record.name, record.message) for record in caplog.records] == [
+        ("caviar.session", "waiting for agent 'a'")
+    ]
+
+
+def test_a_worker_tells_since_when_the_last_frame_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = list[object]()
+
+    class Worker:
+        address = "tcp://10.0.0.2:1"
+
+        def log_event(self, topic: str, message: object) -> None:
+            told.append((topic, message))
+
+    times = itertools.count(100.0, 10.0)
+    monkeypatch.setattr(cluster_watch.time, "monotonic", lambda: next(times))
+    monkeypatch.setattr(cluster_watch, "_worker_of_task", Worker)
+    watch = StepWatch(3)
+    watch.frame_finished(None)
+    watch.waits("waiting")
+    about = {"episode": 3, "text": "waiting", "stands_s": 10.0, "worker": Worker.address}
+    assert told == [(cluster_watch.TOPIC, about)]
