@@ -24,7 +24,7 @@ from caviar_clients.datasets import cluster_watch
 from caviar_clients.datasets.generate import Outcome
 from caviar_clients.datasets.generate import generate as generate_dataset
 from caviar_clients.datasets.plan import plan_dataset
-from caviar_clients.datasets.verify import verify
+from caviar_clients.datasets.verification.verify import verify
 from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 

@@ -22,7 +22,7 @@ from caviar_clients.datasets.estimate import Estimate
 from caviar_clients.datasets.generate import generate
 from caviar_clients.datasets.ledger import Ledger, MissingEpisodes
 from caviar_clients.datasets.plan import DatasetPlan, plan_dataset
-from caviar_clients.datasets.verify import verify
+from caviar_clients.datasets.verification.verify import verify
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.scenario import load_scenario
 

@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.findings import Finding
-from caviar_clients.datasets.path_checks import Pair, check_gains, check_geometry, check_matrix, pair_of
+from caviar_clients.datasets.verification.findings import Finding
+from caviar_clients.datasets.verification.path_checks import (
+    Pair,
+    check_gains,
+    check_geometry,
+    check_matrix,
+    pair_of,
+)
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.channel import Interaction

@@ -203,7 +203,7 @@ def verify_command(
 
     from caviar_clients.cli.shared import write_json
     from caviar_clients.datasets.reader import check_level
-    from caviar_clients.datasets.verify import as_rows, verify
+    from caviar_clients.datasets.verification.verify import as_rows, verify
 
     check_level(dataset)
     console = Console()

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
-from caviar_clients.datasets.catalogue_checks import refuse_impossible
 from caviar_clients.datasets.look.data import (
     Content,
     Progress,
@@ -44,6 +43,7 @@ from caviar_clients.datasets.look.scans import (
 from caviar_clients.datasets.look.units import small_time_unit, time_text
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.texts import counted, decimal, percent
+from caviar_clients.datasets.verification.catalogue_checks import refuse_impossible
 from caviar_clients.files import reserved, write_file
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_protocol.errors import AssetError

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Set
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from caviar_clients.datasets.findings import Finding, listed, runs
+from caviar_clients.datasets.verification.findings import Finding, listed, runs
 from caviar_protocol.errors import AssetError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import FrameEntry, Recording

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.datasets.findings import Finding
+from caviar_clients.datasets.verification.findings import Finding
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Link, Scene

@@ -14,20 +14,25 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, Catalogue
-from caviar_clients.datasets.catalogue_checks import (
+from caviar_clients.datasets.directory import DatasetDirectory
+from caviar_clients.datasets.remote import RemoteDataset, located
+from caviar_clients.datasets.rows import rows_of
+from caviar_clients.datasets.verification.catalogue_checks import (
     against_recording,
     check_structure,
     impossible_values,
     missing_episodes,
     orphans,
 )
-from caviar_clients.datasets.checked_settings import checked_settings
-from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.findings import Finding, as_rows, listed, runs
-from caviar_clients.datasets.physics import PhysicsChecks
-from caviar_clients.datasets.recording_checks import lacking_scenery, products, scenes_and_stamps, seeds
-from caviar_clients.datasets.remote import RemoteDataset, located
-from caviar_clients.datasets.rows import rows_of
+from caviar_clients.datasets.verification.checked_settings import checked_settings
+from caviar_clients.datasets.verification.findings import Finding, as_rows, listed, runs
+from caviar_clients.datasets.verification.physics import PhysicsChecks
+from caviar_clients.datasets.verification.recording_checks import (
+    lacking_scenery,
+    products,
+    scenes_and_stamps,
+    seeds,
+)
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import Recording
 

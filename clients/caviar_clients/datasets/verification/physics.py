@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_clients.datasets.beam_checks import (
+from caviar_clients.datasets.verification.beam_checks import (
     BEAM,
     FROM_PATHS,
     User,
@@ -23,8 +23,8 @@ from caviar_clients.datasets.beam_checks import (
     check_flags,
     check_snr,
 )
-from caviar_clients.datasets.findings import Finding
-from caviar_clients.datasets.path_checks import (
+from caviar_clients.datasets.verification.findings import Finding
+from caviar_clients.datasets.verification.path_checks import (
     DELAY,
     GAIN_DB,
     Pair,
@@ -34,7 +34,7 @@ from caviar_clients.datasets.path_checks import (
     matrix_of,
     pair_of,
 )
-from caviar_clients.datasets.recording_checks import lacking_assets
+from caviar_clients.datasets.verification.recording_checks import lacking_assets
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import AssetError, CaviarError
 from caviar_protocol.messages import Status

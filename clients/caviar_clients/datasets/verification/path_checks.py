@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caviar_clients.datasets.findings import Finding
+from caviar_clients.datasets.verification.findings import Finding
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Channel, Scene

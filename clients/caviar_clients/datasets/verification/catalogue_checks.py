@@ -13,9 +13,9 @@ from types import UnionType
 from typing import Any, get_args, get_type_hints
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
-from caviar_clients.datasets.checked_settings import checked_settings
-from caviar_clients.datasets.findings import Finding, gaps, listed, runs
 from caviar_clients.datasets.rows import EpisodeRows
+from caviar_clients.datasets.verification.checked_settings import checked_settings
+from caviar_clients.datasets.verification.findings import Finding, gaps, listed, runs
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.scene_validation import MAX_COORDINATE_M
 
