@@ -312,7 +312,10 @@ def check_conformance(command: str, folder: Path) -> None:
     found = {entry["case"]: entry for entry in json.loads(verdicts.read_text("utf-8"))["verdicts"]}
     failed = [entry for entry in found.values() if entry["outcome"] == "fail"]
     assert not failed, failed
-    played = {"garbage", "truncated", "oversized", "undecodable-input", "restore", "sigterm", "scene-turning"}
+    played = {
+        "garbage", "truncated", "oversized", "undecodable-input", "restore", "sigterm", "scene-turning",
+        "run-time-meshes",
+    }  # fmt: skip
     assert {case for case in played if found[case]["outcome"] == "pass"} == played
     assert done.returncode == 0, done.stdout
 
@@ -360,6 +363,8 @@ def check_recording(directory: Path) -> None:
     scene = frame.scene()
     assert scene is not None
     assert scene.names == ("car", "uav", "van")
+    # The mesh of the van came while the run went on.
+    assert set(recording.meshes) == {scene.assets[2]}
     names = ["bs", "car/lidar", "car/rx", "uav/rx-uav", "van/rx"]
     assert [device.name for device in scene.devices] == names
     before = recording.frame(0, 10).scene()
