@@ -47,6 +47,46 @@ Ask = Callable[[str, Sequence[str]], list[str]]
 """Answers of a library to cases of a kind."""
 
 
+LONGEST = 80
+"""Lines of code that a reference world may have."""
+
+
+class LibraryTests:
+    """Tests of every library: a subclass says where its sources are, its module has the fixture ``ask``."""
+
+    SCHEMA: Path
+    """Source that holds the schema of the protocol."""
+    WORLD: Path
+    """The reference world."""
+    COMMENT: str
+    """How a line of its language begins that is a comment."""
+
+    def test_its_schema_is_that_of_the_protocol(self) -> None:
+        assert schema_is_current(self.SCHEMA)
+
+    def test_the_reference_world_is_short(self) -> None:
+        lines = [line.strip() for line in self.WORLD.read_text("utf-8").splitlines()]
+        assert 40 < sum(bool(line) and not line.startswith(self.COMMENT) for line in lines) <= LONGEST
+
+    def test_vectors_are_read_written_and_refused(self, ask: Ask) -> None:
+        check_vectors(ask)
+        check_arrays(ask)
+
+    def test_poses_are_converted_to_the_axes_of_engines_and_back(self, ask: Ask) -> None:
+        check_axes(ask)
+
+    def test_devices_are_mounted_as_the_vectors_say(self, ask: Ask) -> None:
+        check_mounts(ask)
+        check_matches(ask)
+
+    def test_wrong_objects_and_scenery_are_refused(self, ask: Ask) -> None:
+        check_wrong_objects(ask)
+        check_wrong_scenery(ask)
+
+    def test_links_channels_and_actions_are_decoded(self, ask: Ask) -> None:
+        check_decoders(ask)
+
+
 # --- vectors ----------------------------------------------------------------------------------------------
 
 

@@ -87,7 +87,7 @@ def test_it_is_asked_for_objects_with_times_of_the_episode_and_commands() -> Non
     command = VelocityCommand(object="car", velocity=(3.0, 0.0, 0.0))
     for number in (0, 1, 4):
         result = stepped(made, number, *([command] if number else []))
-    assert yard.times == pytest.approx([(0.0, 0.0), (0.1, 0.0), (0.4, 0.1)])
+    assert np.array(yard.times) == pytest.approx(np.array([[0.0, 0.0], [0.1, 0.0], [0.4, 0.1]]))
     assert yard.t0 == 5.0
     assert scene(result).position[0, 0] == pytest.approx(7 + 3 * 0.4)
     assert made.prefixes() == ("car", "crate.")
@@ -175,4 +175,4 @@ def test_a_state_has_the_engines_its_time_and_who_came_first() -> None:
     there = [scene(stepped(made, 5)) for made in (one, other)]
     assert there[0].position.tolist() == there[1].position.tolist()
     assert [d.name for d in there[1].devices] == ["car/rx"]
-    assert yard.times == pytest.approx([(0.5, 0.3)])
+    assert yard.times == [pytest.approx((0.5, 0.3))]
