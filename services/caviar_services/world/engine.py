@@ -12,7 +12,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -204,8 +204,9 @@ class EngineWorld(World[WorldSettings]):
         Args:
             engine: Which every incarnation of the world has.
         """
-        members = {"engine": staticmethod(lambda: engine), "Settings": type(engine).Settings}
-        return type(f"{type(engine).__name__}World", (cls,), members)
+        members: dict[str, Any] = {"engine": staticmethod(lambda: engine), "Settings": type(engine).Settings}
+        members["__module__"] = type(engine).__module__
+        return cast(type[EngineWorld], type(f"{type(engine).__name__}World", (cls,), members))
 
     def __init__(self, settings: WorldSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
