@@ -29,7 +29,7 @@ from caviar_protocol.topics import DriveCommand, SignalCommand
 from caviar_services.agent.baselines import LosBeamAgent
 
 
-class Marshal(LosBeamAgent):
+class Conductor(LosBeamAgent):
     """Stops one car, and keeps a light at one phase."""
 
     def other_actuators(self):
@@ -42,15 +42,16 @@ class Marshal(LosBeamAgent):
 '''
 
 
-def played(folder: Path, agent: str) -> tuple[str, Recording]:
-    """Digest and recording of `crossing` in free space, with an agent."""
+def played(folder: Path) -> tuple[str, Recording]:
+    """Digest and recording of `crossing` in free space, with that agent."""
     text = (SCENARIOS / "crossing.toml").read_text("utf-8")
     text = re.sub(r"^\[services\.channel\.settings\]\n(.+\n)*", "", text, flags=re.MULTILINE)
     text = re.sub(r"^scenery = .*\n", "", text, flags=re.MULTILINE)
-    text = text.replace('use = "sionna-rt"', 'use = "free-space"').replace('use = "los-beam"', f'use = "{agent}"')
+    text = text.replace('use = "sionna-rt"', 'use = "free-space"')
+    text = text.replace('use = "los-beam"', 'use = "conductor:Conductor"')
     text = text.replace("file:crossing/", f"file:{SCENARIOS}/crossing/")
     folder.mkdir()
-    (folder / "marshal.py").write_text(AGENT, "utf-8")
+    (folder / "conductor.py").write_text(AGENT, "utf-8")
     (folder / "run.toml").write_text(text, "utf-8")
     finished = run(folder / "run.toml", folder / "runs", "--embedded", "--frames", str(FRAMES))
     assert finished.status == 0, finished.output
@@ -59,7 +60,7 @@ def played(folder: Path, agent: str) -> tuple[str, Recording]:
 
 
 def test_a_car_that_is_commanded_to_stand_stands_and_people_walk_on(tmp_path: Path) -> None:
-    (digest, recording), (again, _) = (played(tmp_path / name, "marshal:Marshal") for name in ("one", "two"))
+    (digest, recording), (again, _) = (played(tmp_path / name) for name in ("one", "two"))
     assert again == digest
     speeds, walked = [], 0.0
     for frame in recording:
