@@ -1,4 +1,4 @@
-"""The reference world in Python: short, in whole runs, and killed. The kit judges it in test_conform_kit.py."""
+"""The reference world in Python: short, in whole runs, and killed; test_conform_kit.py has it judged."""
 
 from __future__ import annotations
 

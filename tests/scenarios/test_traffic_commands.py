@@ -20,7 +20,7 @@ pytestmark = [
 ]
 
 CAR = "traffic.east.15"
-"""It departs at the beginning of frame 0, 75 s after that of SUMO."""
+"""It departs 75 s after SUMO begins, and is there from frame 1 on."""
 FRAMES = 60
 STOPPED = 15
 """Frame in which the agent stops it."""
@@ -42,13 +42,13 @@ class Conductor(LosBeamAgent):
 '''
 
 
-def played(folder: Path) -> tuple[str, Recording]:
-    """Digest and recording of `crossing` in free space, with that agent."""
+def played(folder: Path, agent: str) -> tuple[str, Recording]:
+    """Digest and recording of `crossing` in free space, with an agent."""
     text = (SCENARIOS / "crossing.toml").read_text("utf-8")
     text = re.sub(r"^\[services\.channel\.settings\]\n(.+\n)*", "", text, flags=re.MULTILINE)
     text = re.sub(r"^scenery = .*\n", "", text, flags=re.MULTILINE)
     text = text.replace('use = "sionna-rt"', 'use = "free-space"')
-    text = text.replace('use = "los-beam"', 'use = "conductor:Conductor"')
+    text = text.replace('use = "los-beam"', f'use = "{agent}"')
     text = text.replace("file:crossing/", f"file:{SCENARIOS}/crossing/")
     folder.mkdir()
     (folder / "conductor.py").write_text(AGENT, "utf-8")
@@ -59,19 +59,29 @@ def played(folder: Path) -> tuple[str, Recording]:
     return summary["digest"], Recording(finished.directory)
 
 
-def test_a_car_that_is_commanded_to_stand_stands_and_people_walk_on(tmp_path: Path) -> None:
-    (digest, recording), (again, _) = (played(tmp_path / name) for name in ("one", "two"))
-    assert again == digest
-    speeds, walked = [], 0.0
+def motion(recording: Recording) -> tuple[np.ndarray, float]:
+    """Place along the street [m] and speed [m/s] of the car in each frame, and how far people walked [m]."""
+    found, walked = [], 0.0
     for frame in recording:
         scene = frame.scene()
         assert scene is not None
         speed = np.linalg.norm(scene.velocity, axis=1)
-        speeds.append(float(speed[scene.names.index(CAR)]))
         walked += float(speed[[kind == "pedestrian" for kind in scene.classes]].sum()) * 0.1
-    assert min(speeds[5:STOPPED]) > 2
-    assert max(speeds[STOPPED + 35 :]) < 0.1
+        if CAR in scene.names:
+            row = scene.names.index(CAR)
+            found.append((scene.position[row, 0], speed[row]))
+    return np.array(found), walked
+
+
+def test_a_car_that_is_commanded_to_stand_stands_and_people_walk_on(tmp_path: Path) -> None:
+    digest, recording = played(tmp_path / "one", "conductor:Conductor")
+    assert played(tmp_path / "two", "conductor:Conductor")[0] == digest
+    (driven, walked), (left, _) = map(motion, (recording, played(tmp_path / "left", "los-beam")[1]))
+    assert len(driven) == len(left) == FRAMES - 1
+    assert driven[:STOPPED, 1].min() > 5
+    assert driven[STOPPED + 35 :, 1].max() < 0.1
+    # Left alone it drives on, up to the queue before the junction.
+    assert left[-1, 0] - driven[-1, 0] > 2
     assert walked > 50
-    # Of the agent's commands none was refused, and beams were chosen beside them.
     kinds = {type(c).__name__ for _, p in recording.products("action") for c in p.payload.commands}
     assert kinds == {"BeamChoice", "DriveCommand", "SignalCommand"}

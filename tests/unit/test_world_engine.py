@@ -126,11 +126,7 @@ def test_wrong_meshes_while_the_run_goes_on_are_named_once_and_leave_boxes(
     wrong = {
         "nan": (broken, BOX.faces, "a vertex is not finite"),
         "none": (BOX.vertices, BOX.faces[:0], "it has no triangles"),
-        "many": (
-            BOX.vertices,
-            np.repeat(BOX.faces, 9, axis=0),
-            "it has 108 triangles, and this run takes 100",
-        ),
+        "many": (BOX.vertices, many, "it has 108 triangles, and this run takes 100"),
         "corner": (BOX.vertices, [[0, 1, 8]], "a corner that is none of its 8 vertices"),
         "flat": (BOX.vertices * [1, 1, 0], BOX.faces, "flat along z"),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from caviar_clients.conform import street
 from caviar_clients.conform.canonical import Answer
@@ -114,12 +115,13 @@ def _expect_mesh(session: Session, asset: Fields) -> None:
     stated = Asset(name=asset["name"], digest=asset["digest"], size=asset["size"])
     if problem := wrong_name(stated):
         raise Failed(f"an asset named objects/{stated.digest}.ply", f"{stated.name}: {problem}")
-    file = Path(session.rules.directory) / f"{stated.digest}.ply"
-    file.write_bytes(session.fetch(asset))
-    try:
-        read_unit_mesh(file, stated.name, MAX_FACES)
-    except AssetError as error:
-        raise Failed("a mesh that fills the unit box", str(error)) from error
+    with TemporaryDirectory(prefix="caviar-conform-") as folder:
+        file = Path(folder) / "mesh.ply"
+        file.write_bytes(session.fetch(asset))
+        try:
+            read_unit_mesh(file, stated.name, MAX_FACES)
+        except AssetError as error:
+            raise Failed("a mesh that fills the unit box", str(error)) from error
 
 
 def _with_capability(kit: Kit) -> Session:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, cast
 
@@ -195,7 +195,7 @@ class EngineWorld(World[WorldSettings]):
     inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
     checkpoints: ClassVar[bool] = True
     changes_geometry: ClassVar[bool] = True
-    engine: ClassVar[Callable[[], Engine]]
+    engine: ClassVar[Engine]
 
     @classmethod
     def of(cls, engine: Engine) -> type[EngineWorld]:
@@ -204,13 +204,13 @@ class EngineWorld(World[WorldSettings]):
         Args:
             engine: Which every incarnation of the world has.
         """
-        members: dict[str, Any] = {"engine": staticmethod(lambda: engine), "Settings": type(engine).Settings}
+        members: dict[str, Any] = {"engine": engine, "Settings": type(engine).Settings}
         members["__module__"] = type(engine).__module__
         return cast(type[EngineWorld], type(f"{type(engine).__name__}World", (cls,), members))
 
     def __init__(self, settings: WorldSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
-        self._engine = self.engine()
+        self._engine = self.engine
         self._engine._world, self._engine.settings = self, settings
         self._files: dict[str, bytes] | None = None
         self._is_prepared = False
