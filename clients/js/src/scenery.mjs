@@ -5,6 +5,7 @@ import { byBytes } from "./schema.mjs";
 import { sha256 } from "./sha256.mjs";
 
 /** @import { Material, OfferedMesh, SceneryMesh, Vector3 } from "./types.d.ts" */
+/** @typedef {{ dimensions: [number, number, number], centre: [number, number, number] }} Box  [m] */
 /** @typedef {ArrayLike<number> | readonly Vector3[]} Triples  as triples, or one number after the other */
 
 /** Materials of Recommendation ITU-R P.2040. */
@@ -147,7 +148,7 @@ export class Assets {
  * @param {Triples} vertices
  * @param {Triples} triangles
  * @param {string} material
- * @returns {{ file: Uint8Array, faces: number, dimensions: Vector3, centre: Vector3 }}
+ * @returns {{ file: Uint8Array, faces: number } & Box}
  */
 export function unitMesh(name, vertices, triangles, material) {
   const points = flat(vertices),
@@ -164,7 +165,7 @@ export function unitMesh(name, vertices, triangles, material) {
 /**
  * The bounding box of points; what is not finite counts as 0.
  * @param {Triples} vertices
- * @returns {{ dimensions: Vector3, centre: Vector3 }}
+ * @returns {Box}
  */
 export function boxOf(vertices) {
   const low = [Infinity, Infinity, Infinity],
