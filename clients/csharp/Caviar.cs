@@ -1361,6 +1361,21 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 && name.Skip(8).Take(64).All(letter => "0123456789abcdef".IndexOf(letter) >= 0);
         }
 
+        /// <summary>Raises ArgumentException for what a run would refuse.</summary>
+        public static void Check(string name, IList<double[]> vertices, IList<int[]> triangles, long maxFaces)
+        {
+            string who = "mesh '" + name + "': ";
+            if (vertices.Any(vertex => vertex.Take(3).Any(x => double.IsNaN(x) || double.IsInfinity(x))))
+                throw new ArgumentException(who + "a vertex is not finite");
+            if (triangles.Count == 0) throw new ArgumentException(who + "it has no triangle");
+            if (maxFaces > 0 && triangles.Count > maxFaces)
+                throw new ArgumentException(who + "it has " + triangles.Count
+                    + " triangles, and this run takes " + maxFaces);
+            if (vertices.Count == 0 || Enumerable.Range(0, 3).Any(i =>
+                vertices.Max(vertex => vertex[i]) <= vertices.Min(vertex => vertex[i])))
+                throw new ArgumentException(who + "it is flat");
+        }
+
         /// <summary>Bring a mesh; its name.</summary>
         public string Add(byte[] data)
         {
@@ -2057,7 +2072,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 if (!runs)
                     return _assets.Offer("objects/" + name + ".ply",
                         Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
-                CheckAtRunTime(name, vertices, triangles);
+                RunTimeMeshes.Check(name, vertices, triangles, _meshes.MaxFaces);
                 return _meshes.Add(Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
             }
             catch (ArgumentException problem)
@@ -2066,20 +2081,6 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 LogOnce(problem.Message + "; objects with it are boxes");
                 return "";
             }
-        }
-
-        private void CheckAtRunTime(string name, IList<double[]> vertices, IList<int[]> triangles)
-        {
-            string who = "mesh '" + name + "': ";
-            if (vertices.Any(vertex => vertex.Take(3).Any(part => double.IsNaN(part) || double.IsInfinity(part))))
-                throw new ArgumentException(who + "a vertex is not finite");
-            if (triangles.Count == 0) throw new ArgumentException(who + "it has no triangle");
-            if (_meshes.MaxFaces > 0 && triangles.Count > _meshes.MaxFaces)
-                throw new ArgumentException(who + "it has " + triangles.Count + " triangles, and this run takes "
-                    + _meshes.MaxFaces);
-            if (vertices.Count == 0 || Enumerable.Range(0, 3).Any(i =>
-                vertices.Max(vertex => vertex[i]) <= vertices.Min(vertex => vertex[i])))
-                throw new ArgumentException(who + "it is flat");
         }
 
         private void LogOnce(string line)
