@@ -107,6 +107,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "follow.md",
         {"followed-rays": ""},
     ),
+    "human-blockage": Measurement(
+        "python tests/bench/bench_human_blockage.py --markdown {out}/human-blockage.md",
+        "python tests/bench/bench_human_blockage.py --markdown {out}/human-blockage.md",
+        "human-blockage.md",
+        {"human-blockage": ""},
+    ),
     "keyframes": Measurement(
         f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 3 --out {{out}}",
         f"{_CAVIAR} --part keyframes --baseline {_BASE} --reference {_BASE} --minutes 13 --out {{out}}",
@@ -130,6 +136,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "python tests/bench/bench_processes.py street-canyon --frames 400 --markdown {out}/processes.md",
         "processes.md",
         {"processes": ""},
+    ),
+    "quadrotor": Measurement(
+        "python tests/bench/bench_quadrotor.py --rounds 2 --markdown {out}/quadrotor.md",
+        "python tests/bench/bench_quadrotor.py --markdown {out}/quadrotor.md",
+        "quadrotor.md",
+        {"quadrotor-frames": ""},
     ),
     "stability": Measurement(
         "caviar stability --markdown {out}/stability.md",

@@ -1512,6 +1512,13 @@ class Mounts {
   std::vector<std::string> arrived_;
 };
 
+// Whether a name is that of a mesh that came while a run went on, `objects/SHA-256.ply`: consumers without that
+// mesh have a box.
+inline bool is_mesh_name(const std::string& name) {
+  return name.size() == 8 + 64 + 4 && name.rfind("objects/", 0) == 0 && name.rfind(".ply") == 72 &&
+         name.find_first_not_of("0123456789abcdef", 8) == 72;
+}
+
 // What is wrong with the objects of a frame; nothing where consumers will accept them (SPEC.md, Content).
 inline std::string wrong_object(const Object& object, const std::vector<std::string>& prefixes,
                                 const std::map<std::string, Bytes>& files) {
@@ -1525,8 +1532,8 @@ inline std::string wrong_object(const Object& object, const std::vector<std::str
   if (!keeps_rule("NewName", object.name)) return name + "a name has 1 to 128 printable characters";
   if (!claimed) return name + "its name begins with no prefix; call claim() for it in prepare()";
   if (!keeps_rule("NewName", object.kind)) return name + "its kind is missing: car, uav, pedestrian, …";
-  if (!object.asset.empty() && !files.count(object.asset))
-    return name + "asset '" + object.asset + "' was not offered; offer_mesh() in prepare() returns its name";
+  if (!object.asset.empty() && !files.count(object.asset) && !is_mesh_name(object.asset))
+    return name + "asset '" + object.asset + "' was not offered; offer_mesh() returns its name";
   if (!(std::fabs(norm - 1.0) <= 1e-3))
     return name + "its orientation has norm " + std::to_string(norm) + ", not 1";
   if (!(length(object.position) <= 1e9)) return name + "its position is farther than 1e9 m, or no number";
@@ -1631,10 +1638,11 @@ inline std::string wrong_mesh(const Mesh& mesh) {
   return mesh.triangles.empty() ? "it has no triangle" : "";
 }
 
-// The mesh as a binary PLY file.
-inline Bytes to_ply(const Mesh& mesh) {
+// The mesh as a binary PLY file, which names the material of its object, where it has one of its own.
+inline Bytes to_ply(const Mesh& mesh, const std::string& material = "") {
+  const std::string comment = material.empty() ? "" : "comment material " + material + "\n";
   Bytes file =
-      "ply\nformat binary_little_endian 1.0\nelement vertex " + std::to_string(mesh.vertices.size()) +
+      "ply\nformat binary_little_endian 1.0\n" + comment + "element vertex " + std::to_string(mesh.vertices.size()) +
       "\nproperty float x\nproperty float y\nproperty float z\nelement face " +
       std::to_string(mesh.triangles.size()) + "\nproperty list uchar int vertex_indices\nend_header\n";
   const auto add = [&file](const void* data, std::size_t size) {
@@ -1676,19 +1684,25 @@ inline bool plain_name(const std::string& name) {
          name.find_first_not_of(LETTERS) == std::string::npos;
 }
 
-// What is wrong with scenery; nothing where it can be offered.
-inline std::string wrong_scenery(const std::vector<Surface>& surfaces,
-                                 const std::vector<Material>& materials) {
+// What is wrong with a material of Recommendation ITU-R P.2040; nothing where there is one of this name.
+inline std::string wrong_material(const std::string& type) {
   static constexpr char TYPES_OF_P2040[] =
       " asphalt_concrete brick carpet_tile ceiling_board chipboard clear_acrylic concrete floorboard glass "
       "marble "
       "metal plasterboard plywood vinyl_tile wood very_dry_ground medium_dry_ground wet_ground vacuum ";
+  if (std::strstr(TYPES_OF_P2040, (" " + type + " ").c_str()) != nullptr) return {};
+  return "'" + type + "' is none of" + TYPES_OF_P2040;
+}
+
+// What is wrong with scenery; nothing where it can be offered.
+inline std::string wrong_scenery(const std::vector<Surface>& surfaces,
+                                 const std::vector<Material>& materials) {
   std::map<std::string, bool> names, kinds;
   for (const Material& material : materials) {
     if (!plain_name(material.name) || kinds.count(material.name))
       return "material '" + material.name + "': names are unique, of letters, digits, '_', '-' and '.'";
-    if (std::strstr(TYPES_OF_P2040, (" " + material.type + " ").c_str()) == nullptr)
-      return "material '" + material.name + "': '" + material.type + "' is none of" + TYPES_OF_P2040;
+    if (const std::string wrong = wrong_material(material.type); !wrong.empty())
+      return "material '" + material.name + "': " + wrong;
     if (!(material.thickness_m > 0))
       return "material '" + material.name + "': its thickness is not above 0 m";
     kinds[material.name] = true;
@@ -1714,6 +1728,75 @@ inline std::string geometry_digest(const std::map<std::string, Bytes>& files) {
   }
   return files.empty() ? "" : digest.hex();
 }
+
+// Meshes that come while an episode goes on, each for as long as an object has it (SPEC.md, Geometry at run
+// time).
+class RunTimeMeshes {
+ public:
+  static constexpr std::int64_t LINGER_FRAMES = 20;  // one that comes back soon costs nothing
+
+  std::int64_t max_faces = 0;  // triangles that a mesh may have; 0: the run takes none, and objects are boxes
+
+  // Begins an episode, or goes on in it at a frame. `again`: another process may have announced some before.
+  void reset(bool again, std::int64_t frame = 0) {
+    files_.clear(), used_.clear(), announced_.clear();
+    frame_ = frame, known_ = !again;
+  }
+
+  // The name of the mesh of a file.
+  std::string add(Bytes file) {
+    const std::string name = "objects/" + sha256(file) + ".ply";
+    std::int64_t& used = used_.emplace(name, frame_).first->second;
+    used = std::max(used, frame_);
+    files_.emplace(name, std::move(file));
+    return name;
+  }
+
+  bool has(const std::string& name) const { return files_.count(name) && !refused_.count(name); }
+
+  // What DONE says of the meshes of a frame: nothing where they are those of the frame before.
+  std::optional<Value> change(std::int64_t frame, const std::vector<Object>& objects) {
+    frame_ = frame + 1;
+    if (max_faces == 0) return {};
+    for (const Object& object : objects)
+      if (const auto used = used_.find(object.asset); used != used_.end()) used->second = frame;
+    for (auto used = used_.begin(); used != used_.end();) {
+      const bool gone = used->second + LINGER_FRAMES < frame;
+      if (gone) files_.erase(used->first);
+      used = gone ? used_.erase(used) : std::next(used);
+    }
+    std::vector<std::string> names;
+    for (const auto& entry : files_)
+      if (has(entry.first)) names.push_back(entry.first);
+    if (known_ && names == announced_) return {};
+    known_ = true, announced_ = names;
+    std::vector<Value> assets;
+    for (const std::string& name : names)
+      assets.push_back(
+          Value::map({{"name", name}, {"digest", name.substr(8, 64)}, {"size", files_[name].size()}}));
+    return Value::map({{"frame", frame}, {"assets", Value::list(assets)}});
+  }
+
+  // The broker takes a mesh for none, or, where the digest is empty, all that were announced.
+  void refuse(const std::string& digest) {
+    for (const auto& entry : files_)
+      if (digest.empty() || entry.first.substr(8, 64) == digest) refused_[entry.first] = true;
+  }
+
+  // The file of a digest; null where there is none.
+  const Bytes* find(const std::string& digest) const {
+    const auto found = files_.find("objects/" + digest + ".ply");
+    return found == files_.end() ? nullptr : &found->second;
+  }
+
+ private:
+  std::map<std::string, Bytes> files_;
+  std::map<std::string, std::int64_t> used_;  // frame in which an object had it last, or in which it came
+  std::map<std::string, bool> refused_;
+  std::vector<std::string> announced_;
+  std::int64_t frame_ = 0;  // that is computed next
+  bool known_ = true;       // whether `announced_` is what the broker has
+};
 
 // --- 8 commands, link, channel
 // -------------------------------------------------------------------------------
@@ -2143,17 +2226,25 @@ class World {
   }
 
   // Offers the mesh of objects, fitted into the unit box that `dimensions` scale; returns what goes into
-  // `asset`. In `prepare`.
+  // `asset`. In `prepare` it is there for the whole run. In `reset`, `step` and `restore` it comes while the
+  // run goes on, and stays as long as an object has it, and 20 frames longer, until the episode ends; a state
+  // has no meshes, so that `restore` offers those of its objects again. One that is none is logged then, and
+  // its objects are boxes. `material`: of ITU-R P.2040; empty: what the channel's settings say.
   std::string offer_mesh(const std::string& name, const std::vector<Vector3>& vertices,
-                         const std::vector<Triangle>& triangles) {
+                         const std::vector<Triangle>& triangles, const std::string& material = "") {
+    const bool runs = stage_ >= Stage::ready;
     Mesh mesh{vertices, triangles};
-    if (const std::string wrong = wrong_mesh(mesh); !wrong.empty())
-      return fail("mesh '" + name + "': " + wrong), "";
+    std::string wrong = wrong_mesh(mesh);
+    if (wrong.empty() && !material.empty()) wrong = wrong_material(material);
     const Box box = bounds(vertices);
+    if (runs && wrong.empty()) wrong = wrong_at_run_time(mesh, box);
+    if (!wrong.empty() && !runs) return fail("mesh '" + name + "': " + wrong), "";
+    if (!wrong.empty()) return log_once("mesh '" + name + "': " + wrong + "; objects with it are boxes"), "";
     for (Vector3& vertex : mesh.vertices)
       for (std::size_t k = 0; k < 3; ++k)
         vertex[k] = box.size[k] > 0 ? (vertex[k] - box.centre[k]) / box.size[k] : 0.0;
-    return offer_file("objects/" + name + ".ply", to_ply(mesh));
+    if (runs) return run_time_meshes_.add(to_ply(mesh, material));
+    return offer_file("objects/" + name + ".ply", to_ply(mesh, material));
   }
 
   // Offers the static scenery, in world axes. At most one world of a run does. In `prepare`.
@@ -2229,7 +2320,7 @@ class World {
                               {"role", "world"},
                               {"inputs", Value::list(wanted)},
                               {"outputs", Value::list({"scene"})},
-                              {"capabilities", Value::list({"assets", "checkpoint", "episodes"})},
+                              {"capabilities", Value::list({"assets", "checkpoint", "episodes", "geometry"})},
                               {"implementation", "caviar.hpp"},
                               {"max_in_flight", max_in_flight}});
 #if defined(__linux__)
@@ -2323,13 +2414,13 @@ class World {
     if (message.is("SHUTDOWN")) return on_shutdown(fields);
     if (message.is("REFUSE")) return on_refuse(fields);
     if (message.is("STALE")) return log("its " + fields["of"].text() + " was stale"), false;
-    if (message.is("ERROR")) return log(fields["code"].text() + ": " + fields["message"].text()), false;
+    if (message.is("ERROR")) return on_error(fields), false;
     const bool mine = welcomed() && fields["epoch"].integer() == welcome_["epoch"].integer() &&
                       fields["attempt"].integer() == welcome_["attempt"].integer();
     const bool turn = mine && stage_ == Stage::active && fields["episode"].integer() == episode_;
     if (message.is("WELCOME") && stage_ == Stage::connecting) return on_welcome(fields);
     if (message.is("ASSET_GET") && stage_ >= Stage::ready) return serve(fields), false;
-    if (message.is("PREPARE") && mine && stage_ == Stage::joined) return on_prepare(), false;
+    if (message.is("PREPARE") && mine && stage_ == Stage::joined) return on_prepare(fields), false;
     if (message.is("RESET") && mine && stage_ >= Stage::ready) return on_reset(fields), false;
     if (message.is("GRANT") && turn) return on_grant(std::move(message));
     if (message.is("CHECKPOINT") && turn) return on_checkpoint(fields), false;
@@ -2360,8 +2451,14 @@ class World {
     return false;
   }
 
-  void on_prepare() {
+  void on_error(const Value& fields) {
+    log(fields["code"].text() + ": " + fields["message"].text());
+    if (fields["code"].text() == "refused-mesh") run_time_meshes_.refuse(fields["subject"].text());
+  }
+
+  void on_prepare(const Value& fields) {
     prefixes_.clear(), files_.clear(), notes_.clear(), failure_.clear();
+    run_time_meshes_.max_faces = fields["max_faces"].integer();
     heart_.report("prepare");
     prepare();
     if (!failure_.empty()) return fault("prepare", -1, failure_);
@@ -2383,19 +2480,39 @@ class World {
   }
 
   void serve(const Value& get) {
-    const auto found = digests_.find(get["digest"].text());
+    const std::string digest = get["digest"].text();
+    const auto offered = digests_.find(digest);
+    const Bytes* data = offered == digests_.end() ? run_time_meshes_.find(digest) : &files_[offered->second];
     const auto offset = static_cast<std::size_t>(get["offset"].integer());
-    if (found == digests_.end() || offset > files_[found->second].size())
+    if (data == nullptr || offset > data->size())
       return refuse("unknown-asset", "no asset has this digest, or so many bytes", "ASSET_GET",
                     get["digest"]);
-    const Bytes& data = files_[found->second];
-    const Value answer = Value::map({{"digest", found->first}, {"offset", offset}, {"size", data.size()}});
-    send_parts(socket_, {encode("AssetData", answer), data.substr(offset, MAX_ASSET_CHUNK)});
+    const Value answer = Value::map({{"digest", digest}, {"offset", offset}, {"size", data->size()}});
+    send_parts(socket_, {encode("AssetData", answer), data->substr(offset, MAX_ASSET_CHUNK)});
   }
 
   void forget() {
-    answers_.clear(), waiting_.clear(), mounts_.clear();
+    answers_.clear(), waiting_.clear(), mounts_.clear(), logged_.clear();
     kept_ = 0, newest_ = -1, deferred_ = false, previous_ns_.reset();
+    run_time_meshes_.reset(was_here_before());
+  }
+
+  // Whether the broker may know meshes that an earlier process of this world announced.
+  bool was_here_before() const {
+    return welcome_["epoch"].integer(1) > 1 || welcome_["attempt"].integer(1) > 1;
+  }
+
+  std::string wrong_at_run_time(const Mesh& mesh, const Box& box) const {
+    const auto faces = static_cast<std::int64_t>(mesh.triangles.size()), most = run_time_meshes_.max_faces;
+    if (most > 0 && faces > most)
+      return "it has " + std::to_string(faces) + " triangles, and this run takes " + std::to_string(most);
+    if (!(box.size[0] > 0 && box.size[1] > 0 && box.size[2] > 0)) return "it is flat";
+    return {};
+  }
+
+  void log_once(const std::string& line) {
+    if (!logged_[line]) log(line);
+    logged_[line] = true;
   }
 
   void on_reset(const Value& fields) {
@@ -2463,7 +2580,15 @@ class World {
   void finish(std::vector<Object> objects) {
     if (failure_.empty()) failure_ = wrong_objects(objects);
     if (!failure_.empty()) return fault("step", frame(), failure_);
+    for (Object& object : objects) {
+      if (!is_mesh_name(object.asset)) continue;
+      if (run_time_meshes_.max_faces == 0)
+        object.asset.clear();  // the run takes no meshes now
+      else if (!run_time_meshes_.has(object.asset))
+        log_once(object.asset + " is not there; objects with it are boxes until offer_mesh() brings it");
+    }
     const std::chrono::nanoseconds took = Clock::now() - began_;
+    const std::optional<Value> change = run_time_meshes_.change(frame(), objects);
     std::map<std::string, Value> devices = mounts_.devices(objects);
     for (const Object& object : objects)
       if (devices.count(object.name))
@@ -2471,10 +2596,11 @@ class World {
     auto [header, body] = encode_scene(std::move(objects), devices);
     if (header.size() > MAX_HEADER) return fault("step", frame(), "the header of the scene exceeds 1 MiB");
     Value product = Value::map({{"topic", "scene"}, {"digest", product_digest(header, body)}});
-    const Value done = stamped({{"episode", episode_},
-                                {"frame", frame()},
-                                {"products", Value::list({product})},
-                                {"measured", Value::map({{"step", took.count()}})}});
+    Value done = stamped({{"episode", episode_},
+                          {"frame", frame()},
+                          {"products", Value::list({product})},
+                          {"measured", Value::map({{"step", took.count()}})}});
+    if (change) done.set("geometry", *change);
     answer({encode("Done", done), std::move(header), std::move(body)});
     previous_ns_ = grant_.fields["t_ns"].integer();
   }
@@ -2541,6 +2667,7 @@ class World {
     right = right && length <= state.size() - begin &&
             !Unpacker(std::string_view(state).substr(begin, length)).read(head);
     failure_.clear();
+    run_time_meshes_.reset(was_here_before(), fields["frame"].integer() + 1);
     if (!right || !restore(state.substr(begin + length)) || !failure_.empty()) {
       fault("restore", -1, failure_.empty() ? "RESTORE has a state that is none of this world" : failure_);
       return end("it cannot go on from the state that it was given", 1);
@@ -2569,6 +2696,8 @@ class World {
   std::vector<std::string> prefixes_, notes_;
   std::map<std::string, Bytes> files_;          // scenery by name
   std::map<std::string, std::string> digests_;  // name by digest
+  RunTimeMeshes run_time_meshes_;
+  std::map<std::string, bool> logged_;
   std::string failure_;
 
   std::int64_t episode_ = -1, t0_ns_ = 0, seed_episode_ = 0, newest_ = -1;

@@ -1,6 +1,7 @@
-// The reference world: a car and a UAV move, a pedestrian comes and goes, and it brings a street and a car's
-// mesh. The UAV flies between four points, or where agents send it; that state is saved, so that the world
-// goes on where it was when it is killed and started again.
+// The reference world: a car and a UAV move, a pedestrian and a ramp come and go, and it brings a street and the
+// meshes of car and ramp, that of the ramp while the run goes on. The UAV flies between four points, or where
+// agents send it; that state is saved, so that the world goes on where it was when it is killed and started
+// again.
 //
 //     g++ -std=c++17 -O2 world.cpp -o world -lzmq -pthread
 //     ./world tcp://127.0.0.1:5555 world
@@ -19,7 +20,7 @@ class Street : public caviar::World {
   std::string car_mesh_;
 
   void prepare() override {
-    for (const char* name : {"car", "pedestrian", "uav"}) claim(name);
+    for (const char* name : {"car", "pedestrian", "ramp", "uav"}) claim(name);
     caviar::Mesh car = caviar::box_mesh({0.0, 0.0, -0.2}, {1.0, 1.0, 0.6});
     const caviar::Mesh cabin = caviar::box_mesh({-0.05, 0.0, 0.3}, {0.5, 0.9, 0.4});
     for (const caviar::Triangle& corners : cabin.triangles)
@@ -41,6 +42,7 @@ class Street : public caviar::World {
         uav_.target = command.position, uav_.speed = command.speed;
     std::vector<Object> objects{driven(t), flown(t - previous)};
     if (std::fmod(t, 12.0) >= 4.0) objects.push_back(walking(std::fmod(t, 12.0) - 4.0));
+    if (std::fmod(t, 12.0) >= 6.0) objects.push_back(standing());
     return objects;
   }
 
@@ -72,6 +74,14 @@ class Street : public caviar::World {
   static Object walking(double t) {  // along the pavement, for 8 s
     return {"pedestrian", "pedestrian",    "", {-6.0 + 1.4 * t, 12.0, 0.9}, {1, 0, 0, 0},
             {1.4, 0, 0},  {0.5, 0.6, 1.8}, {}};
+  }
+
+  Object standing() {  // offered again in each frame, which costs nothing
+    const std::vector<Vector3> wedge{{0, 0, 0}, {2, 0, 0}, {2, 1, 0}, {0, 1, 0}, {0, 0, 1}, {0, 1, 1}};
+    const std::vector<caviar::Triangle> sides{{0, 3, 2}, {0, 2, 1}, {0, 1, 4}, {3, 5, 2},
+                                              {0, 4, 5}, {0, 5, 3}, {1, 2, 5}, {1, 5, 4}};
+    const std::string mesh = offer_mesh("ramp", wedge, sides, "wood");
+    return {"ramp", "ramp", mesh, {6.0, 2.0, 1.0}, {1, 0, 0, 0}, {}, {4.0, 2.0, 2.0}, {}};
   }
 
   Bytes save() override { return Bytes(reinterpret_cast<const char*>(&uav_), sizeof uav_); }

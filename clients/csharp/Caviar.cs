@@ -1221,15 +1221,17 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return name;
         }
 
-        public static byte[] Ply(string name, IList<double[]> vertices, IList<int[]> triangles)
+        public static byte[] Ply(string name, IList<double[]> vertices, IList<int[]> triangles,
+            string material = "")
         {
             foreach (var triangle in triangles)
                 if (triangle.Length != 3 || triangle.Any(corner => corner < 0 || corner >= vertices.Count))
                     throw new ArgumentException("mesh '" + name + "': the corners "
                         + string.Join(", ", triangle) + " are not three of its " + vertices.Count
                         + " vertices");
-            var head = Bytes.Utf8("ply\nformat binary_little_endian 1.0\nelement vertex " + vertices.Count
-                + "\nproperty float x\nproperty float y\nproperty float z\nelement face " + triangles.Count
+            var head = Bytes.Utf8("ply\nformat binary_little_endian 1.0\n"
+                + (material == "" ? "" : "comment material " + material + "\n")
+                + "element vertex " + vertices.Count + "\nproperty float x\nproperty float y\nproperty float z\nelement face " + triangles.Count
                 + "\nproperty list uchar int vertex_indices\nend_header\n");
             var data = new byte[head.Length + 12 * vertices.Count + 13 * triangles.Count];
             head.CopyTo(data, 0);
@@ -1315,6 +1317,109 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             return _files.Where(file => _digests[file.Key] == digest).Select(file => file.Value)
                 .FirstOrDefault();
+        }
+    }
+
+    /// <summary>Meshes that come while an episode goes on, each for as long as an object has it (SPEC.md,
+    /// Geometry at run time).</summary>
+    internal sealed class RunTimeMeshes
+    {
+        /// <summary>Frames for which a mesh stays that no object has any more: one that comes back soon costs
+        /// nothing.</summary>
+        public const int LingerFrames = 20;
+
+        private sealed class File
+        {
+            public byte[] Data;
+            public long Used; // frame in which an object had it last, or in which it came
+        }
+
+        private readonly SortedDictionary<string, File> _files =
+            new SortedDictionary<string, File>(StringComparer.Ordinal);
+        private readonly HashSet<string> _refused = new HashSet<string>();
+        private string _announced = ""; // null: not known
+        private long _frame; // that is computed next
+
+        /// <summary>Triangles that a mesh may have; 0: the run takes none, and objects are boxes.</summary>
+        public long MaxFaces;
+
+        /// <summary>Begin an episode, or go on in it at a frame.</summary>
+        /// <param name="again">Whether another process of this world may have announced some before.</param>
+        public void Reset(bool again, long frame = 0)
+        {
+            _files.Clear();
+            _announced = again ? null : "";
+            _frame = frame;
+        }
+
+        /// <summary>Whether a name is that of a mesh that came while a run went on: consumers without that mesh
+        /// have a box.</summary>
+        public static bool IsName(string name)
+        {
+            return name.Length == 76 && name.StartsWith("objects/", StringComparison.Ordinal)
+                && name.EndsWith(".ply", StringComparison.Ordinal)
+                && name.Skip(8).Take(64).All(letter => "0123456789abcdef".IndexOf(letter) >= 0);
+        }
+
+        /// <summary>Raises ArgumentException for what a run would refuse.</summary>
+        public static void Check(string name, IList<double[]> vertices, IList<int[]> triangles, long maxFaces)
+        {
+            string who = "mesh '" + name + "': ";
+            if (vertices.Any(vertex => vertex.Take(3).Any(x => double.IsNaN(x) || double.IsInfinity(x))))
+                throw new ArgumentException(who + "a vertex is not finite");
+            if (triangles.Count == 0) throw new ArgumentException(who + "it has no triangle");
+            if (maxFaces > 0 && triangles.Count > maxFaces)
+                throw new ArgumentException(who + "it has " + triangles.Count
+                    + " triangles, and this run takes " + maxFaces);
+            if (vertices.Count == 0 || Enumerable.Range(0, 3).Any(i =>
+                vertices.Max(vertex => vertex[i]) <= vertices.Min(vertex => vertex[i])))
+                throw new ArgumentException(who + "it is flat");
+        }
+
+        /// <summary>Bring a mesh; its name.</summary>
+        public string Add(byte[] data)
+        {
+            string name = "objects/" + Bytes.Sha256(data) + ".ply";
+            File file;
+            if (!_files.TryGetValue(name, out file)) _files[name] = file = new File { Data = data };
+            file.Used = Math.Max(file.Used, _frame);
+            return name;
+        }
+
+        public bool Has(string name) { return _files.ContainsKey(name) && !_refused.Contains(name); }
+
+        /// <summary>What DONE says of the meshes of a frame; null where they are those of the frame
+        /// before.</summary>
+        public Map Change(long frame, IEnumerable<string> meshes)
+        {
+            _frame = frame + 1;
+            if (MaxFaces == 0) return null;
+            File file;
+            foreach (var mesh in meshes)
+                if (_files.TryGetValue(mesh, out file)) file.Used = frame;
+            foreach (var gone in _files.Where(entry => entry.Value.Used + LingerFrames < frame)
+                .Select(entry => entry.Key).ToList())
+                _files.Remove(gone);
+            var names = _files.Keys.Where(Has).ToList();
+            var announced = string.Concat(names);
+            if (announced == _announced) return null;
+            _announced = announced;
+            var assets = names.Select(name => (object)new Map { { "name", name },
+                { "digest", name.Substring(8, 64) }, { "size", (long)_files[name].Data.Length } });
+            return new Map { { "frame", frame }, { "assets", assets.ToList() } };
+        }
+
+        /// <summary>The broker takes a mesh for none, or, where the digest is empty, all of them.</summary>
+        public void Refuse(string digest)
+        {
+            _refused.UnionWith(_files.Keys.Where(name => digest == "" || name.Substring(8, 64) == digest));
+        }
+
+        /// <summary>The file of a digest, or null.</summary>
+        public byte[] Find(string digest)
+        {
+            File file;
+            return _files.TryGetValue("objects/" + digest + ".ply", out file) ? file.Data : null;
         }
     }
 
@@ -1410,7 +1515,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             if (item.AngularVelocity != null) Numbers(who + "angular velocity", item.AngularVelocity, 3, 1e9);
             if (item.Mesh != "" && HasMesh != null && !HasMesh(item.Mesh))
                 throw new ArgumentException(who + "the mesh '" + item.Mesh
-                    + "' was not offered; call OfferMesh in Prepare");
+                    + "' was not offered; take it from what OfferMesh returns");
         }
 
         private static void Numbers(string what, double[] values, int count, double most)
@@ -1859,6 +1964,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private const int DigestedBytes = 16 << 10;
         private readonly AutoResetEvent _arrived = new AutoResetEvent(false);
         private readonly Assets _assets = new Assets();
+        private readonly RunTimeMeshes _meshes = new RunTimeMeshes();
+        private readonly HashSet<string> _said = new HashSet<string>();
         private readonly Queue<KeyValuePair<Map, List<byte[]>>> _grants = new Queue<KeyValuePair<Map,
             List<byte[]>>>();
         private readonly Dictionary<long, byte[]> _answers = new Dictionary<long, byte[]>();
@@ -1944,13 +2051,51 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return _products.TryGetValue(topic, out found) ? found : new List<Map>();
         }
 
-        /// <summary>Bring the mesh of objects; the name of its asset, for WorldObject.Mesh.</summary>
+        /// <summary>Bring the mesh of objects; the name of its asset, for WorldObject.Mesh. In Prepare it is
+        /// there for the whole run. In Reset, Step and Restore it comes while the run goes on, and stays as long
+        /// as an object has it, and 20 frames longer, until the episode ends; a state has no meshes, so that
+        /// Restore offers those of its objects again. One that is none is logged then, and the name is empty:
+        /// its objects are boxes.</summary>
         /// <param name="vertices">In body axes (x forward, y left, z up) and any unit: they are fitted into
         /// the unit box.</param>
-        public string OfferMesh(string name, IList<double[]> vertices, IList<int[]> triangles)
+        /// <param name="material">Of Recommendation ITU-R P.2040; empty: what the channel's settings
+        /// say.</param>
+        public string OfferMesh(string name, IList<double[]> vertices, IList<int[]> triangles,
+            string material = "")
         {
-            return _assets.Offer("objects/" + name + ".ply",
-                Assets.Ply(name, Assets.InUnitBox(vertices), triangles));
+            bool runs = _state == State.Ready || _state == State.Active;
+            try
+            {
+                if (material != "" && !Material.Types.Contains(material))
+                    throw new ArgumentException("mesh '" + name + "': no type is '" + material + "'; one of "
+                        + string.Join(", ", Material.Types));
+                if (!runs)
+                    return _assets.Offer("objects/" + name + ".ply",
+                        Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
+                RunTimeMeshes.Check(name, vertices, triangles, _meshes.MaxFaces);
+                return _meshes.Add(Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
+            }
+            catch (ArgumentException problem)
+            {
+                if (!runs) throw;
+                LogOnce(problem.Message + "; objects with it are boxes");
+                return "";
+            }
+        }
+
+        private void LogOnce(string line)
+        {
+            if (_said.Add(line)) Log(Name + ": " + line);
+        }
+
+        /// <summary>A mesh as the run may have it.</summary>
+        private string Looked(string mesh)
+        {
+            if (!RunTimeMeshes.IsName(mesh)) return mesh;
+            if (_meshes.MaxFaces == 0) return ""; // the run takes no meshes now
+            if (!_meshes.Has(mesh))
+                LogOnce(mesh + " is not there; objects with it are boxes until OfferMesh brings it");
+            return mesh;
         }
 
         /// <summary>Bring the static scenery: a mesh of a material each.</summary>
@@ -2035,7 +2180,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 { "version", new List<object> { 1L, 6L } }, { "name", Name }, { "role", "world" },
                 { "inputs", inputs },
                 { "outputs", new List<object> { "scene" } },
-                { "capabilities", new List<object> { "assets", "episodes", "checkpoint" } },
+                { "capabilities", new List<object> { "assets", "episodes", "checkpoint",
+                    "geometry" } },
                 { "implementation", Implementation }, { "max_in_flight", 4L },
             });
         }
@@ -2144,6 +2290,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             {
                 Log(Name + ": " + type + " " + message.Text("code") + message.Text("of") + " "
                     + message.Text("message"));
+                if (message.Text("code") == "refused-mesh") _meshes.Refuse(message.Text("subject"));
                 return;
             }
             if (type == "CANCEL") return; // advice: the answer is due all the same
@@ -2171,7 +2318,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             switch (type)
             {
                 case "WELCOME": Welcome(message); break;
-                case "PREPARE": OnPrepare(); break;
+                case "PREPARE": OnPrepare(message); break;
                 case "RESET": OnReset(message); break;
                 case "GRANT": _grants.Enqueue(new KeyValuePair<Map, List<byte[]>>(message, parts)); break;
                 case "EPISODE_END": _state = State.Ready; break;
@@ -2200,13 +2347,14 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             object devices;
             Scenario.TryGetValue("devices", out devices);
             _scene = new SceneBuilder(((List<object>)devices ?? new List<object>())
-                .Cast<Map>()) { HasMesh = _assets.Has };
+                .Cast<Map>()) { HasMesh = name => _assets.Has(name) || RunTimeMeshes.IsName(name) };
             _heart = new Heart(_endpoint, _token, message, Name);
             _state = State.Joined;
         }
 
-        private void OnPrepare()
+        private void OnPrepare(Map message)
         {
+            _meshes.MaxFaces = message.Whole("max_faces");
             _state = State.Preparing;
             _heart.Phase = "prepare";
             _assets.Clear();
@@ -2224,7 +2372,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private void Serve(Map get)
         {
-            byte[] data = _assets.Find(get.Text("digest"));
+            byte[] data = _assets.Find(get.Text("digest")) ?? _meshes.Find(get.Text("digest"));
             long offset = get.Whole("offset");
             if (data == null || offset > data.Length)
             {
@@ -2246,6 +2394,8 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _answers.Clear();
             _grants.Clear();
             _scene.Arrived = new string[0];
+            _meshes.Reset(WasHereBefore);
+            _said.Clear();
             _stepped = false;
             _newest = -1;
             Reset(message.Whole("seed"), _t0 / 1e9);
@@ -2253,6 +2403,10 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _state = State.Active;
             Send("RESET_DONE", With(new Map { { "episode", _episode } }));
         }
+
+        /// <summary>Whether the broker may know meshes that an earlier process of this world
+        /// announced.</summary>
+        private bool WasHereBefore { get { return _epoch > 1 || _attempt > 1; } }
 
         // --- frames ----------------------------------------------------------------------------------------
 
@@ -2293,15 +2447,18 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 if (objects == null) return null;
                 var given = objects.ToList();
                 phase = "encode";
+                foreach (var item in given) item.Mesh = Looked(item.Mesh);
                 var product = _scene.Build(given);
                 _previous = now;
                 _stepped = true;
                 var entry = new Map { { "topic", "scene" }, { "digest", product.Digest } };
                 var measured = new Map { { "step", watch.ElapsedTicks * (
                     1000000000L / System.Diagnostics.Stopwatch.Frequency) } };
-                return Framed("DONE", With(new Map { { "episode", _episode }, { "frame", Frame },
-                    { "products", new List<object> { entry } }, { "measured", measured } }), product.Header,
-                    product.Body);
+                var done = With(new Map { { "episode", _episode }, { "frame", Frame },
+                    { "products", new List<object> { entry } }, { "measured", measured } });
+                var change = _meshes.Change(Frame, given.Select(item => item.Mesh));
+                if (change != null) done["geometry"] = change;
+                return Framed("DONE", done, product.Header, product.Body);
             }
             catch (Exception problem) { return FaultOf(Frame, phase, problem, culprit); }
         }
@@ -2377,6 +2534,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _previous = head.Whole("previous");
             _stepped = head.Flag("stepped");
             _newest = head.Whole("newest");
+            _meshes.Reset(WasHereBefore, _newest + 1);
             Restore(state.Skip(at + (int)length).ToArray());
         }
     }

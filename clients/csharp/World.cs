@@ -14,17 +14,16 @@ internal sealed class Street : World
     private const double Radius = 20, Speed = 10; // of the car [m, m/s]
     private string _mesh;
     private double[] _uav, _wanted; // position [m]; velocity that was commanded [m/s], or null
+    // A wedge: x forward, y left, z up, in any unit.
+    private static readonly double[][] Wedge =
+        { V(-1, -1, 0), V(1, -1, 0), V(1, 1, 0), V(-1, 1, 0), V(-1, -1, 1), V(-1, 1, 1) };
+    private static readonly int[][] Sides =
+        { T(0, 3, 2), T(0, 2, 1), T(0, 1, 4), T(3, 5, 2), T(0, 4, 5), T(0, 5, 3), T(1, 2, 5), T(1, 5, 4) };
 
     protected override void Prepare()
     {
         Prefixes.AddRange(new[] { "car", "uav", "van" });
-        // A wedge: x forward, y left, z up, in any unit.
-        double[][] wedge = { V(-1, -1, 0), V(1, -1, 0), V(1, 1, 0), V(-1, 1, 0), V(-1, -1, 1), V(-1, 1, 1) };
-        int[][] sides =
-        {
-            T(0, 3, 2), T(0, 2, 1), T(0, 1, 4), T(3, 5, 2), T(0, 4, 5), T(0, 5, 3), T(1, 2, 5), T(1, 5, 4),
-        };
-        _mesh = OfferMesh("car", wedge, sides);
+        _mesh = OfferMesh("car", Wedge, Sides);
         double[][] ground = { V(-60, -60, 0), V(60, -60, 0), V(60, 60, 0), V(-60, 60, 0) };
         double[][] wall = { V(30, 30, 0), V(30, -30, 0), V(30, -30, 12), V(30, 30, 12) };
         int[][] square = { T(0, 1, 2), T(0, 2, 3) };
@@ -66,6 +65,7 @@ internal sealed class Street : World
         {
             var van = new WorldObject("van", "truck", V(-40 + 16 * passing, 26, 1.25), V(5.5, 2.1, 2.5));
             van.Velocity = V(16, 0, 0);
+            van.Mesh = OfferMesh("van", Wedge, Sides, "metal"); // it comes while the run goes on
             objects.Add(van);
         }
         return objects;

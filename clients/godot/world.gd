@@ -14,16 +14,16 @@ class Street:
 	extends "res://addons/caviar/caviar_world.gd"
 	const RADIUS = 20.0  # of the car [m]
 	const SPEED = 10.0  # [m/s]
+	# A wedge: x forward, y left, z up, in any unit.
+	const WEDGE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 1], [-1, 1, 1]]
+	const SIDES = [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]]
 	var mesh = ""
 	var uav = []  # position [m]
 	var wanted = null  # velocity that was commanded [m/s], or null
 
 	func prepare():
 		prefixes = ["car", "uav", "van"]
-		# A wedge: x forward, y left, z up, in any unit.
-		var wedge = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 1], [-1, 1, 1]]
-		var sides = [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]]
-		mesh = offer_mesh("car", wedge, sides)
+		mesh = offer_mesh("car", WEDGE, SIDES)
 		var ground = [[-60, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0]]
 		var wall = [[30, 30, 0], [30, -30, 0], [30, -30, 12], [30, 30, 12]]
 		var square = [[0, 1, 2], [0, 2, 3]]
@@ -61,6 +61,7 @@ class Street:
 			return [car, flying]
 		var van = object("van", "truck", [-40.0 + 16.0 * passing, 26.0, 1.25], [5.5, 2.1, 2.5])
 		van["velocity"] = [16.0, 0.0, 0.0]
+		van["mesh"] = offer_mesh("van", WEDGE, SIDES, "metal")  # it comes while the run goes on
 		return [car, flying, van]
 
 	func save():

@@ -1,6 +1,6 @@
 // The reference world: a car goes round in a circle, a UAV flies from point to point or where an agent sends
-// it, a truck comes and goes; the ground, a building and the mesh of the car are its own. Killed and started
-// again, it goes on as if nothing had happened.
+// it, a truck comes and goes; the ground, a building and the meshes of car and truck are its own. Killed and
+// started again, it goes on as if nothing had happened.
 // In Node: node world.mjs ws://HOST:PORT/ws NAME; in a browser: browser.html.
 import { cos, generator, main, quaternion, sin, World } from "./src/index.mjs";
 
@@ -71,8 +71,12 @@ class Street extends World {
   truckAt(elapsed) {
     const number = Math.floor(elapsed / TRUCK_EVERY_S), since = elapsed - number * TRUCK_EVERY_S;
     if (since >= TRUCK_STAYS_S) return [];
-    const position = [TRUCK_M_S * (since - TRUCK_STAYS_S / 2), -20, 1.6], velocity = [TRUCK_M_S, 0, 0];
-    return [{ name: `truck.${number}`, class: "truck", dimensions: [8, 2.5, 3.2], position, velocity }];
+    // Its mesh comes with it, while the run goes on: a wedge.
+    const wedge = [[-4, -1, 0], [4, -1, 0], [4, 1, 0], [-4, 1, 0], [-4, -1, 3], [-4, 1, 3]];
+    const sides = [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]];
+    const { asset, dimensions } = this.offerMesh("truck", wedge, sides, "metal");
+    const position = [TRUCK_M_S * (since - TRUCK_STAYS_S / 2), -20, 1.5], velocity = [TRUCK_M_S, 0, 0];
+    return [{ name: `truck.${number}`, class: "truck", asset, dimensions, position, velocity }];
   }
 
   save() { return this.uav; }

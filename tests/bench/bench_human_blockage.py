@@ -1,6 +1,6 @@
 """What a person in the way takes: as a traced body of skin, and as a screen of TR 38.901's blockage model B.
 
-    python tests/bench/bench_human_blockage.py [--json FILE]
+    python tests/bench/bench_human_blockage.py [--markdown FILE]
 
 A person of 0.3 m × 0.5 m × 1.72 m faces a link of 20 m between antennas at 1.5 m, in its middle, and steps
 aside. For each offset and carrier: the loss against free space of the sum of all paths, with a body whose
@@ -12,13 +12,13 @@ edges diffract or do not, and with a screen. There is no ground.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from caviar_protocol.spec import table
 from caviar_services.channel.stability.lab import (
     Model,
     Thing,
@@ -66,20 +66,28 @@ def loss_db(model: Model, offset: float) -> list[float | None]:
     return found
 
 
+def cell(loss: float | None) -> str:
+    """A loss as the table shows it."""
+    # + 0.0: what is but rounding is no negative zero.
+    return "no path" if loss is None else f"{round(loss, 1) + 0.0:.1f} dB".replace("-", "−")
+
+
 def main() -> None:
-    """Print a table, and write it as JSON where asked to."""
+    """Measure, print, and write the table where asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--markdown", type=Path, help="write the table of the documentation there")
     args = parser.parse_args()
-    rows = []
-    for name, model in models().items():
-        for offset in OFFSETS:
-            losses = loss_db(model, offset)
-            rows.append({"model": name, "offset_m": offset, "loss_db": losses})
-            shown = ["no path" if loss is None else f"{loss:.1f} dB" for loss in losses]
-            print(f"{name:22} {offset:4.1f} m  28 GHz {shown[0]:>8}  60 GHz {shown[1]:>8}", flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    compared = models()
+    losses = {(name, at): loss_db(model, at) for name, model in compared.items() for at in OFFSETS}
+    head = ["aside by", *(f"{name}, {f / 1e9:g} GHz" for f in FREQUENCIES for name in compared)]
+    rows = [
+        [f"{at:g} m", *(cell(losses[name, at][c]) for c in range(len(FREQUENCIES)) for name in compared)]
+        for at in OFFSETS
+    ]
+    text = table(head, rows)
+    print(text)
+    if args.markdown:
+        args.markdown.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

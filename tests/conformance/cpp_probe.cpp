@@ -11,7 +11,8 @@
 //
 // Bytes are hexadecimal digits behind an `x`, or `zeros:N`. With an endpoint and a name it is a world that
 // its settings set: `wrong` says what is wrong with its object, `deferred` that it answers frames later, as
-// an engine does, and it looks at links and channels.
+// an engine does, and it looks at links and channels. `spawn` has its car bring a mesh in frames 1 to 3, which
+// is `right`, or wrong in one of several ways.
 #include <iostream>
 #include <sstream>
 
@@ -234,9 +235,10 @@ class Odd : public caviar::World {
  public:
   bool due = false;
 
-  std::vector<caviar::Object> objects() const {
+  std::vector<caviar::Object> objects() {
     caviar::Object car;
     car.name = car.kind = "car";
+    car.asset = spawned_;
     const std::string wrong = settings()["wrong"].text();
     if (wrong == "orientation") car.orientation = {2.0, 0.0, 0.0, 0.0};
     if (wrong == "dimensions") car.dimensions[1] = 0.0;
@@ -260,7 +262,19 @@ class Odd : public caviar::World {
       offer_scenery({{"ground", "gold", caviar::box_mesh({}, {1, 1, 1})}}, {{"gold", "gold", 1}});
     if (wrong == "name") offer_file("../car.ply", "");
   }
-  std::vector<caviar::Object> step(double, double, const std::vector<caviar::Command>&) override {
+  void spawn_mesh(double t) {
+    const std::string spawn = settings()["spawn"].text();
+    spawned_.clear();
+    if (spawn.empty() || t < 0.05 || t > 0.35) return;
+    caviar::Mesh mesh = caviar::box_mesh({}, {4.0, 2.0, 1.0});
+    if (spawn == "nan") mesh.vertices[3][1] = std::nan("");
+    if (spawn == "none") mesh.triangles.clear();
+    if (spawn == "flat")
+      for (caviar::Vector3& vertex : mesh.vertices) vertex[2] = 0.0;
+    spawned_ = offer_mesh("crate", mesh.vertices, mesh.triangles, spawn == "gold" ? "gold" : "wood");
+  }
+  std::vector<caviar::Object> step(double t, double, const std::vector<caviar::Command>&) override {
+    spawn_mesh(t);
     for (const caviar::Ray& ray : rays())
       if (ray.a.empty() || !(ray.tau > 0)) fail("a ray has no amplitude");
     for (const caviar::LinkUser& user : link_users())
@@ -272,6 +286,8 @@ class Odd : public caviar::World {
     if (settings()["deferred"].boolean()) defer(), due = true;
     return objects();
   }
+
+  std::string spawned_;
 };
 
 static int odd_world(const char* endpoint, const char* name) {

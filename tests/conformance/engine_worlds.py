@@ -27,6 +27,7 @@ from vector_files import FOLDER, Vector, all_vectors, array_of, load
 from caviar_protocol.arrays import WIRE_DTYPES
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
+from caviar_protocol.geometry import digest_in
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import (
     Action,
@@ -39,12 +40,57 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
+from caviar_services.world.run_time_meshes import RunTimeMeshes
 
 FRAMES = 300
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))
 """Objects that come in each frame of the vectors ``mounts_0`` to ``mounts_4``."""
 Ask = Callable[[str, Sequence[str]], list[str]]
 """Answers of a library to cases of a kind."""
+
+
+LONGEST = 80
+"""Lines of code that a reference world may have."""
+
+
+class LibraryTests:
+    """Tests of every library: a subclass says where its sources are, its module has the fixture ``ask``."""
+
+    SCHEMA: Path
+    """Source that holds the schema of the protocol."""
+    WORLD: Path
+    """The reference world."""
+    COMMENT: str
+    """How a line of its language begins that is a comment."""
+
+    def test_its_schema_is_that_of_the_protocol(self) -> None:
+        assert schema_is_current(self.SCHEMA)
+
+    def test_the_reference_world_is_short(self) -> None:
+        lines = [line.strip() for line in self.WORLD.read_text("utf-8").splitlines()]
+        assert 40 < sum(bool(line) and not line.startswith(self.COMMENT) for line in lines) <= LONGEST
+
+    def test_vectors_are_read_written_and_refused(self, ask: Ask) -> None:
+        check_vectors(ask)
+        check_arrays(ask)
+
+    def test_poses_are_converted_to_the_axes_of_engines_and_back(self, ask: Ask) -> None:
+        check_axes(ask)
+
+    def test_devices_are_mounted_as_the_vectors_say(self, ask: Ask) -> None:
+        check_mounts(ask)
+        check_matches(ask)
+
+    def test_wrong_objects_and_scenery_are_refused(self, ask: Ask) -> None:
+        check_wrong_objects(ask)
+        check_wrong_scenery(ask)
+
+    def test_meshes_come_and_go_while_a_run_goes_on(self, ask: Ask) -> None:
+        check_spawned(ask)
+        check_wrong_spawned(ask)
+
+    def test_links_channels_and_actions_are_decoded(self, ask: Ask) -> None:
+        check_decoders(ask)
 
 
 # --- vectors ----------------------------------------------------------------------------------------------
@@ -224,6 +270,62 @@ def check_wrong_scenery(ask: Ask) -> None:
         assert expected in answer
 
 
+SPAWNED = (
+    # One mesh that is used, and lingers; another one beside it; both go.
+    "limit 9|reset 0 0|frame 0 |add 01|frame 1 0|frame 2 0|add 0203|frame 3 1|frame 22 |frame 23 |frame 24 ",
+    # A process that was started again says once more what it has; one goes on in an episode.
+    "limit 9|reset 1 0|frame 0 |frame 1 |add 01|frame 2 0",
+    "limit 9|reset 1 40|add 01|frame 40 |frame 41 |frame 61 |frame 62 ",
+    # One that is refused is not announced again; the next episode begins without.
+    "limit 9|reset 0 0|add 01|add 02|frame 0 0,1|refuse 0|frame 1 0,1|frame 2 0,1|reset 0 0|frame 0 ",
+    # A run that takes none.
+    "limit 0|reset 0 0|add 01|frame 0 0",
+)
+
+
+def check_spawned(ask: Ask) -> None:
+    """Meshes are announced, and go, as those of worlds in this repository."""
+    answers = ask("spawned", [script.replace("|", "\t") for script in SPAWNED])
+    assert answers == ["\t".join(_spawned(script)) for script in SPAWNED]
+
+
+def _spawned(script: str) -> Iterator[str]:
+    meshes, names = RunTimeMeshes(), list[str]()
+    for step in script.split("|"):
+        what, first, *rest = step.split(" ")
+        match what:
+            case "limit":
+                meshes.max_faces = int(first)
+            case "reset":
+                limit, refused = meshes.max_faces, meshes
+                meshes = RunTimeMeshes(again=first == "1")
+                meshes.max_faces = limit
+                meshes._refused = refused._refused
+                meshes._frame = int(rest[0])
+            case "add":
+                names.append(meshes.add(bytes.fromhex(first)))
+                yield names[-1]
+            case "refuse":
+                meshes.refuse(digest_in(names[int(first)]), "it is none")
+            case "frame":
+                there = meshes.at(int(first), [names[int(i)] for i in rest[0].split(",") if i])
+                yield "-" if there is None else f"{first}:{','.join(sorted(there))}"
+
+
+def check_wrong_spawned(ask: Ask) -> None:
+    """What a run would refuse of a mesh that comes while it goes on is named."""
+    corners = "0 0 0 1 0 0 0 1 0 0 0 1"
+    nan = "x7ff8000000000000"
+    cases = {
+        "mesh 'a': a vertex is not finite": f"a\t9\t{corners} 0 {nan} 0\t0 1 2",
+        "mesh 'b': it has no triangle": f"b\t9\t{corners}\t",
+        "mesh 'c': it has 2 triangles, and this run takes 1": f"c\t1\t{corners}\t0 1 2 0 2 3",
+        "mesh 'd': it is flat": "d\t9\t0 0 0 1 0 0 0 1 0\t0 1 2",
+        "ok": f"e\t9\t{corners}\t0 1 2 0 2 3",
+    }
+    assert ask("spawn", list(cases.values())) == list(cases)
+
+
 # --- what others made ---------------------------------------------------------------------------------------
 
 
@@ -312,7 +414,10 @@ def check_conformance(command: str, folder: Path) -> None:
     found = {entry["case"]: entry for entry in json.loads(verdicts.read_text("utf-8"))["verdicts"]}
     failed = [entry for entry in found.values() if entry["outcome"] == "fail"]
     assert not failed, failed
-    played = {"garbage", "truncated", "oversized", "undecodable-input", "restore", "sigterm", "scene-turning"}
+    played = {
+        "garbage", "truncated", "oversized", "undecodable-input", "restore", "sigterm", "scene-turning",
+        "run-time-meshes",
+    }  # fmt: skip
     assert {case for case in played if found[case]["outcome"] == "pass"} == played
     assert done.returncode == 0, done.stdout
 
@@ -360,6 +465,8 @@ def check_recording(directory: Path) -> None:
     scene = frame.scene()
     assert scene is not None
     assert scene.names == ("car", "uav", "van")
+    # The mesh of the van came while the run went on.
+    assert set(recording.meshes) == {scene.assets[2]}
     names = ["bs", "car/lidar", "car/rx", "uav/rx-uav", "van/rx"]
     assert [device.name for device in scene.devices] == names
     before = recording.frame(0, 10).scene()

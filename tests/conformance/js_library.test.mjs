@@ -143,7 +143,7 @@ test("what no consumer would accept is named", () => {
     [{ dimensions: [4, 0, 1] }, /dimensions are \[4, 0, 1\]; give sides above 0/],
     [
       { asset: "objects/car.ply" },
-      /asset is "objects\/car.ply", which was not offered; call offerMesh in prepare/,
+      /asset is "objects\/car.ply", which was not offered; take it from what offerMesh returns/,
     ],
   ];
   for (const [change, told] of wrong)
@@ -355,6 +355,88 @@ test("a state is the same after it was saved and taken over", async () => {
     second.restored(encode({ caviar: "agent", own: null, state: null })),
     /a state that no world/,
   );
+});
+
+const WEDGE = {
+  vertices: [[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]],
+  triangles: [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]],
+}; // prettier-ignore
+
+/** A world in its first episode, which offers what `step` asks for, and what it said. */
+async function spawning(step, { max_faces = 100, attempt = 1 } = {}) {
+  const world = Object.assign(new World({ prefixes: ["car"] }), { step, said: [] });
+  const scenario = { devices: [], sampling_period_ns: 100_000_000 };
+  world.log = (line) => world.said.push(line);
+  world.welcomed({ run: "r", seed: 1n, settings: {}, scenario, epoch: 1, attempt });
+  await world.prepared({ max_faces });
+  await world.began({ seed: 1n, t0_ns: 0n, seed_episode: 0 });
+  world.frame = async (frame) => {
+    const done = await world.answered({ frame, t_ns: 0n, previous_frame: frame - 1 }, []);
+    const [{ header, body }] = done.products;
+    return { ...done, scene: decodePayload("scene", header, body) };
+  };
+  return world;
+}
+
+test("a mesh that comes while the run goes on is announced, served, and goes after its objects", async () => {
+  let shown = false;
+  const world = await spawning(function () {
+    const { asset, dimensions } = shown ? this.offerMesh("car", WEDGE.vertices, WEDGE.triangles, "wood") : {};
+    return [{ ...CAR, ...(shown && { asset, dimensions }) }];
+  });
+  assert.equal((await world.frame(0)).geometry, undefined);
+  shown = true;
+  const { geometry, scene } = await world.frame(1);
+  const [{ name, digest, size }] = geometry.assets;
+  assert.equal(geometry.frame, 1);
+  assert.deepEqual([name, scene.assets], [`objects/${digest}.ply`, [name]]);
+  const { piece } = world.piece(digest, 0);
+  assert.deepEqual([sha256(piece), piece.length], [digest, size]);
+  assert.match(new TextDecoder().decode(piece), /^ply\n.*\ncomment material wood\n/);
+  assert.equal((await world.frame(2)).geometry, undefined);
+  shown = false;
+  for (let frame = 3; frame <= 22; frame++) assert.equal((await world.frame(frame)).geometry, undefined);
+  assert.deepEqual((await world.frame(23)).geometry, { frame: 23, assets: [] });
+  assert.equal(world.piece(digest, 0), undefined);
+});
+
+test("a mesh that is none while the run goes on leaves a box, and is said once", async () => {
+  const { vertices, triangles } = WEDGE;
+  const wrong = [
+    ["nan", [[NaN, 0, 0], ...vertices.slice(1)], triangles, /"nan": vertex 0 has the coordinate NaN/],
+    ["none", vertices, [], /"none" has 0 corners/],
+    ["many", vertices, Array(101).fill([0, 1, 2]), /"many" has 101 triangles, and this run takes 100/],
+    ["flat", vertices.map(([x, y]) => [x, y, 0]), triangles, /"flat" is flat/],
+  ];
+  const world = await spawning(function () {
+    return wrong.map(([name, points, corners]) => {
+      const { asset, dimensions } = this.offerMesh(name, points, corners);
+      return { ...CAR, name: `car.${name}`, asset, dimensions };
+    });
+  });
+  for (const frame of [0, 1]) {
+    const { geometry, scene } = await world.frame(frame);
+    assert.equal(geometry, undefined);
+    assert.deepEqual(scene.assets, ["", "", "", ""]);
+  }
+  assert.equal(world.said.length, wrong.length);
+  wrong.forEach(([, , , told], index) => assert.match(world.said[index], told));
+});
+
+test("meshes are announced once more by a process that was started again, not where none may come", async () => {
+  const step = function () {
+    return [{ ...CAR, ...this.offerMesh("car", WEDGE.vertices, WEDGE.triangles) }];
+  };
+  const again = await spawning(() => [CAR], { attempt: 2 });
+  assert.deepEqual((await again.frame(0)).geometry, { frame: 0, assets: [] });
+  assert.equal((await again.frame(1)).geometry, undefined);
+  const closed = await spawning(step, { max_faces: 0 });
+  const { geometry, scene } = await closed.frame(0);
+  assert.deepEqual([geometry, scene.assets], [undefined, [""]]);
+  const world = await spawning(step);
+  const [{ digest }] = (await world.frame(0)).geometry.assets;
+  world.refused({ code: "refused-mesh", subject: digest });
+  assert.deepEqual((await world.frame(1)).geometry, { frame: 1, assets: [] });
 });
 
 test("times are those of the grant and of the frame before it", () => {

@@ -429,7 +429,7 @@ def test_what_fails_alike_is_told_once_at_the_end() -> None:
 
 def test_there_is_a_fault_for_every_case() -> None:
     """So that no verdict is one that cannot fail; of run-time meshes see test_geometry_cases.py."""
-    meshes = {"geometry", "later-geometry", "geometry-gone"}
+    meshes = {"geometry", "later-geometry", "geometry-gone", "run-time-meshes"}
     assert set(FAULTS) | meshes == {case.name for case in cases()}
 
 

@@ -22,12 +22,16 @@ from scenarios_support import ROOT, environment, eventually, recorded_below, run
 
 from caviar_broker.control.socket import ask
 from caviar_clients.conform import conform
+from caviar_clients.conform.canonical import Answer
 from caviar_clients.conform.client import Received, Rules, Started, Wire
 from caviar_clients.conform.session import Seen, Session
 from caviar_clients.conform.street import Inputs
+from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import RunError
+from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.keys import Pair, write_pair
 from caviar_protocol.recording import Recording
+from caviar_protocol.topics import Scene
 
 pytestmark = pytest.mark.slow
 
@@ -66,17 +70,18 @@ def test_the_reference_world_has_at_most_80_lines_of_code() -> None:
 # --- the protocol ---------------------------------------------------------------------------------------
 
 
-def failures(program: Path, **settings: Any) -> dict[str, str]:
-    """What the conformance kit finds wrong with a world."""
+def failures(program: Path, *more: str, **settings: Any) -> dict[str, str]:
+    """What the conformance kit finds wrong with a world; ``more``: cases that it has to pass, too."""
     command = shlex.join([str(program), "{endpoint}", "{name}"])
     verdicts = conform(ANY, command=command, rules=Rules(name="mine", role="world", settings=settings))
     passed = {v.case for v in verdicts if v.outcome == "pass"}
-    assert passed >= {"frames", "restore", "queued-grants", "undecodable-input", "scene-mounts", "sigterm"}
+    always = {"frames", "restore", "queued-grants", "undecodable-input", "scene-mounts", "sigterm"}
+    assert passed >= {*always, *more}
     return {v.case: f"expected {v.expected}; got {v.got}" for v in verdicts if v.outcome == "fail"}
 
 
 def test_the_reference_world_fails_no_case_of_the_kit(world: Path) -> None:
-    assert failures(world) == {}
+    assert failures(world, "run-time-meshes") == {}
 
 
 def test_a_world_that_answers_later_and_looks_at_channels_fails_no_case(odd: Path) -> None:
@@ -105,7 +110,7 @@ def joined(program: Path, folder: Path, **welcome: Any) -> Iterator[Session]:
         ("dimensions", "object 'car': sides of its box are above 0"),
         ("position", "object 'car': its position is farther than 1e9 m, or no number"),
         ("velocity", "object 'car': its velocity is not below that of light"),
-        ("asset", "asset 'objects/none.ply' was not offered; offer_mesh() in prepare() returns its name"),
+        ("asset", "asset 'objects/none.ply' was not offered; offer_mesh() returns its name"),
         ("prefix", "object 'tram': its name begins with no prefix; call claim() for it in prepare()"),
         ("kind", "object 'car': its kind is missing"),
         ("twice", "object 'car': its name occurs twice"),
@@ -158,6 +163,65 @@ def test_scenery_is_readable_for_a_ray_tracer(world: Path, tmp_path: Path) -> No
     np.testing.assert_allclose([house.min(axis=(0, 1)), house.max(axis=(0, 1))], [[-30, 16, 0], [30, 28, 12]])
     # Corners are counter-clockwise seen from outside: the signed volume of a closed body is its volume.
     assert np.linalg.det(house).sum() / 6 == pytest.approx(60 * 12 * 12)
+
+
+def test_a_mesh_that_comes_while_the_run_goes_on_is_announced_and_goes_after_its_objects(
+    odd: Path, tmp_path: Path
+) -> None:
+    with joined(odd, tmp_path, settings={"spawn": "right"}) as session:
+        begun(session, max_faces=12)
+        # The kit's world was here before: what it announced then, if anything, is gone.
+        assert session.step(EMPTY).fields["geometry"] == {"frame": 0}
+        done = session.step(EMPTY)
+        assert done.fields["geometry"]["frame"] == 1
+        (asset,) = done.fields["geometry"]["assets"]
+        assert assets_of(done) == [asset["name"]] == [f"objects/{asset['digest']}.ply"]
+        data = session.fetch(asset)
+        assert b"\ncomment material wood\n" in data
+        mesh = read_mesh(data)
+        np.testing.assert_allclose([mesh.min(axis=(0, 1)), mesh.max(axis=(0, 1))], [[-0.5] * 3, [0.5] * 3])
+        # No object has it after frame 3; it stays for 20 frames.
+        changes = {frame: session.step(EMPTY).fields.get("geometry") for frame in range(2, 26)}
+        assert {frame: change for frame, change in changes.items() if change} == {24: {"frame": 24}}
+
+
+def test_a_mesh_that_the_broker_refuses_is_not_announced_again(odd: Path, tmp_path: Path) -> None:
+    with joined(odd, tmp_path, settings={"spawn": "right"}) as session:
+        begun(session, max_faces=100)
+        session.step(EMPTY)
+        (asset,) = session.step(EMPTY).fields["geometry"]["assets"]
+        error = {"code": "refused-mesh", "message": "it is none", "of": "DONE", "subject": asset["digest"]}
+        session.send("ERROR", error)
+        assert session.step(EMPTY).fields["geometry"] == {"frame": 2}
+        assert "geometry" not in session.step(EMPTY).fields
+
+
+@pytest.mark.parametrize(
+    ("spawn", "max_faces"),
+    [("nan", 100), ("none", 100), ("flat", 100), ("gold", 100), ("right", 11), ("right", 0)],
+)
+def test_a_mesh_that_is_none_or_that_the_run_does_not_take_leaves_a_box(
+    odd: Path, tmp_path: Path, spawn: str, max_faces: int
+) -> None:
+    with joined(odd, tmp_path, settings={"spawn": spawn}) as session:
+        begun(session, max_faces)
+        frames = [session.step(EMPTY) for _ in range(4)]
+        assert [assets_of(done) for done in frames] == [[""]] * 4
+        announced = [done.fields.get("geometry", {}).get("assets", []) for done in frames]
+        assert announced == [[]] * 4
+
+
+def begun(session: Session, max_faces: int) -> None:
+    """Take a world into an episode of a run that takes meshes while it goes on."""
+    session.prepare(inputs=EMPTY, max_faces=max_faces)
+    session.reset(0)
+
+
+def assets_of(done: Answer) -> list[str]:
+    """Meshes of the objects of a scene."""
+    scene = decode_payload("scene", *done.parts[1:3])
+    assert isinstance(scene, Scene)
+    return list(scene.assets)
 
 
 def read_mesh(data: bytes) -> np.ndarray[Any, Any]:
@@ -301,7 +365,11 @@ def test_a_run_of_300_frames_with_rays_a_lidar_a_link_and_a_recorder(world: Path
         topic: [product.payload for _, product in recording.products(topic)] for topic in topics
     }
     assert {topic: len(products) for topic, products in found.items()} == dict.fromkeys(topics, 300)
-    assert {name for scene in found["scene"] for name in scene.names} == {"car", "pedestrian", "uav"}
+    assert {name for scene in found["scene"] for name in scene.names} == {"car", "pedestrian", "ramp", "uav"}
+    # The mesh of the ramp came while the run went on.
+    spawned = {asset for scene in found["scene"] for asset in scene.assets if is_mesh_name(asset)}
+    assert spawned == set(recording.meshes)
+    assert len(spawned) == 1
     rung = "siso-rt" if scenario == SCENARIO else "free-space"
     assert {channel.rung for channel in found["channel"]} == {rung}
     # The pedestrian's phone is there as long as its owner.

@@ -16,8 +16,6 @@ pytestmark = pytest.mark.slow
 CSHARP = ROOT / "clients" / "csharp"
 CHECK = Path(__file__).parent / "csharp" / "Check.cs"
 SCENARIO = CSHARP / "world.toml"
-LONGEST = 80
-"""Lines of code that the reference world may have."""
 
 
 @pytest.fixture(scope="module")
@@ -60,36 +58,12 @@ def ask(build: Path, tmp_path: Path) -> worlds.Ask:
     return asked
 
 
-def test_its_schema_is_that_of_the_protocol() -> None:
-    assert worlds.schema_is_current(CSHARP / "Caviar.cs")
+class TestTheLibraryInCSharp(worlds.LibraryTests):
+    """What is tested of every library."""
 
-
-def test_the_reference_world_is_short() -> None:
-    lines = (CSHARP / "World.cs").read_text("utf-8").splitlines()
-    assert sum(bool(line.strip()) and not line.strip().startswith("//") for line in lines) <= LONGEST
-
-
-def test_vectors_are_read_written_and_refused(ask: worlds.Ask) -> None:
-    worlds.check_vectors(ask)
-    worlds.check_arrays(ask)
-
-
-def test_poses_are_converted_to_the_axes_of_engines_and_back(ask: worlds.Ask) -> None:
-    worlds.check_axes(ask)
-
-
-def test_devices_are_mounted_as_the_vectors_say(ask: worlds.Ask) -> None:
-    worlds.check_mounts(ask)
-    worlds.check_matches(ask)
-
-
-def test_wrong_objects_and_scenery_are_refused(ask: worlds.Ask) -> None:
-    worlds.check_wrong_objects(ask)
-    worlds.check_wrong_scenery(ask)
-
-
-def test_links_channels_and_actions_are_decoded(ask: worlds.Ask) -> None:
-    worlds.check_decoders(ask)
+    SCHEMA = CSHARP / "Caviar.cs"
+    WORLD = CSHARP / "World.cs"
+    COMMENT = "//"
 
 
 def test_the_programs_of_its_page_compile(build: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 
@@ -14,8 +14,11 @@ from caviar_clients.conform import Rules, conform
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Depth
 from caviar_services.frame import Frame, StepResult
+from caviar_services.mesh.shapes import box, ply, unit_box
 from caviar_services.runner import Runner
 from caviar_services.service import NoSettings, Service
+from caviar_services.world.base import ObjectState
+from caviar_services.world.engine import Engine, EngineWorld
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +49,41 @@ class Early(Following):
         raise ValueError("it cannot load them")
 
 
-def judged(cls: type[Service[NoSettings]], *names: str) -> dict[str, str]:
+class Crates(Engine):
+    """A crate is there from 0.3 s on, and its mesh comes with it."""
+
+    prefixes = ("crate",)
+    mesh = ""
+
+    def step(self, t: float, previous: float, commands: object) -> list[ObjectState]:
+        del previous, commands
+        if t < 0.3:
+            return []
+        self.bring()
+        at, level, still = (5.0, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        return [ObjectState("crate", "crate", at, level, still, (1.0, 1.0, 1.0), mesh=self.mesh)]
+
+    def bring(self) -> None:
+        self.mesh = self.offer_mesh("crate", unit_box().vertices, unit_box().faces, "wood").mesh
+
+
+class Unannounced(Crates):
+    """Names a mesh that it never brings."""
+
+    mesh = f"objects/{'0' * 64}.ply"
+
+    def bring(self) -> None:
+        pass
+
+
+class Oversized(Crates):
+    """Brings a mesh of 2 m."""
+
+    def bring(self) -> None:
+        self.mesh = self._world.add_mesh(ply(box((-1, 1), (-1, 1), (-1, 1))))
+
+
+def judged(cls: type[Service[Any]], *names: str) -> dict[str, str]:
     """Outcome of each case for a service, each life of which is a thread."""
 
     def tell(text: str) -> None:
@@ -67,3 +104,13 @@ def test_a_service_that_follows_passes_all_of_them(tmp_path: Path, monkeypatch: 
 def test_one_that_cannot_load_them_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert judged(Early, "geometry") == {"geometry": "fail"}
+
+
+@pytest.mark.parametrize(
+    ("engine", "outcome"), [(Crates, "pass"), (Unannounced, "fail"), (Oversized, "fail")]
+)
+def test_a_world_passes_where_its_meshes_are_announced_and_can_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: type[Engine], outcome: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert judged(EngineWorld.of(engine()), "run-time-meshes") == {"run-time-meshes": outcome}

@@ -20,8 +20,6 @@ GODOT = ROOT / "clients" / "godot"
 ADDON = GODOT / "addons" / "caviar"
 CHECK = Path(__file__).parent / "godot" / "check.gd"
 SCENARIO = GODOT / "world.toml"
-LONGEST = 80
-"""Lines of code that the reference world may have."""
 
 
 @pytest.fixture(scope="module")
@@ -54,22 +52,12 @@ def command(godot: str) -> list[str]:
     return [godot, "--path", str(GODOT), "-s", "world.gd"]
 
 
-def test_its_schema_is_that_of_the_protocol() -> None:
-    assert worlds.schema_is_current(ADDON / "caviar_schema.gd")
+class TestTheAddOn(worlds.LibraryTests):
+    """What is tested of every library."""
 
-
-def test_the_reference_world_is_short() -> None:
-    lines = (GODOT / "world.gd").read_text("utf-8").splitlines()
-    assert sum(bool(line.strip()) and not line.strip().startswith("#") for line in lines) <= LONGEST
-
-
-def test_vectors_are_read_written_and_refused(ask: worlds.Ask) -> None:
-    worlds.check_vectors(ask)
-    worlds.check_arrays(ask)
-
-
-def test_poses_are_converted_to_the_axes_of_engines_and_back(ask: worlds.Ask) -> None:
-    worlds.check_axes(ask)
+    SCHEMA = ADDON / "caviar_schema.gd"
+    WORLD = GODOT / "world.gd"
+    COMMENT = "#"
 
 
 def test_the_transform_of_a_node_is_a_pose(ask: worlds.Ask) -> None:
@@ -79,20 +67,6 @@ def test_the_transform_of_a_node_is_a_pose(ask: worlds.Ask) -> None:
     position, orientation = ([worlds.number(word) for word in field.split()] for field in answer.split("\t"))
     assert position == pytest.approx([-3, -1, 2])
     assert orientation == pytest.approx([math.cos(half), 0, 0, math.sin(half)], abs=1e-6)
-
-
-def test_devices_are_mounted_as_the_vectors_say(ask: worlds.Ask) -> None:
-    worlds.check_mounts(ask)
-    worlds.check_matches(ask)
-
-
-def test_wrong_objects_and_scenery_are_refused(ask: worlds.Ask) -> None:
-    worlds.check_wrong_objects(ask)
-    worlds.check_wrong_scenery(ask)
-
-
-def test_links_channels_and_actions_are_decoded(ask: worlds.Ask) -> None:
-    worlds.check_decoders(ask)
 
 
 def test_the_reference_world_fails_no_case_of_the_kit(godot: str, tmp_path: Path) -> None:

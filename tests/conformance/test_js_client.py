@@ -234,6 +234,10 @@ def test_300_frames_have_paths_scans_and_links_of_what_the_world_brings(
     assert there[0] == always | {"truck.0", "truck.0/rx"}
     assert there[1] == always  # the truck has gone
     assert there[2] == always | {"truck.1", "truck.1/rx"}
+    # The mesh of trucks came while the run went on.
+    first = recording.frame(0, 0).scene()
+    assert first is not None
+    assert set(recording.meshes) == {first.assets[first.names.index("truck.0")]}
     lidar: Any = next(product for _, product in recording.products("lidar")).payload
     assert {"ground", "building"} <= set(lidar.object_names)
     hit = {lidar.object_names[index] for index in set(lidar.scans[0].object.tolist())}

@@ -1,4 +1,4 @@
-"""People as screens: TR 38.901's blockage model B against its formulas, written here once more."""
+"""People as screens: blockage model B of TR 38.901, section 7.6.4.2; its formulas, written here once more."""
 
 from __future__ import annotations
 

@@ -385,28 +385,36 @@ class Session:
         self.send("ASSET_DATA", {"digest": digest, "offset": offset, "size": len(data)}, chunk)
 
     def _fetch_scenery(self, offer: Fields) -> None:
-        """Take a world's scenery, each file in as many parts as the world makes of it."""
+        """Take a world's scenery."""
         if self.hello["role"] != "world":
             raise Failed("READY", "ASSET_OFFER, which only worlds send")
         for asset in offer["assets"]:
-            data = b""
-            while True:
-                self.send("ASSET_GET", {"digest": asset["digest"], "offset": len(data)})
-                answer = self.receive("ASSET_DATA")
-                if answer.kind == "READY":
-                    self._early.append(answer)
-                    answer = self.receive("ASSET_DATA")
-                if answer.kind != "ASSET_DATA" or answer.fields["offset"] != len(data):
-                    raise Failed(f"ASSET_DATA from byte {len(data)}", str(answer))
-                data += answer.parts[1]
-                if len(data) >= asset["size"]:
-                    break
-                if not answer.parts[1]:
-                    raise Failed("at least one byte of an ASSET_DATA before the end", "none")
-            if hashlib.sha256(data).hexdigest() != asset["digest"]:
-                raise Failed(f"bytes of {asset['name']} with the digest of its offer", "others")
-            self.offered[asset["name"]] = data
+            self.offered[asset["name"]] = self.fetch(asset)
         self.assets = list(offer["assets"])
+
+    def fetch(self, asset: Fields) -> bytes:
+        """Return a file of a world, in as many parts as the world makes of it.
+
+        Args:
+            asset: As in ASSET_OFFER.
+        """
+        data = b""
+        while True:
+            self.send("ASSET_GET", {"digest": asset["digest"], "offset": len(data)})
+            answer = self.receive("ASSET_DATA")
+            if answer.kind == "READY":
+                self._early.append(answer)
+                answer = self.receive("ASSET_DATA")
+            if answer.kind != "ASSET_DATA" or answer.fields["offset"] != len(data):
+                raise Failed(f"ASSET_DATA from byte {len(data)}", str(answer))
+            data += answer.parts[1]
+            if len(data) >= asset["size"]:
+                break
+            if not answer.parts[1]:
+                raise Failed("at least one byte of an ASSET_DATA before the end", "none")
+        if hashlib.sha256(data).hexdigest() != asset["digest"]:
+            raise Failed(f"bytes of {asset['name']} with the digest of its offer", "others")
+        return data
 
     # --- frames --------------------------------------------------------------------------------------
 

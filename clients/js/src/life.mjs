@@ -27,7 +27,9 @@ import { decodePayload, payloadDigest } from "./topics.mjs";
  * @property {(grant: Message, inputs: Input[]) => Promise<{ products: Product[], [field: string]: any }>}
  *   answered
  * @property {() => Promise<Uint8Array>} saved
- * @property {(state: Uint8Array) => Promise<void>} restored
+ * @property {(state: Uint8Array, frame: number) => Promise<void>} restored
+ * @property {(digest: string, offset: number) => ({ size: number, piece: Uint8Array } | undefined)} piece
+ * @property {(error: Message) => void} refused
  */
 /**
  * How a life ended: the run is over, or its connections are lost.
@@ -60,8 +62,7 @@ export class Life {
   #progress = new Progress();
   /** @type {Heartbeat | undefined} */
   #heart;
-  /** @type {Assets | undefined} */
-  #assets;
+  #hasOffered = false;
   #rejoin_ms = 0;
   #over = false;
   /** @type {(outcome: Outcome) => void} */
@@ -178,6 +179,7 @@ export class Life {
       case "STALE":
         return this.log(`${this.part.name}: my ${message.of} was stale`);
       case "ERROR":
+        this.part.refused(message);
         return this.log(
           `${this.part.name}: the broker could not use a message: ${message.code}: ${message.message}`,
         );
@@ -256,7 +258,7 @@ export class Life {
     this.#state = "preparing";
     this.#progress.enter("prepare", this.part.grace);
     const { ready, assets } = await this.#orFault("prepare", () => this.part.prepared(prepare));
-    this.#assets = assets;
+    this.#hasOffered = true;
     if (assets?.listed.length) this.#send({ type: "ASSET_OFFER", ...this.#who, assets: assets.listed });
     this.#send({ type: "READY", ...this.#who, ...ready });
     this.#state = "ready";
@@ -265,7 +267,7 @@ export class Life {
 
   /** @param {Message} get */
   #assetGet({ digest, offset }) {
-    const found = this.#assets?.piece(digest, offset);
+    const found = this.#hasOffered ? this.part.piece(digest, offset) : undefined;
     if (!found)
       return this.#complain("unknown-asset", `no file that I offered has this digest and a byte ${offset}`, {
         of: "ASSET_GET",
@@ -348,7 +350,7 @@ export class Life {
 
   /** @param {Message} restore  @param {Uint8Array} state */
   async #restore({ frame }, state) {
-    await this.#orFault("restore", () => this.part.restored(state));
+    await this.#orFault("restore", () => this.part.restored(state, frame));
     this.#answered = frame;
     this.#send({ type: "READY", ...this.#who });
   }

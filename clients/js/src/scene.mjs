@@ -2,6 +2,7 @@
 // error here names the object, where one there ends the run.
 import { NumericArray } from "./arrays.mjs";
 import { SceneError } from "./errors.mjs";
+import { isMeshName } from "./run_time_meshes.mjs";
 import { byBytes } from "./schema.mjs";
 
 /** @import { Device, Scene, SceneObject, Vector3 } from "./types.d.ts" */
@@ -32,10 +33,10 @@ export function sceneOf(objects, { prefixes, offered, devices: mounted }) {
       throw new SceneError(`two objects are named ${quoted(object.name)}; names have to differ`);
     checkName(object, prefixes);
     checkNumbers(object);
-    if (object.asset && !offered(object.asset)) {
+    if (object.asset && !isMeshName(object.asset) && !offered(object.asset)) {
       throw new SceneError(
         `object ${quoted(object.name)}: asset is ${quoted(object.asset)}, which was not offered; ` +
-          "call offerMesh in prepare",
+          "take it from what offerMesh returns",
       );
     }
   });

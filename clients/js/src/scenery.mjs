@@ -5,6 +5,7 @@ import { byBytes } from "./schema.mjs";
 import { sha256 } from "./sha256.mjs";
 
 /** @import { Material, OfferedMesh, SceneryMesh, Vector3 } from "./types.d.ts" */
+/** @typedef {{ dimensions: [number, number, number], centre: [number, number, number] }} Box  [m] */
 /** @typedef {ArrayLike<number> | readonly Vector3[]} Triples  as triples, or one number after the other */
 
 /** Materials of Recommendation ITU-R P.2040. */
@@ -62,30 +63,13 @@ export class Assets {
    * @param {string} name  such as `car`: the asset is `objects/car.ply`
    * @param {Triples} vertices  [m], x forward, y left, z up
    * @param {Triples} triangles  three indices each, counter-clockwise seen from outside
+   * @param {string} [material]  of ITU-R P.2040; empty: what the channel's settings say
    * @returns {OfferedMesh}
    */
-  offerMesh(name, vertices, triangles) {
-    const points = flat(vertices),
-      corners = flat(triangles);
-    checkMesh(name, points, corners);
-    const low = [Infinity, Infinity, Infinity],
-      high = [-Infinity, -Infinity, -Infinity];
-    points.forEach((value, index) => {
-      low[index % 3] = Math.min(low[index % 3], value);
-      high[index % 3] = Math.max(high[index % 3], value);
-    });
-    const dimensions = triple((axis) => high[axis] - low[axis]);
-    if (!dimensions.every((side) => side > 0))
-      throw new SceneError(`mesh ${JSON.stringify(name)} is flat: its sides are ${dimensions.join(", ")} m`);
-    const centre = triple((axis) => (high[axis] + low[axis]) / 2);
+  offerMesh(name, vertices, triangles, material = "") {
+    const { file, dimensions, centre } = unitMesh(name, vertices, triangles, material);
     const asset = `objects/${name}.ply`;
-    this.offerFile(
-      asset,
-      ply(
-        points.map((value, index) => (value - centre[index % 3]) / dimensions[index % 3]),
-        corners,
-      ),
-    );
+    this.offerFile(asset, file);
     return { asset, dimensions, centre };
   }
 
@@ -98,11 +82,7 @@ export class Assets {
     for (const [key, { type, thickness = 0.1 }] of Object.entries(materials)) {
       if (!/^[\w.-]+$/.test(key))
         throw new SceneError(`a material is named ${JSON.stringify(key)}; use letters, digits, _, . and -`);
-      if (!MATERIALS.includes(type))
-        throw new SceneError(
-          `material ${JSON.stringify(key)} is of the type ${JSON.stringify(type)}; ` +
-            `choose one of ${MATERIALS.join(", ")}`,
-        );
+      checkMaterial(`material ${JSON.stringify(key)}`, type);
       if (!(thickness > 0))
         throw new SceneError(
           `material ${JSON.stringify(key)} has the thickness ${thickness}; give it metres above 0`,
@@ -162,6 +142,53 @@ export class Assets {
   }
 }
 
+/**
+ * The file of a mesh that fills the unit box, and what it had measured.
+ * @param {string} name
+ * @param {Triples} vertices
+ * @param {Triples} triangles
+ * @param {string} material
+ * @returns {{ file: Uint8Array, faces: number } & Box}
+ */
+export function unitMesh(name, vertices, triangles, material) {
+  const points = flat(vertices),
+    corners = flat(triangles);
+  checkMesh(name, points, corners);
+  if (material) checkMaterial(`mesh ${JSON.stringify(name)}`, material);
+  const { dimensions, centre } = boxOf(points);
+  if (!dimensions.every((side) => side > 0))
+    throw new SceneError(`mesh ${JSON.stringify(name)} is flat: its sides are ${dimensions.join(", ")} m`);
+  const unit = points.map((value, index) => (value - centre[index % 3]) / dimensions[index % 3]);
+  return { file: ply(unit, corners, material), faces: corners.length / 3, dimensions, centre };
+}
+
+/**
+ * The bounding box of points; what is not finite counts as 0.
+ * @param {Triples} vertices
+ * @returns {Box}
+ */
+export function boxOf(vertices) {
+  const low = [Infinity, Infinity, Infinity],
+    high = [-Infinity, -Infinity, -Infinity];
+  flat(vertices).forEach((given, index) => {
+    const value = Number.isFinite(given) ? given : 0;
+    low[index % 3] = Math.min(low[index % 3], value);
+    high[index % 3] = Math.max(high[index % 3], value);
+  });
+  const sides = triple((axis) => high[axis] - low[axis]),
+    middle = triple((axis) => (high[axis] + low[axis]) / 2);
+  const there = sides.every(Number.isFinite);
+  return { dimensions: there ? sides : [0, 0, 0], centre: there ? middle : [0, 0, 0] };
+}
+
+/** @param {string} what  @param {string} type */
+function checkMaterial(what, type) {
+  if (!MATERIALS.includes(type))
+    throw new SceneError(
+      `${what} is of the type ${JSON.stringify(type)}; choose one of ${MATERIALS.join(", ")}`,
+    );
+}
+
 /** @param {Triples} triples  @returns {number[]} */
 function flat(triples) {
   return Array.from(/** @type {ArrayLike<any>} */ (triples)).flat();
@@ -192,13 +219,16 @@ function checkMesh(name, points, corners) {
  * A binary PLY file.
  * @param {number[]} points
  * @param {number[]} corners
+ * @param {string} [material]  of the object, where it has one of its own
  * @returns {Uint8Array}
  */
-export function ply(points, corners) {
+export function ply(points, corners, material = "") {
   const vertices = points.length / 3,
     faces = corners.length / 3;
   const head = utf8.encode(
-    `ply\nformat binary_little_endian 1.0\nelement vertex ${vertices}\nproperty float x\nproperty float y\n` +
+    "ply\nformat binary_little_endian 1.0\n" +
+      (material && `comment material ${material}\n`) +
+      `element vertex ${vertices}\nproperty float x\nproperty float y\n` +
       `property float z\nelement face ${faces}\nproperty list uchar int vertex_indices\nend_header\n`,
   );
   const file = new Uint8Array(head.length + 4 * points.length + 13 * faces);

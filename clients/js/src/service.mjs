@@ -27,6 +27,8 @@ const PATIENCE_S = 120;
 export class Service {
   /** What it knows of the run; from WELCOME on. @type {RunInfo} */
   info = { run: "", seed: 0n, settings: {}, scenario: {}, devices: [], samplingPeriod: 0 };
+  /** Where lines for people go. @type {(line: string) => void} */
+  log = console.warn;
   /** @type {Life | undefined} */
   #life;
   #left = "";
@@ -60,6 +62,7 @@ export class Service {
   async run(url, { token = "", patience = PATIENCE_S, log = console.warn } = {}) {
     if (!/^wss?:\/\/./.test(url))
       throw new RunError(`${url} is no address of a gateway; write ws://HOST:PORT/ws`);
+    this.log = log;
     let said = "";
     let until = Date.now() + 1000 * patience,
       pause = PAUSE_MS,
@@ -140,7 +143,7 @@ export class Service {
       role: this.role,
       inputs: this.inputs,
       outputs: this.outputs,
-      capabilities: ["assets", "checkpoint", "episodes", "parts"],
+      capabilities: ["assets", "checkpoint", "episodes", ...this.abilities, "parts"],
       implementation: "caviar-js",
       max_in_flight: 4,
     };
@@ -219,20 +222,38 @@ export class Service {
     return null;
   }
 
-  /** @param {any} state */
-  restoreOwnState(state) {}
+  /** @param {any} state  @param {number} frame  after which the service goes on */
+  restoreOwnState(state, frame) {}
+
+  /** Capabilities that only some services have. @returns {string[]} */
+  get abilities() {
+    return [];
+  }
+
+  /**
+   * A piece of a file that this service brought; undefined where there is none.
+   * @param {string} digest
+   * @param {number} offset
+   * @returns {{ size: number, piece: Uint8Array } | undefined}
+   */
+  piece(digest, offset) {
+    return undefined;
+  }
+
+  /** The broker could not use what this service sent. @param {Message} error */
+  refused(error) {}
 
   /** @returns {Promise<Uint8Array>} */
   async saved() {
     return encode({ caviar: this.role, own: this.ownState(), state: this.save() });
   }
 
-  /** @param {Uint8Array} bytes */
-  async restored(bytes) {
+  /** @param {Uint8Array} bytes  @param {number} [frame]  after which the service goes on */
+  async restored(bytes, frame = -1) {
     const found = unmarked(decode(bytes));
     if (found?.caviar !== this.role)
       throw new SceneError(`a state that no ${this.role} of this library saved`);
-    this.restoreOwnState(found.own);
+    this.restoreOwnState(found.own, frame);
     await this.restore(found.state);
   }
 }

@@ -1,10 +1,15 @@
 // A virtual world: an engine that says where things are.
+import { SceneError } from "./errors.mjs";
 import { Mounts } from "./mounts.mjs";
+import { isMeshName, RunTimeMeshes } from "./run_time_meshes.mjs";
 import { sceneOf } from "./scene.mjs";
-import { Assets } from "./scenery.mjs";
+import { Assets, boxOf, unitMesh } from "./scenery.mjs";
 import { byBytes } from "./schema.mjs";
 import { Service } from "./service.mjs";
 import { encodePayload } from "./topics.mjs";
+
+/** [m] side of the box of a mesh that is refused and has none. */
+const SMALLEST_M = 0.01;
 
 /** @import { Product } from "./life.mjs" */
 /** @import { Message } from "./messages.mjs" */
@@ -29,6 +34,12 @@ import { encodePayload } from "./topics.mjs";
 export class World extends Service {
   #assets = new Assets();
   #mounts = new Mounts([]);
+  #meshes = new RunTimeMeshes();
+  /** Whether another process of this world may have been in the run. */
+  #again = false;
+  #isPrepared = false;
+  /** What was said, once an episode each. @type {Set<string>} */
+  #said = new Set();
 
   /**
    * @param {object} options
@@ -67,15 +78,41 @@ export class World extends Service {
   }
 
   /**
-   * Offer the mesh of a moving object, in `prepare`.
+   * Offer the mesh of a moving object. In `prepare` it is there for the whole run. In `reset`, `step` and
+   * `restore` it comes while the run goes on, and stays as long as an object has it, and 20 frames longer,
+   * until the episode ends. A state has no meshes: `restore` offers those of its objects again.
    *
    * @param {string} name  such as `car`
    * @param {Triples} vertices  x forward, y left, z up [m], as triples or one after the other
    * @param {Triples} triangles  three indices each, counter-clockwise seen from outside
-   * @returns {OfferedMesh} `asset` and `dimensions` of objects that look like it
+   * @param {string} [material]  of ITU-R P.2040, such as `wood`; left out: what the channel's settings say
+   * @returns {OfferedMesh} `asset` and `dimensions` of objects that look like it; where it is none and the
+   *   run goes on, that is logged, and the `asset` is empty: its objects are boxes
+   * @throws {SceneError} in `prepare`, where it is none
    */
-  offerMesh(name, vertices, triangles) {
-    return this.#assets.offerMesh(name, vertices, triangles);
+  offerMesh(name, vertices, triangles, material = "") {
+    if (!this.#isPrepared) return this.#assets.offerMesh(name, vertices, triangles, material);
+    try {
+      const { file, faces, dimensions, centre } = unitMesh(name, vertices, triangles, material);
+      const most = this.#meshes.maxFaces;
+      if (most && faces > most)
+        throw new SceneError(
+          `mesh ${JSON.stringify(name)} has ${faces} triangles, and this run takes ${most}`,
+        );
+      return { asset: this.#meshes.add(file), dimensions, centre };
+    } catch (error) {
+      if (!(error instanceof SceneError)) throw error;
+      this.#say(`${error.message}; objects with it are boxes`);
+      const { dimensions, centre } = boxOf(vertices);
+      const [x, y, z] = dimensions.map((side) => Math.max(side, SMALLEST_M));
+      return { asset: "", dimensions: [x, y, z], centre };
+    }
+  }
+
+  /** @param {string} line */
+  #say(line) {
+    if (!this.#said.has(line)) this.log(`${this.name}: ${line}`);
+    this.#said.add(line);
   }
 
   /**
@@ -101,18 +138,39 @@ export class World extends Service {
   welcomed(welcome) {
     super.welcomed(welcome);
     this.#mounts = new Mounts(this.info.devices);
+    this.#again = welcome.epoch > 1 || welcome.attempt > 1;
+    this.#isPrepared = false;
   }
 
   /** @override  @param {Message} prepare */
   async prepared(prepare) {
     await this.prepare(this.info);
+    this.#isPrepared = true;
+    this.#meshes.maxFaces = prepare.max_faces;
     const prefixes = [...new Set([...this.prefixes, ...this.#mounts.fixedNames])].sort(byBytes);
     return { ready: { geometry: this.#assets.geometry, prefixes }, assets: this.#assets };
+  }
+
+  /** @override  @param {string} digest  @param {number} offset */
+  piece(digest, offset) {
+    return this.#assets.piece(digest, offset) ?? this.#meshes.piece(digest, offset);
+  }
+
+  /** @override  @param {Message} error */
+  refused({ code, subject }) {
+    if (code === "refused-mesh") this.#meshes.refuse(subject);
+  }
+
+  /** @override */
+  get abilities() {
+    return ["geometry"];
   }
 
   /** @override */
   begin() {
     this.#mounts.clear();
+    this.#meshes.reset(this.#again);
+    this.#said.clear();
   }
 
   /** @override  @param {Message} grant  @param {Input[]} inputs */
@@ -121,13 +179,27 @@ export class World extends Service {
     const commands = actions.flatMap(
       (input) => /** @type {Action | undefined} */ (input.payload)?.commands ?? [],
     );
-    const objects = await this.step(...this.times(grant), commands, inputs);
+    const given = await this.step(...this.times(grant), commands, inputs);
+    const objects = given.map((object) => this.#looked(object));
     const scene = sceneOf(objects, {
       prefixes: this.prefixes,
       offered: (name) => this.#assets.has(name),
       devices: () => this.#mounts.devices(objects),
     });
-    return { products: [/** @type {Product} */ ({ topic: "scene", ...encodePayload("scene", scene) })] };
+    const geometry = this.#meshes.change(grant.frame, scene.assets);
+    return {
+      products: [/** @type {Product} */ ({ topic: "scene", ...encodePayload("scene", scene) })],
+      ...(geometry && { geometry }),
+    };
+  }
+
+  /** An object as the run may have it. @param {SceneObject} object  @returns {SceneObject} */
+  #looked(object) {
+    if (!object.asset || !isMeshName(object.asset)) return object;
+    if (!this.#meshes.maxFaces) return { ...object, asset: "" }; // the run takes no meshes now
+    if (!this.#meshes.has(object.asset))
+      this.#say(`${object.asset} is not there; objects with it are boxes until offerMesh brings it`);
+    return object;
   }
 
   /** @override */
@@ -135,8 +207,9 @@ export class World extends Service {
     return this.#mounts.arrived;
   }
 
-  /** @override  @param {string[]} arrived */
-  restoreOwnState(arrived) {
+  /** @override  @param {string[]} arrived  @param {number} frame */
+  restoreOwnState(arrived, frame) {
     this.#mounts.clear(arrived);
+    this.#meshes.reset(this.#again, frame + 1);
   }
 }

@@ -113,8 +113,7 @@ class MotionCalls:
     async def land(self, timeout_sec: object = 60, vehicle_name: object = "") -> bool:
         """Go down until the ground or another surface bears the vehicle."""
         vehicle, _ = await self._ready("land", vehicle_name)
-        timeout_s = number(timeout_sec, "timeout_sec", 0.0, math.inf)
-        down = await self._flown(vehicle, Land(vehicle.object, self._habits.climb_m_s, timeout_s))
+        down = await self._flown(vehicle, Land(vehicle.object, self._habits.climb_m_s, _timeout(timeout_sec)))
         vehicle.landed = down
         return down
 
@@ -148,8 +147,7 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly to a point, and stop there."""
-        vehicle, _ = await self._ready("moveToPosition", vehicle_name)
-        self._note_yaw(yaw_mode)
+        vehicle, _ = await self._ready("moveToPosition", vehicle_name, yaw_mode)
         point = await self._point((number(x, "x"), number(y, "y"), number(z, "z")))
         return await self._flown(vehicle, self._path(vehicle, [point], velocity, timeout_sec))
 
@@ -164,8 +162,7 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly up or down to a height."""
-        vehicle, flown = await self._ready("moveToZ", vehicle_name)
-        self._note_yaw(yaw_mode)
+        vehicle, flown = await self._ready("moveToZ", vehicle_name, yaw_mode)
         (_, _, height), (east, north, _) = await self._point((0.0, 0.0, number(z, "z"))), flown.position
         path = self._path(vehicle, [(east, north, height)], velocity, timeout_sec)
         return await self._flown(vehicle, path)
@@ -182,8 +179,7 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly from point to point, and stop at the last one."""
-        vehicle, _ = await self._ready("moveOnPath", vehicle_name)
-        self._note_yaw(yaw_mode)
+        vehicle, _ = await self._ready("moveOnPath", vehicle_name, yaw_mode)
         if not isinstance(path, list) or not 0 < len(path) <= MOST_POINTS:
             raise CallError(f"path is no list of 1 to {MOST_POINTS} Vector3r")
         points = [await self._point(vector(point, f"path[{i}]")) for i, point in enumerate(path)]
@@ -200,11 +196,9 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Keep a velocity for a time, then brake."""
-        vehicle, _ = await self._ready("moveByVelocity", vehicle_name)
-        self._note_yaw(yaw_mode)
+        vehicle, _ = await self._ready("moveByVelocity", vehicle_name, yaw_mode)
         velocity = await self._velocity(vx, vy, vz)
-        manoeuvre = FlyVelocity(vehicle.object, velocity, _duration(duration))
-        return await self._flown(vehicle, manoeuvre)
+        return await self._flown(vehicle, FlyVelocity(vehicle.object, velocity, _duration(duration)))
 
     async def move_by_velocity_z(
         self,
@@ -217,8 +211,7 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Keep a horizontal velocity and a height for a time, then brake."""
-        vehicle, _ = await self._ready("moveByVelocityZ", vehicle_name)
-        self._note_yaw(yaw_mode)
+        vehicle, _ = await self._ready("moveByVelocityZ", vehicle_name, yaw_mode)
         velocity = await self._velocity(vx, vy, 0.0)
         _, _, height = await self._point((0.0, 0.0, number(z, "z")))
         climb = self._habits.climb_m_s
@@ -232,8 +225,8 @@ class MotionCalls:
         vehicle, _ = await self._ready("rotateToYaw", vehicle_name)
         heading = math.radians(number(yaw, "yaw", -1e6, 1e6))
         near = max(LEAST_MARGIN, math.radians(number(margin, "margin", 0.0, 180.0)))
-        timeout_s = number(timeout_sec, "timeout_sec", 0.0, math.inf)
-        return await self._flown(vehicle, Turn(vehicle.object, math.pi / 2 - heading, near, timeout_s))
+        turn = Turn(vehicle.object, math.pi / 2 - heading, near, _timeout(timeout_sec))
+        return await self._flown(vehicle, turn)
 
     # --- places ---------------------------------------------------------------------------------------
 
@@ -301,11 +294,17 @@ class MotionCalls:
                 "first"
             )
 
-    async def _ready(self, method: str, vehicle_name: object) -> tuple[Vehicle, Flown]:
+    async def _ready(
+        self, method: str, vehicle_name: object, yaw_mode: object = None
+    ) -> tuple[Vehicle, Flown]:
+        """A vehicle that may fly, and where it is."""
         vehicle, flown = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
         self._require_control(vehicle, method)
         if not vehicle.armed:
             raise CallError(f"{method}: vehicle {vehicle.name!r} is not armed; call armDisarm(True) first")
+        mode = yaw_mode if isinstance(yaw_mode, dict) else {}
+        if mode.get("yaw_or_rate") or mode.get("is_rate") is False:
+            self._note("yaw", "a call has a yaw_mode; vehicles of this run head where they move")
         return vehicle, flown
 
     async def _flown(self, vehicle: Vehicle, manoeuvre: Manoeuvre) -> bool:
@@ -316,8 +315,7 @@ class MotionCalls:
 
     def _path(self, vehicle: Vehicle, points: list[Vector], velocity: object, timeout_sec: object) -> FlyPath:
         speed = number(velocity, "velocity", 1e-3, FASTEST)
-        timeout_s = number(timeout_sec, "timeout_sec", 0.0, math.inf)
-        return FlyPath(vehicle.object, points, speed, self._habits.reach_m, timeout_s)
+        return FlyPath(vehicle.object, points, speed, self._habits.reach_m, _timeout(timeout_sec))
 
     async def _point(self, point: Vector) -> Vector:
         return (await self._bridge.ned()).point_to_enu(point)
@@ -328,11 +326,6 @@ class MotionCalls:
             for part, name in zip(parts, ("vx", "vy", "vz"), strict=True)
         )
         return (await self._bridge.ned()).velocity_to_enu((x, y, z))
-
-    def _note_yaw(self, yaw_mode: object) -> None:
-        mode = yaw_mode if isinstance(yaw_mode, dict) else {}
-        if mode.get("yaw_or_rate") or mode.get("is_rate") is False:
-            self._note("yaw", "a call has a yaw_mode; vehicles of this run head where they move")
 
     def _note(self, key: str, words: str) -> None:
         """Say once what a client asks for in vain."""
@@ -356,3 +349,7 @@ def _with_known(pose: Mapping[str, Any]) -> dict[str, Mapping[str, Any] | None]:
 
 def _duration(value: object) -> float:
     return number(value, "duration", 0.0, math.inf)
+
+
+def _timeout(value: object) -> float:
+    return number(value, "timeout_sec", 0.0, math.inf)

@@ -12,8 +12,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.geometry import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.space.ply import read_ply
-from caviar_services.mesh.shapes import Mesh
+from caviar_services.mesh.shapes import Mesh, ply
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,73 @@ def world_mesh(shape: SceneryShape) -> Mesh:
     """
     vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file}")
     return Mesh(vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3], faces.astype(np.int32))
+
+
+class RadioMaterial(NamedTuple):
+    """A material of scenery that a world makes in memory."""
+
+    itu_material: str
+    """Its name in ITU-R P.2040: ``concrete``."""
+    thickness_m: float = 0.2
+    """[m]"""
+    colour: tuple[float, float, float] | None = None
+    """Linear sRGB, 0…1, as cameras see it; None: as its material looks."""
+
+
+def scenery_files(
+    name: str, shapes: Mapping[str, tuple[Mesh, str]], materials: Mapping[str, RadioMaterial]
+) -> dict[str, bytes]:
+    """Make a scene description of meshes, and their files.
+
+    Args:
+        name: Of the description.
+        shapes: Mesh in world axes [m], and name of its material, by name of the shape.
+        materials: By name.
+
+    Returns:
+        Content by asset name, for `Service.scenery`.
+
+    Raises:
+        AssetError: ITU-R P.2040 has no such material, a thickness is not above 0, or a shape names a material
+            that is not there.
+
+    Example:
+        >>> from caviar_services.mesh.shapes import unit_box
+        >>> list(scenery_files("town", {"house": (unit_box(), "wall")}, {"wall": RadioMaterial("brick")}))
+        ['scenery/town.xml', 'scenery/meshes/house.ply']
+    """
+    lines = ['<scene version="2.1.0">']
+    for key, material in materials.items():
+        if material.itu_material not in ITU_MATERIALS:
+            raise AssetError(
+                f"material {key!r}: ITU-R P.2040 has no material {material.itu_material!r}; "
+                f"{suggestion(material.itu_material, ITU_MATERIALS)}"
+            )
+        if not material.thickness_m > 0:
+            raise AssetError(
+                f"material {key!r}: a thickness of {material.thickness_m:g} m; write one above 0"
+            )
+        lines += [
+            f'  <bsdf type="itu-radio-material" id={quoteattr(key)}>',
+            f'    <string name="type" value="{material.itu_material}"/>',
+            f'    <float name="thickness" value="{material.thickness_m:g}"/>',
+        ]
+        if material.colour is not None:
+            red, green, blue = material.colour
+            lines.append(f'    <rgb name="color" value="{red:.6f} {green:.6f} {blue:.6f}"/>')
+        lines.append("  </bsdf>")
+    for shape, (_, key) in shapes.items():
+        if key not in materials:
+            raise AssetError(f"shape {shape!r}: there is no material {key!r}; {suggestion(key, materials)}")
+        lines += [
+            f'  <shape type="ply" id={quoteattr(f"mesh-{shape}")}>',
+            f'    <string name="filename" value={quoteattr(f"meshes/{shape}.ply")}/>',
+            '    <boolean name="face_normals" value="true"/>',
+            f'    <ref id={quoteattr(key)} name="bsdf"/>',
+            "  </shape>",
+        ]
+    meshes = {f"scenery/meshes/{shape}.ply": ply(mesh) for shape, (mesh, _) in shapes.items()}
+    return {f"scenery/{name}.xml": "\n".join([*lines, "</scene>", ""]).encode(), **meshes}
 
 
 def find_scenery(assets: Mapping[str, Path]) -> Path | None:

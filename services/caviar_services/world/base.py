@@ -20,6 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
+from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
@@ -56,7 +57,8 @@ class ObjectState(NamedTuple):
     tilt_rate: tuple[float, float] = (0.0, 0.0)
     """[rad/s] about the world's x and y through its position, right-handed."""
     mesh: str = ""
-    """Its own mesh, by the name that `World.add_mesh` returned; empty: that of its class, or a box."""
+    """Its own mesh, by the name that `World.add_mesh` returned or that it has in `World.scenery`; empty: that
+    of its class, or a box."""
 
 
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -321,7 +323,9 @@ class World(Service[W]):
             raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
         meshes = set(self.mesh_classes())
         assets = tuple(
-            (mesh if self._meshes.max_faces else "") or (f"objects/{kind}.ply" if kind in meshes else "")
+            # A run may take no meshes that come while it goes on: their objects then are as if without.
+            (mesh if self._meshes.max_faces or not is_mesh_name(mesh) else "")
+            or (f"objects/{kind}.ply" if kind in meshes else "")
             for _, kind, mesh in listed
         )
         return names, tuple(kind for _, kind, _ in listed), assets

@@ -21,8 +21,8 @@ from caviar_protocol.errors import AssetError, SetupError, suggestion
 from caviar_protocol.host import install_command
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.engine_axes import EngineAxes
-from caviar_services.mesh.scenery import ITU_MATERIALS, read_scenery, world_mesh
-from caviar_services.mesh.shapes import Mesh, ply
+from caviar_services.mesh.scenery import ITU_MATERIALS, RadioMaterial, read_scenery, scenery_files, world_mesh
+from caviar_services.mesh.shapes import Mesh
 from caviar_services.sensors.shading import shape_colour
 
 PANDA3D = EngineAxes(
@@ -179,25 +179,10 @@ def _colour(core: ModuleType, node: Any, index: int) -> Vector:
 def _described(name: str, shapes: Mapping[str, tuple[Mesh, str, Vector]]) -> dict[str, bytes]:
     """A Mitsuba XML of shapes, with their meshes, by asset name."""
     looks = sorted({(radio, colour) for _, radio, colour in shapes.values()})
-    lines = ['<scene version="2.1.0">']
-    for index, (radio, colour) in enumerate(looks):
-        lines += [
-            f'  <bsdf type="itu-radio-material" id="{radio}-{index}">',
-            f'    <string name="type" value="{radio}"/>',
-            '    <float name="thickness" value="0.2"/>',
-            f'    <rgb name="color" value="{colour[0]:.6f} {colour[1]:.6f} {colour[2]:.6f}"/>',
-            "  </bsdf>",
-        ]
-    for shape, (_, radio, colour) in shapes.items():
-        lines += [
-            f'  <shape type="ply" id="mesh-{shape}">',
-            f'    <string name="filename" value="meshes/{shape}.ply"/>',
-            '    <boolean name="face_normals" value="true"/>',
-            f'    <ref id="{radio}-{looks.index((radio, colour))}" name="bsdf"/>',
-            "  </shape>",
-        ]
-    meshes = {f"scenery/meshes/{shape}.ply": ply(mesh) for shape, (mesh, _, _) in shapes.items()}
-    return {f"scenery/{name}.xml": "\n".join([*lines, "</scene>", ""]).encode(), **meshes}
+    keys = {look: f"{look[0]}-{index}" for index, look in enumerate(looks)}
+    materials = {key: RadioMaterial(radio, colour=colour) for (radio, colour), key in keys.items()}
+    placed = {shape: (mesh, keys[radio, colour]) for shape, (mesh, radio, colour) in shapes.items()}
+    return scenery_files(name, placed, materials)
 
 
 def geom_node(core: ModuleType, name: str, mesh: Mesh) -> Any:

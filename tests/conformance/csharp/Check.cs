@@ -15,7 +15,7 @@ internal static class Check
         var answers = new Dictionary<string, Func<string[], string>>
         {
             { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted },
-            { "match", Match }, { "mesh", Mesh },
+            { "match", Match }, { "mesh", Mesh }, { "spawned", Spawned }, { "spawn", Spawn },
             { "users", Users }, { "paths", Paths }, { "commands", Commands },
         };
         foreach (var line in File.ReadAllLines(arguments[1]))
@@ -152,6 +152,46 @@ internal static class Check
             return "ok";
         }
         catch (ArgumentException problem) { return problem.Message; }
+    }
+
+    // Steps `limit N`, `reset AGAIN FRAME`, `add HEX`, `refuse MESH`, `frame NUMBER MESH,MESH`, where a MESH is the
+    // number of one that was added: the names of `add`, what DONE says of `frame`.
+    private static string Spawned(string[] fields)
+    {
+        var meshes = new RunTimeMeshes();
+        var names = new List<string>();
+        var answers = new List<string>();
+        foreach (var words in fields.Select(field => field.Split(' ')))
+        {
+            if (words[0] == "limit") meshes.MaxFaces = long.Parse(words[1]);
+            if (words[0] == "reset") meshes.Reset(words[1] == "1", long.Parse(words[2]));
+            if (words[0] == "add") { names.Add(meshes.Add(Hex(words[1]))); answers.Add(names.Last()); }
+            if (words[0] == "refuse") meshes.Refuse(names[int.Parse(words[1])].Substring(8, 64));
+            if (words[0] != "frame") continue;
+            var used = words[2].Split(',').Where(word => word != "").Select(word => names[int.Parse(word)]);
+            var change = meshes.Change(long.Parse(words[1]), used);
+            answers.Add(change == null ? "-" : change.Whole("frame") + ":"
+                + string.Join(",", change.List("assets").Cast<Map>().Select(asset => asset.Text("name"))));
+        }
+        return string.Join("\t", answers);
+    }
+
+    // A mesh that comes while a run goes on, MAX_FACES, vertices, triangles: why it would be refused.
+    private static string Spawn(string[] fields)
+    {
+        try
+        {
+            var triangles = Rows(fields[3]).Select(row => row.Select(n => (int)n).ToArray()).ToList();
+            RunTimeMeshes.Check(fields[0], Rows(fields[2]), triangles, long.Parse(fields[1]));
+            return "ok";
+        }
+        catch (ArgumentException problem) { return problem.Message; }
+    }
+
+    private static List<double[]> Rows(string text)
+    {
+        var numbers = text == "" ? new double[0] : Numbers(text);
+        return Enumerable.Range(0, numbers.Length / 3).Select(i => numbers.Skip(3 * i).Take(3).ToArray()).ToList();
     }
 
     private static string Text(double[] numbers)

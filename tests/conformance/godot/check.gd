@@ -7,6 +7,7 @@ extends SceneTree
 const Axes = preload("res://addons/caviar/caviar_axes.gd")
 const Codec = preload("res://addons/caviar/caviar_codec.gd")
 const Products = preload("res://addons/caviar/caviar_products.gd")
+const RunTimeMeshes = preload("res://addons/caviar/caviar_run_time_meshes.gd")
 const Scene = preload("res://addons/caviar/caviar_scene.gd")
 const Scenery = preload("res://addons/caviar/caviar_scenery.gd")
 
@@ -112,6 +113,51 @@ func ask_mesh(fields):
 	else:
 		scenery.offer_mesh(fields[1], [[0, 0, 0], [0, 0, 0], [0, 0, 0]], [numbers(fields[2])])
 	return "ok" if scenery.problem == "" else scenery.problem
+
+
+# Steps `limit N`, `reset AGAIN FRAME`, `add HEX`, `refuse MESH`, `frame NUMBER MESH,MESH`, where a MESH is the number
+# of one that was added: the names of `add`, what DONE says of `frame`.
+func ask_spawned(fields):
+	var meshes = RunTimeMeshes.new()
+	var names = []
+	var answers = []
+	for field in fields:
+		var words = field.split(" ")
+		if words[0] == "limit":
+			meshes.max_faces = int(words[1])
+		elif words[0] == "reset":
+			meshes.reset(words[1] == "1", int(words[2]))
+		elif words[0] == "add":
+			names.append(meshes.add(bytes(words[1])))
+			answers.append(names.back())
+		elif words[0] == "refuse":
+			meshes.refuse(names[int(words[1])].substr(8, 64))
+		elif words[0] == "frame":
+			var used = []
+			for word in words[2].split(",", false):
+				used.append(names[int(word)])
+			var change = meshes.change(int(words[1]), used)
+			var announced = []
+			if change != null:
+				for asset in change["assets"]:
+					announced.append(asset["name"])
+			var told = PoolStringArray(announced).join(",")
+			answers.append("-" if change == null else "%d:%s" % [change["frame"], told])
+	return join(answers)
+
+
+# A mesh that comes while a run goes on, MAX_FACES, vertices, triangles: why it would be refused.
+func ask_spawn(fields):
+	var wrong = Scenery.wrong_at_run_time(fields[0], rows(fields[2]), rows(fields[3]), int(fields[1]))
+	return "ok" if wrong == "" else wrong
+
+
+func rows(text):
+	var found = []
+	var all = numbers(text) if text != "" else []
+	for i in range(all.size() / 3):
+		found.append([all[3 * i], all[3 * i + 1], all[3 * i + 2]])
+	return found
 
 
 func ask_users(fields):

@@ -4,6 +4,7 @@
 
 const Axes = preload("caviar_axes.gd")
 const Codec = preload("caviar_codec.gd")
+const RunTimeMeshes = preload("caviar_run_time_meshes.gd")
 const LIGHT_M_S = 299792458.0
 
 var prefixes = []  # that names have to begin with; empty: any will do
@@ -103,8 +104,9 @@ func _check(item):
 	for side in item["dimensions"]:
 		if side <= 0:
 			_wrong(who + "dimensions are %s; each has to be above 0 m" % str(item["dimensions"]))
-	if item["mesh"] != "" and scenery != null and not scenery.has(item["mesh"]):
-		_wrong(who + "the mesh '%s' was not offered; call offer_mesh in prepare" % item["mesh"])
+	var mesh = item["mesh"]
+	if mesh != "" and scenery != null and not scenery.has(mesh) and not RunTimeMeshes.is_name(mesh):
+		_wrong(who + "the mesh '%s' was not offered; take it from what offer_mesh returns" % mesh)
 
 
 func _check_numbers(what, values, count, most):

@@ -39,9 +39,37 @@ func offer(name, data):
 	return name
 
 
-# A mesh of objects: vertices in body axes and any unit are fitted into the unit box.
-func offer_mesh(name, vertices, triangles):
-	return offer("objects/%s.ply" % name, _ply(name, _in_unit_box(vertices), triangles))
+# A mesh of objects: vertices in body axes and any unit are fitted into the unit box. material: of ITU-R P.2040;
+# empty: what the channel's settings say.
+func offer_mesh(name, vertices, triangles, material = ""):
+	return offer("objects/%s.ply" % name, unit_mesh(name, vertices, triangles, material))
+
+
+# The file of a mesh that fills the unit box; `problem` says what is wrong with it.
+func unit_mesh(name, vertices, triangles, material):
+	if material != "" and not material in MATERIALS:
+		_wrong("mesh '%s': no type is '%s'; one of %s" % [name, material, str(MATERIALS)])
+	return _ply(name, _in_unit_box(vertices), triangles, material)
+
+
+# What a run would refuse of a mesh that comes while it goes on, or empty.
+static func wrong_at_run_time(name, vertices, triangles, max_faces):
+	var who = "mesh '%s': " % name
+	if triangles.size() == 0:
+		return who + "it has no triangle"
+	if max_faces > 0 and triangles.size() > max_faces:
+		return who + "it has %d triangles, and this run takes %d" % [triangles.size(), max_faces]
+	for i in range(3):
+		var low = INF
+		var high = -INF
+		for vertex in vertices:
+			if is_nan(vertex[i]) or is_inf(vertex[i]):
+				return who + "a vertex is not finite"
+			low = min(low, vertex[i])
+			high = max(high, vertex[i])
+		if not high > low:
+			return who + "it is flat"
+	return ""
 
 
 # meshes: [{name, vertices, triangles, material}]; materials: [{name, type, thickness}], thickness 0.2 m if
@@ -80,10 +108,12 @@ static func _escaped(text):
 	return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("\"", "&quot;")
 
 
-func _ply(name, vertices, triangles):
+func _ply(name, vertices, triangles, material = ""):
 	var data = StreamPeerBuffer.new()
 	data.put_data(Codec.utf8(
-		"ply\nformat binary_little_endian 1.0\nelement vertex %d\n" % vertices.size()
+		"ply\nformat binary_little_endian 1.0\n"
+		+ ("comment material %s\n" % material if material != "" else "")
+		+ "element vertex %d\n" % vertices.size()
 		+ "property float x\nproperty float y\nproperty float z\nelement face %d\n" % triangles.size()
 		+ "property list uchar int vertex_indices\nend_header\n"
 	))

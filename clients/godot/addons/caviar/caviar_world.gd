@@ -12,6 +12,7 @@ const Axes = preload("caviar_axes.gd")
 const Codec = preload("caviar_codec.gd")
 const Heart = preload("caviar_heart.gd")
 const Products = preload("caviar_products.gd")
+const RunTimeMeshes = preload("caviar_run_time_meshes.gd")
 const Scene = preload("caviar_scene.gd")
 const Scenery = preload("caviar_scenery.gd")
 
@@ -37,6 +38,8 @@ var end_reason = ""
 
 var _codec = Codec.new()
 var _scenery = Scenery.new()
+var _meshes = RunTimeMeshes.new()
+var _said = {}
 var _scene
 var _socket_script
 var _socket
@@ -101,8 +104,28 @@ func object(object_name, kind, position, dimensions):
 	return Scene.object(object_name, kind, position, dimensions)
 
 
-func offer_mesh(mesh_name, vertices, triangles):
-	return _scenery.offer_mesh(mesh_name, vertices, triangles)
+# The mesh of objects, for `mesh` of them. In `prepare` it is there for the whole run. In `reset`, `step` and
+# `restore` it comes while the run goes on, and stays as long as an object has it, and 20 frames longer, until the
+# episode ends; a state has no meshes, so that `restore` offers those of its objects again. One that is none is
+# printed then, and the name is empty: its objects are boxes.
+func offer_mesh(mesh_name, vertices, triangles, material = ""):
+	if _state != READY and _state != ACTIVE:
+		return _scenery.offer_mesh(mesh_name, vertices, triangles, material)
+	var wrong = Scenery.wrong_at_run_time(mesh_name, vertices, triangles, _meshes.max_faces)
+	_scenery.problem = ""
+	var file = _scenery.unit_mesh(mesh_name, vertices, triangles, material) if wrong == "" else null
+	if wrong == "":
+		wrong = _scenery.problem
+	if wrong == "":
+		return _meshes.add(file)
+	_say(wrong + "; objects with it are boxes")
+	return ""
+
+
+func _say(line):
+	if not _said.has(line):
+		printerr("%s: %s" % [name, line])
+	_said[line] = true
 
 
 func offer_scenery(meshes, materials, scenery_name = "world"):
@@ -188,7 +211,8 @@ func _join(patience):
 		declared.append({"topic": topic, "lag": 1, "required": false})
 	_send("HELLO", {
 		"version": [1, 6], "name": name, "role": "world", "inputs": declared, "outputs": ["scene"],
-		"capabilities": ["assets", "episodes", "checkpoint"], "implementation": implementation, "max_in_flight": 4,
+		"capabilities": ["assets", "episodes", "checkpoint", "geometry"], "implementation": implementation,
+		"max_in_flight": 4,
 	})
 
 
@@ -295,6 +319,8 @@ func _take(type, fields, parts):
 		_refused(fields)
 	elif type == "STALE" or type == "ERROR":
 		printerr("%s: %s %s %s" % [name, type, fields.get("code", fields["of"]), fields.get("message", "")])
+		if fields.get("code", "") == "refused-mesh":
+			_meshes.refuse(fields["subject"])
 	elif type == "CANCEL":
 		pass  # advice: the answer is due all the same
 	elif type == "ASSET_GET" and _state > JOINED:
@@ -304,7 +330,7 @@ func _take(type, fields, parts):
 	elif type == "WELCOME":
 		_welcome(fields)
 	elif type == "PREPARE":
-		_on_prepare()
+		_on_prepare(fields)
 	elif type == "RESET":
 		_on_reset(fields)
 	elif type == "GRANT":
@@ -353,8 +379,9 @@ func _welcome(fields):
 	_state = JOINED
 
 
-func _on_prepare():
+func _on_prepare(fields):
 	_state = PREPARING
+	_meshes.max_faces = fields["max_faces"]
 	_heart.phase = "prepare"
 	_scenery.clear()
 	prefixes = []
@@ -378,6 +405,8 @@ func _on_prepare():
 
 func _serve(fields):
 	var data = _scenery.find(fields["digest"])
+	if data == null:
+		data = _meshes.find(fields["digest"])
 	var offset = fields["offset"]
 	if data == null or offset > data.size():
 		_error("unknown-asset", "no asset has this digest, or it ends before", "ASSET_GET", fields["digest"])
@@ -394,6 +423,8 @@ func _on_reset(fields):
 	_answers = {}
 	_grants = []
 	_scene.arrived = []
+	_meshes.reset(_was_here_before())
+	_said = {}
 	_stepped = false
 	_newest = -1
 	_fault = ""
@@ -404,6 +435,11 @@ func _on_reset(fields):
 	_heart.phase = "step"
 	_state = ACTIVE
 	_send("RESET_DONE", _mine({"episode": episode}))
+
+
+# Whether the broker may know meshes that an earlier process of this world announced.
+func _was_here_before():
+	return _epoch > 1 or _attempt > 1
 
 
 # --- frames -------------------------------------------------------------------------------------------------
@@ -443,6 +479,10 @@ func _answered(grant, parts):
 		fail("step returned %s and no list of objects; an error of the script is above" % str(objects))
 	if _fault != "":
 		return _fault_frame(frame, "step", "")
+	var meshes = []
+	for item in objects:
+		item["mesh"] = _looked(item["mesh"])
+		meshes.append(item["mesh"])
 	var product = _scene.build(objects)
 	if product == null:
 		fail(_scene.problem)
@@ -451,7 +491,21 @@ func _answered(grant, parts):
 	_stepped = true
 	var entry = {"topic": "scene", "digest": product["digest"]}
 	var done = _mine({"episode": episode, "frame": frame, "products": [entry]})
+	var change = _meshes.change(frame, meshes)
+	if change != null:
+		done["geometry"] = change
 	return _frame("DONE", done, [product["header"], product["body"]])
+
+
+# A mesh as the run may have it.
+func _looked(mesh):
+	if not RunTimeMeshes.is_name(mesh):
+		return mesh
+	if _meshes.max_faces == 0:
+		return ""  # the run takes no meshes now
+	if not _meshes.has(mesh):
+		_say("%s is not there; objects with it are boxes until offer_mesh brings it" % mesh)
+	return mesh
 
 
 # The source of a product that cannot be read, or empty.
@@ -504,6 +558,7 @@ func _on_restore(state):
 		_previous = head["previous"]
 		_stepped = head["stepped"]
 		_newest = head["newest"]
+		_meshes.reset(_was_here_before(), _newest + 1)
 		restore(parts[1])
 	if _fault != "":
 		_socket.send(_fault_frame(-1, "restore", ""))

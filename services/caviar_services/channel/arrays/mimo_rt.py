@@ -23,10 +23,9 @@ from caviar_services.channel.arrays.channel_matrices import Bins, Located
 from caviar_services.channel.arrays.element_visibility import elements
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
+from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.foliage import Foliage
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
-from caviar_services.channel.propagation.human_blockage import HumanBlockage
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table
@@ -54,7 +53,7 @@ class ElementTracer:
         wavelengths: Float64Array,
         lanes: int,
         los: bool,
-        losses: Sequence[Foliage | HumanBlockage] = (),
+        losses: Sequence[Attenuation] = (),
     ) -> None:
         self._losses = losses
         self._tracer = tracer

@@ -15,7 +15,7 @@ edge or a corner crosses what a line infinitesimally beside it crosses (H. Edels
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -27,7 +27,7 @@ from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Carrier, Scene
-from caviar_services.channel.paths import PathTable
+from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.propagation.geometry import path_corners, ranges
 from caviar_services.channel.sionna.materials import ObjectMaterials
 from caviar_services.mesh.shapes import Mesh, placed, unit_box
@@ -332,7 +332,7 @@ class FoliageKind:
         )
 
 
-class Foliage:
+class Foliage(Attenuation):
     """The foliage of a scene, and the attenuation of paths in it.
 
     The volume of a piece of scenery is within its mesh, that of an object is its bounding box. A path loses,
@@ -399,17 +399,7 @@ class Foliage:
     def amplitude_factor(
         self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
     ) -> Float64Array:
-        """Factors of amplitudes by foliage: 10^(−A/20).
-
-        Args:
-            start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
-            points: As in `PathTable`, Shape ``[P, D, 3]``; ``types`` of Shape ``[P, D]``.
-            end: See ``start``.
-            types: See ``points``.
-
-        Returns:
-            Factors of Shape ``[C, P]``.
-        """
+        """Factors by foliage, 10^(−A/20), Shape ``[C, P]``; see `Attenuation`."""
         corners = path_corners(start, points, end, (types != 0).sum(1))
         paths, legs = len(corners), corners.shape[1] - 1
         ends = corners[:, :-1].reshape(-1, 3), corners[:, 1:].reshape(-1, 3)
@@ -417,11 +407,6 @@ class Foliage:
         inside = inside.reshape(paths, legs, -1).sum(1)
         lost = sum(kind.attenuation_db(inside[:, k]) for k, kind in enumerate(self.kinds))
         return 10 ** (-np.asarray(lost) / 20)
-
-    def attenuated(self, table: PathTable, start: Float64Array, end: Float64Array) -> PathTable:
-        """Paths with the attenuation by foliage; positions of TX and RX of each [m], Shape ``[P, 3]``."""
-        factor = self.amplitude_factor(start, table.points, end, table.types)
-        return replace(table, transfer=table.transfer * factor[..., None, None])
 
 
 def _kind(

@@ -22,7 +22,6 @@ wave. Only screens between the ends of a leg itself count for it.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import Annotated
 
 import msgspec
@@ -31,7 +30,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, UInt8Array, quantity
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.topics import Carrier, Interaction, Scene
-from caviar_services.channel.paths import PathTable
+from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.propagation.geometry import path_corners
 
 # A leg whose horizontal part is shorter [m] is vertical: no screen stands across it.
@@ -81,7 +80,7 @@ def check_screens(
                 )
 
 
-class HumanBlockage:
+class HumanBlockage(Attenuation):
     """What the people of a frame take from paths.
 
     Args:
@@ -133,17 +132,7 @@ class HumanBlockage:
     def amplitude_factor(
         self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
     ) -> Float64Array:
-        """Factors of amplitudes: 10^(−L/20).
-
-        Args:
-            start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
-            points: As in `PathTable`, Shape ``[P, D, 3]``; ``types`` of Shape ``[P, D]``.
-            end: See ``start``.
-            types: See ``points``.
-
-        Returns:
-            Factors of Shape ``[C, P]``.
-        """
+        """Factors by screens, 10^(−L/20), Shape ``[C, P]``; see `Attenuation`."""
         corners = path_corners(start, points, end, (types != 0).sum(1))
         factor = np.ones((len(self._wavelengths), len(corners)))
         if not len(self._feet) or not len(corners):
@@ -207,17 +196,6 @@ class HumanBlockage:
         forward, across = side[:, 0] * c + side[:, 1] * s, side[:, 1] * c - side[:, 0] * s
         # The silhouette of an ellipse with these axes, seen along the direction.
         return np.hypot(width * forward, length * across), height
-
-    def attenuated(self, table: PathTable, start: Float64Array, end: Float64Array) -> PathTable:
-        """Paths with the loss by people.
-
-        Args:
-            table: The paths.
-            start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
-            end: See ``start``.
-        """
-        factor = self.amplitude_factor(start, table.points, end, table.types)
-        return replace(table, transfer=table.transfer * factor[..., None, None])
 
 
 def _unfolded(corners: Float64Array, types: UInt8Array) -> tuple[Float64Array, Float64Array]:

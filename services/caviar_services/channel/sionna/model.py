@@ -28,6 +28,7 @@ from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.propagation.clearance import with_near_pairs
 from caviar_services.channel.propagation.foliage import Foliage
 from caviar_services.channel.propagation.human_blockage import HumanBlockage
@@ -140,9 +141,9 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return self._room
 
     @property
-    def _losses(self) -> tuple[Foliage | HumanBlockage, ...]:
+    def _losses(self) -> tuple[Attenuation, ...]:
         """What paths lose in beside what they meet."""
-        found: list[Foliage | HumanBlockage] = []
+        found: list[Attenuation] = []
         if self.foliage is not None:
             found.append(self.foliage)
         if self.blockage is not None:
