@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Make .venv with what `make demo` needs (deploy/setup.sh demo), or `make test` too (deploy/setup.sh dev),
-# and see to the system libraries that pip does not bring. Installs Debian packages where it may (as root, or with
+# and see to the system libraries that pip does not bring. `deploy/setup.sh engines` sees to the compilers and engines
+# with which the client libraries are tested, and makes no .venv. Installs Debian packages where it may (as root, or with
 # passwordless sudo); otherwise it names the command and fails.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -8,7 +9,8 @@ cd "$(dirname "$0")/.."
 case ${1:-dev} in
   demo) extras=all what="ray tracer, SUMO and Matplotlib" size=1500 stamp=.venv/.setup-demo ;;
   dev) extras=all,dev what="ray tracer, SUMO, Matplotlib, PyTorch and the tools of the tests" size=2500 stamp=.venv/.setup-done ;;
-  *) echo "usage: deploy/setup.sh [demo|dev]" >&2 && exit 2 ;;
+  engines) ;;
+  *) echo "usage: deploy/setup.sh [demo|dev|engines]" >&2 && exit 2 ;;
 esac
 
 say() { printf '\033[1m==>\033[0m %s\n' "$*"; }
@@ -149,6 +151,26 @@ see_to_llvm() {
   say "$(.venv/bin/python -c "$choose")"
 }
 
+# Debian's package of each program; tests that lack one are skipped by its name.
+see_to_engines() {
+  local program missing=()
+  for program in g++:g++ node:nodejs mcs:mono-mcs mono:mono-runtime godot3-server:godot3-server; do
+    command -v "${program%%:*}" >/dev/null || missing+=("${program##*:}")
+  done
+  [ -e /usr/include/zmq.h ] || missing+=(libzmq3-dev)
+  for program in "${missing[@]}"; do
+    # What Mono's sockets call, which its runtime does not bring.
+    if [ "$program" = mono-runtime ]; then missing+=(libmono-posix4.0-cil libmono-system4.0-cil); fi
+  done
+  if [ ${#missing[@]} -gt 0 ]; then
+    need_packages "the tests of the client libraries use ${missing[*]}" "${missing[@]}"
+  fi
+}
+
+if [ "${1:-dev}" = engines ]; then
+  see_to_engines
+  exit
+fi
 if [ -n "${PYTHON:-}" ] && ! new_enough "$PYTHON"; then
   die "PYTHON=$PYTHON is no Python of version 3.11 or newer"
 fi
