@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,7 @@ def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> No
     assert "frame 2" in result.error
     assert DatasetDirectory(tmp_path).finished() == []
     assert not DatasetDirectory(tmp_path).work.exists()
+    assert logging.getLogger("caviar.service").level == logging.NOTSET, "as it was"
 
 
 def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -74,6 +75,19 @@ class EpisodeResult:
     """Times, host and start."""
 
 
+@contextmanager
+def _quiet_services() -> Iterator[None]:
+    """What fails is told in the result, with episode and cause."""
+    logger = logging.getLogger("caviar.service")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@_quiet_services()
 def play_episode(task: EpisodeTask) -> EpisodeResult:
     """Play an episode, and put its recording into place.
 
@@ -85,8 +99,6 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
     Returns:
         Rows of the catalogue and times, or the error.
     """
-    # What fails is told in the result, with episode and cause.
-    logging.getLogger("caviar.service").setLevel(logging.CRITICAL)
     began, cpu = time.monotonic(), time.process_time()
     measured: dict[str, Any] = {
         "host": socket.gethostname(),
