@@ -2118,7 +2118,8 @@ class World {
   double welcome_timeout_s = 120.0;  // for the first WELCOME
   int max_in_flight = 4;             // grants that may be queued
 
-  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 128 + n after signal n.
+  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 1 where this world failed or
+  // was refused, 128 + n after signal n.
   int run(const std::string& endpoint, const std::string& name) {
     leave_on_signals();
     if (connect(endpoint, name))
@@ -2129,7 +2130,7 @@ class World {
   // Begins to connect to a broker, `tcp://HOST:PORT`, under the scenario's name of this world; never waits.
   bool connect(const std::string& endpoint, const std::string& name) {
     leave("another connection is wanted");
-    endpoint_ = endpoint, name_ = name, status_ = 0, rejoining_ = false;
+    endpoint_ = endpoint, name_ = name, status_ = 0, faulted_ = rejoining_ = false;
     std::string wrong;
     keys_ = Keys::from_environment(wrong);
     if (!wrong.empty()) return end(wrong, 1);
@@ -2376,7 +2377,7 @@ class World {
   bool end(const std::string& why, int status) {
     log(why);
     close();
-    status_ = status;
+    status_ = status == 0 && faulted_ ? 1 : status;
     return false;
   }
 
@@ -2618,6 +2619,7 @@ class World {
   void fault(const char* phase, std::int64_t frame, const std::string& line,
              const std::string& culprit = "") {
     log(std::string(phase) + ": " + line);
+    faulted_ = true;
     const Value fields = stamped({{"episode", std::max<std::int64_t>(0, episode_)},
                                   {"frame", frame},
                                   {"phase", phase},
@@ -2687,6 +2689,7 @@ class World {
   Heart heart_;
   Stage stage_ = Stage::over;
   int status_ = 0;
+  bool faulted_ = false;  // whether this world failed
   bool rejoining_ = false;
   double pause_s_ = 0.1;
   Clock::time_point deadline_{}, retry_at_{}, give_up_at_{}, began_{};

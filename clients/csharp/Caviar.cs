@@ -1976,6 +1976,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private Heart _heart;
         private SceneBuilder _scene;
         private State _state = State.Over;
+        private bool _faulted;
         private DateTime _deadline, _rejoinUntil = DateTime.MinValue, _retryAt;
         private double _pause;
         private long _rejoinNs, _epoch, _attempt, _episode, _t0, _previous, _newest;
@@ -2121,6 +2122,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _token = token;
             Name = name;
             ExitStatus = 0;
+            _faulted = false;
             EndReason = "";
             Join(Patience);
         }
@@ -2227,7 +2229,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             _state = State.Over;
             _epoch = 0;
-            ExitStatus = status;
+            ExitStatus = status == 0 && _faulted ? 1 : status;
             EndReason = reason;
             Log(Name + ": " + reason);
         }
@@ -2499,6 +2501,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         private byte[] FaultOf(long frame, string phase, Exception problem, string culprit)
         {
+            _faulted = true;
             Log(Name + ": " + phase + ": " + problem.Message);
             return Framed("FAULT", With(new Map
             {

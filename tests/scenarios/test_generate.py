@@ -426,7 +426,7 @@ def test_a_cluster_whose_workers_are_gone_ends_the_command(
         monkeypatch.setattr(notes, "estimated", lambda *_: worker.kill() if when == "play" else None)
         if when == "before":
             worker.kill()
-            said = f"no Dask scheduler answers at {address}|or it has no worker"
+            said = f"no Dask scheduler answers at {address}|the Dask scheduler {address} has no worker"
         elif when == "trials":
             worker_of_trials(worker)
             said = "a process that tried a scene beforehand died|has had no worker"

@@ -162,7 +162,8 @@ def test_a_killed_agent_that_is_started_again_rejoins_and_nothing_is_lost(
         waiting.killed_after(agent, 120)  # started before the loss of the first was told, perhaps
         away = [waiting.line("away: agent"), waiting.line("away: agent")][-1]
         assert "at most 30 s (timeouts.rejoin_s)" in away
-        assert f"start it again with  python clients/minimal/agent.py {waiting.endpoint} agent" in away
+        example = f"python clients/minimal/agent.py {waiting.endpoint} agent"
+        assert f"start it again as before (or, the example,  {example})" in away
         with waiting.agent(agent) as process:
             assert "came back after" in waiting.line("back: agent")
             status, output = waiting.ended()

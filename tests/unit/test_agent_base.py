@@ -182,6 +182,19 @@ def test_other_commands_stand_after_the_beams() -> None:
     assert [type(command) for command in commands] == [BeamChoice] * 4 + [VelocityCommand]
 
 
+def test_a_command_for_an_actuator_that_is_not_declared_is_refused() -> None:
+    """The broker looks for two owners among what agents declare."""
+
+    class Undeclared(DriverAgent):
+        def other_actuators(self) -> tuple[str, ...]:
+            return ("motion:drone",)
+
+    with pytest.raises(
+        PayloadError, match=r"VelocityCommand for 'motion:uav', .* it returned 'motion:drone'"
+    ):
+        action(Undeclared(AgentSettings(users=("*",)), RunInfo(name="pilot")))
+
+
 @pytest.mark.parametrize(
     ("users", "except_users", "expected"),
     [

@@ -178,11 +178,11 @@ def test_a_base_install_is_whole_and_one_command_adds_every_extra(monkeypatch: p
     assert doctor.exit_status(checks) == 0
     text = shown(checks, width=200)
     assert text.count("pip install") == 1
-    assert "install 'caviar-sim[channel,sensors,world,plot,datasets,policy,system,learning]'" in text
+    assert f"install 'caviar-sim[{','.join(doctor.EXTRAS)}]'" in text
     assert f"  {drjit_setup.INSTALL}\n" in text, "pip brings no LLVM"
     ready, count = re.search(r"Ready: (\d+) of the (\d+) shipped scenarios run here", text).groups()
     assert 0 < int(ready) < int(count)
-    assert "the others need channel, sensors, world (`caviar scenarios`" in text
+    assert "the others need channel, sensors, world, panda3d (`caviar scenarios`" in text
 
 
 def test_every_extra_stands_in_the_readme(repository: Path) -> None:

@@ -104,13 +104,13 @@ def test_the_user_is_told_who_is_awaited_where_and_what_to_type(monkeypatch: pyt
         f"or  python clients/minimal/agent.py {ENDPOINT} agent"
     )
     assert remote.start_command("my world", spec("world"), ENDPOINT) == (
-        f"node clients/minimal/node/world.mjs {ENDPOINT} 'my world'"
+        f"python clients/python/world.py {ENDPOINT} 'my world'"
     )
     told = remote.waiting_text("link", spec("link"), ENDPOINT, 30.0)
     assert told.endswith(
         f"caviar service link --use link:IMPLEMENTATION --broker {ENDPOINT} (IMPLEMENTATION: beams, cell)"
     )
-    monkeypatch.setattr(remote, "MINIMAL", Path("/nowhere"))
+    monkeypatch.setattr(remote, "SOURCES", Path("/nowhere"))
     assert "caviar service agent --use agent:IMPLEMENTATION" in remote.start_command(
         "agent", spec("agent"), ENDPOINT
     )
@@ -120,7 +120,7 @@ def test_the_example_is_named_from_wherever_the_user_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert str(remote.MINIMAL) in remote.start_command("agent", spec("agent"), ENDPOINT)
+    assert str(remote.SOURCES) in remote.start_command("agent", spec("agent"), ENDPOINT)
 
 
 @pytest.mark.parametrize("everywhere", ["0.0.0.0", "[::]"])  # noqa: S104  # only told, not bound

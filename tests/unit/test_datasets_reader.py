@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import pickle
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,17 @@ def test_recorded_arrays_have_a_row_for_each_user_in_their_order(folder: Path) -
         channel = data.episode(shuffled["episode"][row])["channel"]
         user = channel.rx.index(shuffled["rx"][row])
         np.testing.assert_array_equal(h[row], channel.h[shuffled["scene"][row], user][: h.shape[1]])
+
+
+def test_a_recording_of_another_dataset_is_refused(folder: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "d"
+    shutil.copytree(folder, copied)
+    (file,) = DatasetDirectory(copied).episode(1).glob("*.mcap")
+    file.write_bytes(file.read_bytes() + b"\0")
+    data = Dataset(copied)
+    assert data.episode(0)["channel"].h.size
+    with pytest.raises(RecordingError, match=r"episode-000001 is not the recording .* Remove the folder"):
+        data.users()["channel.h"]
 
 
 def test_batches_are_all_users_once_in_an_order_that_the_seed_gives(folder: Path) -> None:

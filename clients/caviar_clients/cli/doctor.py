@@ -37,7 +37,19 @@ from caviar_protocol.host import DISTRIBUTION, install_command
 from caviar_protocol.scenario import load_scenario, shipped_scenarios
 from caviar_services import drjit_setup
 
-EXTRAS = ("channel", "sensors", "world", "plot", "datasets", "policy", "system", "learning")
+EXTRAS = (
+    "channel",
+    "sensors",
+    "world",
+    "plot",
+    "datasets",
+    "policy",
+    "panda3d",
+    "mavlink",
+    "mujoco",
+    "system",
+    "learning",
+)
 MINIMUM_PYTHON = (3, 11)
 MINIMUM_FREE_GB = 2.0
 MINIMUM_FILES = 1024

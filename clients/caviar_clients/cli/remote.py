@@ -186,10 +186,10 @@ def why_lines(why: Mapping[str, Any]) -> Iterator[str]:
         yield f"last blame: {last['kind']}: {last['service']}{frame}: {last['text']}"
 
 
-MINIMAL = Path(caviar_clients.__file__).parents[1] / "minimal"
-"""The example clients; they come with the sources and not with an installed package."""
-EXAMPLES = {"agent": ("python", "agent.py"), "world": ("node", "node/world.mjs")}
-"""Role to the program and the script of its example."""
+SOURCES = Path(caviar_clients.__file__).parents[1]
+"""Of the example clients; they come with the sources and not with an installed package."""
+EXAMPLES = {"agent": "minimal/agent.py", "world": "python/world.py"}
+"""Role to the script of its example, in Python."""
 _EVERYWHERE = ("0.0.0.0", "[::]", "*")  # noqa: S104  # recognised, not bound
 
 
@@ -214,9 +214,9 @@ def start_command(name: str, spec: ServiceSpec, endpoint: str) -> str:
         endpoint: Address of the broker, to connect to.
     """
     # A checkout has clients to copy from; an installed package does not.
-    program, script = EXAMPLES.get(spec.role, ("", ""))
-    if script and (MINIMAL / script).exists():
-        return f"{program} {_shown(MINIMAL / script)} {endpoint} {shlex.quote(name)}"
+    script = EXAMPLES.get(spec.role, "")
+    if script and (SOURCES / script).exists():
+        return f"python {_shown(SOURCES / script)} {endpoint} {shlex.quote(name)}"
     use = f"{spec.role}:IMPLEMENTATION"
     return f"caviar service {shlex.quote(name)} --use {use} --broker {endpoint}"
 

@@ -353,6 +353,8 @@ def _follow(
     _write_summary(summary, directory, json_file)  # last: a disk that is full leaves the screen
     if new and interrupted.came and not outcome["frames"]:
         _remove_without_frames(directory, console)
+    elif interrupted.came and not isinstance(launcher, EmbeddedLauncher):
+        print_line(console, f"caviar run --resume {directory} goes on with it")
     status = 130 if interrupted.came else 1 if outcome["error"] else 0
     return RunOutcome(directory, status, outcome["error"])
 
@@ -443,7 +445,7 @@ class _Watcher:
         if event["kind"] != "away" or spec is None or not spec.remote:
             return ""
         command = start_command(event["service"], spec, self._endpoint)
-        return f"; unless it comes back by itself, start it again with  {command}"
+        return f"; unless it comes back by itself, start it again as before (or, the example,  {command})"
 
     def _tell(self, text: str, style: str) -> None:
         print_line(self._console, printable(text), style)

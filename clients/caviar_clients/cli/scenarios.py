@@ -41,6 +41,8 @@ def _extras(spec: ServiceSpec) -> set[str]:
         found.add("channel" if has_extra("channel") and not has_extra("world") else "world")
     if spec.settings.get("rate_model") == "nr":  # of the link `cell`
         found.add("system")
+    if any(flown.get("engine") == "mujoco" for flown in spec.settings.get("flown", ())):
+        found.add("mujoco")
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")
     for rung in (*ladder, *([reference] if reference else [])):  # models that an adaptive channel has
         found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
-from caviar_clients.datasets.cluster_watch import NOTE_S, TOPIC, ClusterWatch, Stall
+from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_services.drjit_setup import THREADS_VARIABLE
@@ -59,6 +59,10 @@ _CONFIG = {
         "MKL_NUM_THREADS": "1",
     },
 }
+
+
+class NoWorkerError(RunError):
+    """A scheduler answers, and has no worker."""
 
 
 class LostSchedulerError(Exception):
@@ -293,12 +297,17 @@ class Episodes:
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)
                 self._stack.callback(self._client.close, timeout=5)
-                self._client.wait_for_workers(1, timeout=CONNECT_S)
             except (OSError, TimeoutError, ValueError) as error:
                 raise RunError(
-                    f"no Dask scheduler answers at {self._scheduler} within {CONNECT_S:.0f} s, or it has no "
-                    f"worker: start it with "
+                    f"no Dask scheduler answers at {self._scheduler} within {CONNECT_S:.0f} s: start it with "
                     "dask scheduler, and workers with dask worker ADDRESS --nthreads 1"
+                ) from error
+            try:
+                self._client.wait_for_workers(1, timeout=CONNECT_S)
+            except (OSError, TimeoutError) as error:
+                raise NoWorkerError(
+                    f"the Dask scheduler {self._scheduler} has no worker: start one with "
+                    f"dask worker {self._scheduler} --nthreads 1"
                 ) from error
             self._watch_workers()
             self.workers = len(self._last_seen())
@@ -332,19 +341,21 @@ class Episodes:
             f"{RECONNECT_S:.0f} s at most"
         )
         began = noted = time.monotonic()
+        unmanned: float | None = None  # since when a scheduler has answered that has no worker
         while True:
             with suppress(Exception):  # what is left of a broken connection
                 self._disconnect()
             self._stack = ExitStack()
             try:
                 self._connect()
-            except (RunError, OSError, TimeoutError):
+            except (RunError, OSError, TimeoutError) as error:
                 now = time.monotonic()
-                if now > began + RECONNECT_S:
+                unmanned = (unmanned or now) if isinstance(error, NoWorkerError) else None
+                if now > began + RECONNECT_S or (unmanned is not None and now > unmanned + NO_WORKER_S):
                     raise
                 if now > noted + NOTE_S:
                     noted = now
-                    self._note(f"waiting for the Dask scheduler {self._where} for {now - began:.0f} s")
+                    self._note(f"waiting for {now - began:.0f} s: {error}")
                 time.sleep(1.0)
             else:
                 return

@@ -15,6 +15,7 @@ import msgspec
 from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there
 from caviar_clients.datasets.episode import EpisodeTask, play_episode, work_folder
 from caviar_clients.datasets.remote import RemoteDataset, is_address
+from caviar_clients.datasets.texts import bytes_text
 from caviar_protocol.errors import RunError
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
@@ -187,8 +188,8 @@ def check_disk(folder: Path, needed: int) -> int:
     free = shutil.disk_usage(folder).free
     if needed * SPARE > free:
         raise RunError(
-            f"the disk of {folder} is too small: {needed * SPARE / 1e6:,.0f} MB are needed, "
-            f"{free / 1e6:,.0f} MB are free; free some, give another --out or "
+            f"the disk of {folder} is too small: {bytes_text(needed * SPARE)} are needed, "
+            f"{bytes_text(free)} are free; free some, give another --out or "
             "fewer --episodes, or record less (record below [run])"
         )
     return free

@@ -248,7 +248,15 @@ class Dataset:
     def _opened(self, number: int) -> Recording:
         if self._remote is not None:
             self._remote.fetch_episode(number, self.directory)
-        return Recording(self.directory.episode(number))
+        folder, there = self.directory.episode(number), self.directory.size_of(number)
+        # H of one dataset and labels of another would look like a result.
+        _, rows = self._catalogue.query("SELECT bytes FROM episodes WHERE episode = ?", (number,))
+        if rows and there and there != (listed := rows[0][0]):
+            raise RecordingError(
+                f"{folder} is not the recording that the catalogue lists, which has {listed:,} B; it has "
+                f"{there:,} B. Remove the folder, and the generate command plays the episode again"
+            )
+        return Recording(folder)
 
 
 def check_level(location: str | Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import operator
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import ClassVar, NoReturn, TypeVar
 
@@ -19,8 +19,8 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario.rules import BEAM
 from caviar_protocol.space.scene import Pair, pairs_of
-from caviar_protocol.topics import Action, AntennaDevice, BeamChoice, Carrier, Scene
-from caviar_protocol.topics.link import Command
+from caviar_protocol.topics import Action, AntennaDevice, BeamChoice, Carrier, Scene, UserSchedule
+from caviar_protocol.topics.link import Command, SignalCommand
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
 
 # What actuators other than beams begin with; a name without any of these is that of a receiver.
@@ -125,10 +125,23 @@ class Agent(Service[S]):
         pairs = [pair for pair in pairs_of(scene) if self.serves(pair.rx.name)]
         author = f"{type(self).__name__}.choose"
         choices = checked_choices(author, self.choose(frame, scene, pairs), pairs, self.run.carriers)
-        commands = (*choices, *self.other_commands(frame, scene))
+        commands = (*choices, *self._declared(self.other_commands(frame, scene)))
         # One that flies alone has no beams to miss users for.
         counts = {WITHOUT_USERS: 1} if self._owned and not pairs else {}
         return StepResult(products={"action": Action(commands=commands)}, counts=counts)
+
+    def _declared(self, commands: Iterable[Command]) -> Iterator[Command]:
+        """Refuse commands for actuators that are not declared: the broker would not see a second owner."""
+        own = self.other_actuators()
+        for command in commands:
+            actuator = actuator_of(command)
+            if actuator not in own:
+                raise PayloadError(
+                    f"{type(self).__name__}.other_commands returned {type(command).__name__} for "
+                    f"{actuator!r}, which {type(self).__name__}.other_actuators does not name: it returned "
+                    f"{', '.join(map(repr, own)) or 'nothing'}"
+                )
+            yield command
 
     def serves(self, rx: str) -> bool:
         """Whether this agent serves a receiver.
@@ -152,6 +165,27 @@ class Agent(Service[S]):
             device's array − 1. A pair without one is not served; a choice without a carrier holds for all
             carriers. `checked_choices` refuses anything else.
         """
+
+
+def actuator_of(command: Command) -> str:
+    """Name the actuator of a command.
+
+    Args:
+        command: Of an agent.
+
+    Example:
+        >>> from caviar_protocol.topics import VelocityCommand
+        >>> actuator_of(VelocityCommand(object="uav", velocity=(1.0, 0.0, 0.0)))
+        'motion:uav'
+    """
+    match command:
+        case BeamChoice():
+            return f"{BEAM}{command.rx}"
+        case UserSchedule():
+            return f"schedule:{command.tx}"
+        case SignalCommand():
+            return f"signal:{command.signal}"
+    return f"motion:{command.object}"
 
 
 def _receivers(patterns: Iterable[str]) -> tuple[str, ...]:

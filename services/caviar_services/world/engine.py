@@ -154,7 +154,7 @@ class Engine(ABC):
         """
         self._world.offer_scenery(meshes, materials)
 
-    def run(self, endpoint: str, name: str) -> int:
+    def run(self, endpoint: str = "", name: str = "") -> int:
         """Take part in a run until it is over; keys are those of the environment (``CAVIAR_KEY``).
 
         Args:
@@ -162,15 +162,23 @@ class Engine(ABC):
             name: Of this world in the scenario.
 
         Returns:
-            The exit status of the process: 0 after SHUTDOWN, 143 after SIGTERM, 1 after an error, which is
-            written to standard error.
+            The exit status of the process: 0 after a run that came to its end or was stopped, 143 after
+            SIGTERM, 2 without arguments, 1 after anything else. Why is written to standard error.
         """
-        from caviar_services.runner import Runner, SignalTermination
+        from caviar_services.runner import Runner, SignalTermination, restart_status
 
+        if not endpoint or not name:
+            sys.stderr.write(f"usage: python {sys.argv[0]} tcp://HOST:PORT NAME\n")
+            return 2
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
+        _log.info("%s: waiting for the broker at %s", name, endpoint)
         try:
             cls = EngineWorld.of(self)
-            return Runner(name, cls, type(self).__name__, endpoint, termination=SignalTermination()).run()
+            runner = Runner(name, cls, type(self).__name__, endpoint, termination=SignalTermination())
+            status = runner.run()
+            if runner.ended:
+                _log.info("%s: the run is over: %s", name, runner.ended)
+            return restart_status(status, runner.ended) if status == 0 else status
         except CaviarError as error:
             sys.stderr.write(f"{name}: {error}\n")
             return 1

@@ -15,7 +15,7 @@ from typing import Any
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.remote import RemoteDataset, located
+from caviar_clients.datasets.remote import RemoteDataset, is_address, located
 from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.verification.catalogue_checks import (
     against_recording,
@@ -149,5 +149,7 @@ def whole_recording(folder: Path) -> Recording:
 def _damaged(number: int, said: str, folder: str) -> Finding:
     """A recording that cannot be used, and what to do about it."""
     name = DatasetDirectory(Path()).episode(number).name
-    way_out = f"remove {folder}/{name}, and the generate command plays the episode again"
+    way_out = "the generate command plays the episode again"
+    if is_address(folder) or (Path(folder) / name).exists():
+        way_out = f"remove {folder}/{name}, and {way_out}"
     return Finding(number, None, "", "recording", "a whole recording", f"{said}; {way_out}")

@@ -50,6 +50,7 @@ var _state = OVER
 var _grants = []
 var _answers = {}
 var _fault = ""
+var _faulted = false
 var _epoch = 0
 var _attempt = 0
 var _deadline = 0
@@ -160,6 +161,7 @@ func connect_to(url, world_name, token = ""):
 	_token = token
 	name = world_name
 	exit_status = 0
+	_faulted = false
 	_epoch = 0
 	_join(patience_ms)
 
@@ -270,7 +272,7 @@ func _leave(status, reason):
 
 func _end(status, reason):
 	_state = OVER
-	exit_status = status
+	exit_status = 1 if status == 0 and _faulted else status
 	end_reason = reason
 	printerr("%s: %s" % [name, reason])
 
@@ -532,6 +534,7 @@ func _decode(grant, parts):
 
 
 func _fault_frame(number, phase, culprit):
+	_faulted = true
 	printerr("%s: %s: %s" % [name, phase, _fault])
 	var fields = {"episode": episode, "frame": number, "phase": phase, "message": _fault, "culprit": culprit}
 	return _frame("FAULT", _mine(fields))

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import msgspec
 
@@ -45,6 +45,12 @@ NOISES = 5
 """Numbers of unit variance that a step of `Gusts` takes."""
 
 
+WindSpeed: TypeAlias = Annotated[
+    float, quantity("m/s", "velocity along an axis; no gust on Earth was faster", ge=-150, le=150)
+]
+"""The strongest gust that was measured had 113 m/s (WMO, Barrow Island 1996)."""
+
+
 class Wind(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The air that a quadrotor flies in.
 
@@ -53,7 +59,7 @@ class Wind(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         5.0
     """
 
-    velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity_m_s: tuple[WindSpeed, WindSpeed, WindSpeed] = (0.0, 0.0, 0.0)
     """Mean velocity of the air in world axes: where the wind blows to."""
     gusts: Literal["none", "dryden"] = "none"
     """``dryden``: gusts after MIL-F-8785C at low altitude, drawn by seed."""
