@@ -101,6 +101,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
             "fig8-worst-seed": "worst seed",
         },
     ),
+    "engine-worlds": Measurement(
+        "python tests/bench/bench_engine_worlds.py --rounds 1 --markdown {out}/engines.md",
+        "python tests/bench/bench_engine_worlds.py --markdown {out}/engines.md",
+        "engines.md",
+        {"engine-worlds": ""},
+    ),
     "follow": Measurement(
         f"{_FOLLOW} --frames 60 --markdown {{out}}/follow.md",
         f"{_FOLLOW} --markdown {{out}}/follow.md",
@@ -120,8 +126,8 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         {"tradeoff-keyframes": "keyframes"},
     ),
     "panda3d": Measurement(
-        "python tests/bench/bench_panda3d.py --frames 60 --markdown {out}/panda3d.md",
-        "python tests/bench/bench_panda3d.py --munich --markdown {out}/panda3d.md",
+        "python tests/bench/bench_panda3d.py --frames 60 --wall --markdown {out}/panda3d.md",
+        "python tests/bench/bench_panda3d.py --wall --markdown {out}/panda3d.md",
         "panda3d.md",
         {"panda3d-frames": ""},
     ),
