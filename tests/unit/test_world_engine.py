@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.errors import AssetError
+from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -115,6 +115,34 @@ def test_a_mesh_that_comes_later_is_announced_once_and_is_a_box_where_the_run_ta
     closed = stepped(world(Yard(crate), max_faces=0), 0)
     assert closed.meshes is None
     assert scene(closed).assets == ("objects/car.ply", "")
+
+
+@pytest.mark.parametrize(
+    ("objects", "said"),
+    [
+        (None, r"Odd\.step returned None; return a list of ObjectState"),
+        ("car", r"Odd\.step returned 'c' among its objects"),
+        ([ObjectState("car\n", "car", STILL, LEVEL, STILL, SIZE)], r"named 'car\\n'"),
+    ],
+)
+def test_what_a_step_returns_is_named_where_it_is_no_object(objects: object, said: str) -> None:
+    class Odd(Yard):
+        def step(self, t: float, previous: float, commands: object) -> Any:
+            return objects
+
+    with pytest.raises(PayloadError, match=said):
+        stepped(world(Odd()), 0)
+
+
+def test_a_state_that_is_no_bytes_is_refused() -> None:
+    class Odd(Yard):
+        def save(self) -> Any:
+            return "here"
+
+    made = world(Odd())
+    stepped(made, 0)
+    with pytest.raises(PayloadError, match=r"Odd\.save returned str, and a state is bytes"):
+        made.checkpoint()
 
 
 def test_wrong_meshes_while_the_run_goes_on_are_named_once_and_leave_boxes(

@@ -321,6 +321,11 @@ class World(Service[W]):
         if len(set(names)) < len(names):
             twice = next(name for name, following in pairwise(names) if name == following)
             raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
+        # They stand in tables, logs and file names.
+        if odd := next((name for name in names if not name.isprintable()), None):
+            raise PayloadError(
+                f"world {self.run.name!r} has an object named {odd!r}; leave out the control characters"
+            )
         meshes = set(self.mesh_classes())
         assets = tuple(
             # A run may take no meshes that come while it goes on: their objects then are as if without.

@@ -264,12 +264,22 @@ class EngineWorld(World[WorldSettings]):
         """The engine's objects."""
         before, self._elapsed_ns = self._elapsed_ns, elapsed_ns
         previous_ns = elapsed_ns if before < 0 else before
-        return self._engine.step(elapsed_ns / 1e9, previous_ns / 1e9, self._commands)
+        objects = self._engine.step(elapsed_ns / 1e9, previous_ns / 1e9, self._commands)
+        author = f"{type(self._engine).__name__}.step"
+        if not isinstance(objects, Iterable):
+            raise PayloadError(f"{author} returned {objects!r}; return a list of ObjectState, or yield them")
+        for item in objects:
+            if not isinstance(item, ObjectState):
+                raise PayloadError(f"{author} returned {item!r} among its objects; write ObjectState(…)")
+            yield item
 
     def checkpoint(self) -> bytes:
         """The state of the engine, and which of its objects came first."""
-        own = _State(elapsed_ns=self._elapsed_ns, arrived=self._mounts.arrived, own=self._engine.save())
-        return saved(self, 1, own)
+        state = self._engine.save()
+        if not isinstance(state, bytes):
+            author = f"{type(self._engine).__name__}.save"
+            raise PayloadError(f"{author} returned {type(state).__name__}, and a state is bytes")
+        return saved(self, 1, _State(self._elapsed_ns, self._mounts.arrived, state))
 
     def restore(self, state: bytes) -> None:
         """See `checkpoint`."""
