@@ -183,6 +183,8 @@ def _estimate(
 ) -> None:
     plan = ledger.plan
     tried = [left[len(left) * quarter // 4] for quarter in (1, 2, 3)]
+    workers = counted(episodes.workers, "process", "processes")
+    observer.note(f"{workers} started, which try three scenes for an estimate")
     cached = {name: data for number in tried for name, data in traffic.states_of(number).items()}
     trials = episodes.run_on_each(try_worker, plan.scenario, ledger.place, tried, cached)
     good = [trial for trial in trials if trial.scenes]
