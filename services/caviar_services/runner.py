@@ -108,6 +108,11 @@ class Runner:
         self._rejoin_s = 0.0  # for how long the broker waits for this service that lost its connections [s]
         self._session = self._new_session()
 
+    @property
+    def failed(self) -> bool:
+        """Whether the service failed itself, and said so with a FAULT."""
+        return self._session.failed
+
     def run(self) -> int:
         """Serve until SHUTDOWN.
 

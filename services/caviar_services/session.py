@@ -122,6 +122,8 @@ class ServiceSession:
         self._found: dict[str, Path] = {}  # the service's own files, by digest
         # When free memory is given back next [s].
         self._trim_at = 0.0
+        self.failed = False
+        """Whether the service failed, and said so with a FAULT."""
         self._files = AssetFetcher(store, send, fetch_timeout_s)
         self._scenery = AssetFetcher(store, send, fetch_timeout_s, self._note_fetching)
         self._followed = FollowedMeshes(store, self._files, lambda: self.running, self._loaded_meshes)
@@ -448,6 +450,7 @@ class ServiceSession:
             answer: Answer = self._done(grant, result, step_ns)
             self._send(*answer)
         except Exception as error:
+            self.failed = True
             answer = fault_from(error, self._identity, phase, grant.episode, grant.frame), ()
             self._send(*answer)
         return answer
@@ -540,6 +543,7 @@ class ServiceSession:
             episode: In which it came.
             frame: In which it came; −1: in none.
         """
+        self.failed = True
         self._send(fault_from(error, self._identity, phase, episode, frame), ())
 
     def _unexpected(self, message: m.Message, why: str) -> None:

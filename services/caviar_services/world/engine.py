@@ -162,10 +162,10 @@ class Engine(ABC):
             name: Of this world in the scenario.
 
         Returns:
-            The exit status of the process: 0 after a run that came to its end or was stopped, 143 after
-            SIGTERM, 2 without arguments, 1 after anything else. Why is written to standard error.
+            The exit status of the process: 0 after SHUTDOWN, 1 where this world failed or was refused, 143
+            after SIGTERM, 2 without arguments. Why is written to standard error.
         """
-        from caviar_services.runner import Runner, SignalTermination, restart_status
+        from caviar_services.runner import Runner, SignalTermination
 
         if not endpoint or not name:
             sys.stderr.write(f"usage: python {sys.argv[0]} tcp://HOST:PORT NAME\n")
@@ -176,12 +176,12 @@ class Engine(ABC):
             cls = EngineWorld.of(self)
             runner = Runner(name, cls, type(self).__name__, endpoint, termination=SignalTermination())
             status = runner.run()
-            if runner.ended:
-                _log.info("%s: the run is over: %s", name, runner.ended)
-            return restart_status(status, runner.ended) if status == 0 else status
         except CaviarError as error:
             sys.stderr.write(f"{name}: {error}\n")
             return 1
+        if runner.ended:
+            _log.info("%s: the run is over: %s", name, runner.ended)
+        return 1 if status == 0 and runner.failed else status
 
 
 class _State(msgspec.Struct, frozen=True, array_like=True):
