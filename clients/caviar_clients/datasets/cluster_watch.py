@@ -19,7 +19,7 @@ TOPIC = "caviar-waiting"
 LOOK_S = 5.0
 """[s] without a result after which the scheduler is asked for its workers, and between two such questions."""
 NOTE_S = 30.0
-"""[s] without a result after which the user is told what is waited for, and between two such notes."""
+"""[s] without a result after which a note says what is waited for, and between two such notes."""
 SILENT_S = 30.0
 """[s] without a sign of life after which a worker is named."""
 NO_WORKER_S = 60.0
@@ -82,11 +82,11 @@ class Stall:
     text: str
     """Service, frame and line of code."""
     stands_s: float
-    """For how long, when it was told [s]."""
+    """For how long, when the worker reported it [s]."""
     worker: str
     """Address of the process."""
-    told: float
-    """When, of the clock of `ClusterWatch`."""
+    reported: float
+    """When the worker reported it, of the clock of `ClusterWatch`."""
 
     @property
     def error(self) -> str:
@@ -131,7 +131,7 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
     present: frozenset[str] = frozenset()
     """Addresses of the workers, when they were looked at; empty where they were not since the last result."""
     # Written by a thread of Dask, one item at a time.
-    _told: dict[int, Stall] = field(default_factory=dict)
+    _stalls: dict[int, Stall] = field(default_factory=dict)
 
     def progressed(self, now: float) -> None:
         """A result came, or the wait begins.
@@ -149,7 +149,7 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         """
         match event[1]:
             case {"episode": int(episode), "text": str(text), "stands_s": float(s), "worker": str(worker)}:
-                self._told[episode] = Stall(text, s, worker, self.clock())
+                self._stalls[episode] = Stall(text, s, worker, self.clock())
             case _:  # of another version of CAVIAR at a worker: it tells nothing that could be used
                 pass
 
@@ -162,7 +162,7 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
             now: Time [s].
             what: Is waited for: ``no episode has ended``.
             episodes: That are at the workers; None: what any of them tells is looked at.
-            mean_s: Time of an episode so far [s]: waits of up to twice as long are not told, if nothing is
+            mean_s: Time of an episode so far [s]: waits of up to twice as long get no note, if nothing is
                 strange.
 
         Returns:
@@ -181,15 +181,15 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
             address: old if (old := self._seen.get(address)) and old[0] == stamp else (stamp, now)
             for address, stamp in seen.items()
         }
-        told = {n: stall for n, stall in self._told.copy().items() if episodes is None or n in episodes}
-        strange = [*self._without_workers(now), *self._silent(now), *_standing(now, told)]
+        stalls = {n: stall for n, stall in self._stalls.copy().items() if episodes is None or n in episodes}
+        strange = [*self._without_workers(now), *self._silent(now), *_standing(now, stalls)]
         waited_s = now - self._progressed
         is_due = now - max(self._progressed, self._noted) >= NOTE_S
         if is_due and (strange or waited_s >= 2.0 * mean_s):
             self._noted = now
             at_workers = "" if episodes is None else f": {_at_workers(episodes)}"
             self.note("; ".join([f"{what} for {waited_s:.0f} s{at_workers}", *strange]))
-        return {n: self._told.pop(n) for n, stall in told.items() if stall.stands_s >= STALLED_S}
+        return {n: self._stalls.pop(n) for n, stall in stalls.items() if stall.stands_s >= STALLED_S}
 
     def _without_workers(self, now: float) -> list[str]:
         if self._seen:
@@ -214,12 +214,12 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         return [f"{len(silent)} of {len(self._seen)} workers give no sign of life: {named}{_more(silent)}"]
 
 
-def _standing(now: float, told: Mapping[int, Stall]) -> list[str]:
-    # A step that goes on is told again when its time has doubled: what is older has ended.
+def _standing(now: float, stalls: Mapping[int, Stall]) -> list[str]:
+    # A step that goes on is reported again when its time has doubled: what is older has ended.
     standing = [
         f"episode {number}: {stall.text}"
-        for number, stall in sorted(told.items())
-        if now - stall.told <= stall.stands_s + 2.0 * LOOK_S
+        for number, stall in sorted(stalls.items())
+        if now - stall.reported <= stall.stands_s + 2.0 * LOOK_S
     ]
     return standing[:SHOWN]
 

@@ -77,7 +77,7 @@ class EpisodeResult:
 
 @contextmanager
 def _quiet_services() -> Iterator[None]:
-    """What fails is told in the result, with episode and cause."""
+    """Silence the services' logger: the result has what fails, with episode and cause."""
     logger = logging.getLogger("caviar.service")
     before = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -91,7 +91,7 @@ def _quiet_services() -> Iterator[None]:
 def play_episode(task: EpisodeTask) -> EpisodeResult:
     """Play an episode, and put its recording into place.
 
-    Whatever fails is told in the result: an episode that fails is no reason to lose others.
+    The result has whatever fails: an episode that fails is no reason to lose others.
 
     Args:
         task: The episode.
