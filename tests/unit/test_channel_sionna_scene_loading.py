@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.scene_loading import Shape, counting_centre
+from caviar_protocol.errors import AssetError
+from caviar_services.channel.sionna.scene_loading import Shape, counting_centre, file_vertices
+from caviar_services.mesh.scenery import RadioMaterial, scenery_files
 from caviar_services.mesh.shapes import Mesh, box
 
 
@@ -47,3 +51,12 @@ def test_a_city_is_counted_from_its_middle_without_a_word() -> None:
     assert not warning
     assert abs(centre[0] - (300.0 + 9.1e4) / 2) <= 64.0
     assert counting_centre([])[1] == ""
+
+
+def test_a_shape_named_like_a_material_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    files = scenery_files("scene", {"ground": (YARD, "ground")}, {"ground": RadioMaterial("concrete")})
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(AssetError, match=r"the name of a material.*such as 'ground-shape'"):
+        file_vertices(tmp_path / "scenery/scene.xml")

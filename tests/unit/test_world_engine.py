@@ -173,14 +173,18 @@ def test_wrong_meshes_while_the_run_goes_on_are_named_once_and_leave_boxes(
 
 @pytest.mark.parametrize(
     ("material", "says"),
-    [("walls", "has no material 'stone'"), ("wall", "there is no material 'wall'; did you mean 'walls'")],
+    [
+        ("walls", "has no material 'stone'"),
+        ("wall", "there is no material 'wall'; did you mean 'walls'"),
+        ("none", "there is no material 'none'; give {'none': RadioMaterial"),
+    ],
 )
 def test_wrong_scenery_is_refused_by_name(material: str, says: str) -> None:
     class House(Yard):
         def prepare(self) -> None:
             kind = "stone" if material == "walls" else "brick"
             house = SceneryMesh("house", BOX.vertices, BOX.faces, material)
-            self.offer_scenery([house], {"walls": RadioMaterial(kind)})
+            self.offer_scenery([house], {} if material == "none" else {"walls": RadioMaterial(kind)})
 
     with pytest.raises(AssetError, match=says):
         world(House())

@@ -127,7 +127,8 @@ def scenery_files(
         lines.append("  </bsdf>")
     for shape, (_, key) in shapes.items():
         if key not in materials:
-            raise AssetError(f"shape {shape!r}: there is no material {key!r}; {suggestion(key, materials)}")
+            remedy = suggestion(key, materials) if materials else f'give {{{key!r}: RadioMaterial("concrete")}}'
+            raise AssetError(f"shape {shape!r}: there is no material {key!r}; {remedy}")
         lines += [
             f'  <shape type="ply" id={quoteattr(f"mesh-{shape}")}>',
             f'    <string name="filename" value={quoteattr(f"meshes/{shape}.ply")}/>',

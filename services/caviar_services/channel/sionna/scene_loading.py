@@ -58,8 +58,16 @@ def file_vertices(description: Path) -> dict[str, Float64Array]:
         AssetError: Names what is wrong with the description, a material or a mesh.
     """
     vertices = {}
-    for shape in read_scenery(description, asset_name(description)).shapes:
+    shapes = read_scenery(description, asset_name(description)).shapes
+    # As Sionna RT names them: shapes and materials share one space of names there.
+    materials = {shape.material.removeprefix("mat-") for shape in shapes}
+    for shape in shapes:
         _check_material(shape)
+        if shape.name in materials:
+            raise AssetError(
+                f"{shape.place} has the name of a material, by which the ray tracer cannot tell the two "
+                f"apart; call it something else, such as '{shape.name}-shape'"
+            )
         turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
         # Faces are read to be checked: of one that names a vertex that is not there the ray tracer dies.
         found, _ = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
