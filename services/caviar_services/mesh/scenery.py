@@ -127,7 +127,8 @@ def scenery_files(
         lines.append("  </bsdf>")
     for shape, (_, key) in shapes.items():
         if key not in materials:
-            remedy = suggestion(key, materials) if materials else f'give {{{key!r}: RadioMaterial("concrete")}}'
+            example = f'give {{{key!r}: RadioMaterial("concrete")}}'
+            remedy = suggestion(key, materials) if materials else example
             raise AssetError(f"shape {shape!r}: there is no material {key!r}; {remedy}")
         lines += [
             f'  <shape type="ply" id={quoteattr(f"mesh-{shape}")}>',
