@@ -385,7 +385,8 @@ def test_killed_and_started_again_it_goes_on_with_the_same_digest(world: Path, t
     # Each service is a process that starts: the world, whose UAV has state, needs none of the others.
     scenario, digests = free_space(tmp_path, "lidar", "link", "agent"), []
     for folder in ("undisturbed", "killed"):
-        with waiting_run(scenario, tmp_path / folder, "--frames", "80") as run:
+        # As fast as it goes, 80 frames are over before the kill.
+        with waiting_run(scenario, tmp_path / folder, "--frames", "80", "--pace", "4") as run:
             if folder == "killed":
                 with run.world(world) as first:
                     wait_for_frames(run)
