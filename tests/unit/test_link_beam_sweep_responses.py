@@ -61,10 +61,16 @@ def test_where_paths_do_not_say_it_the_grid_is_asked_for(street: tuple[Scene, Us
     scene, users, channel = street
     beams = [(3, 1)] * len(users)
     near = msgspec.structs.replace(channel, rung="spherical")
-    for y, expected in zip(
-        beam_responses(near, scene, users, beams), beam_responses(channel, scene, users, beams), strict=True
+    grid = {(r.carrier, r.tx, r.rx): r.h for r in channel.hf}
+    for place, y, expected in zip(
+        users.channel_indices(channel),
+        beam_responses(near, scene, users, beams),
+        beam_responses(channel, scene, users, beams),
+        strict=True,
     ):
-        assert np.abs(y - expected).max() <= 1e-5 * np.abs(expected).max()
+        # The grid is in single precision: a beam that misses is a small difference of its large numbers.
+        assert place is not None
+        assert np.abs(y - expected).max() <= 1e-6 * np.abs(grid[place]).max()
     with pytest.raises(PayloadError, match=r"rung 'spherical' does not follow from paths; ask for part 'hf'"):
         beam_responses(msgspec.structs.replace(near, hf=()), scene, users, beams)
 
