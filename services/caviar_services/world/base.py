@@ -20,6 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
+from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
@@ -64,7 +65,9 @@ class ObjectState(NamedTuple):
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that all worlds share."""
 
-    prefix: Annotated[str | None, quantity("1", "what the names of its objects begin with")] = None
+    prefix: (
+        Annotated[str, quantity("1", "what the names of its objects begin with", pattern=PRINTABLE)] | None
+    ) = None
     """Unset: the world chooses. No two worlds of a run may share a prefix."""
     scenery: str = ""
     """Static geometry that this world brings: ``sionna:munich`` (a scene that comes with
