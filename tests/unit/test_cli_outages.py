@@ -57,6 +57,22 @@ def test_paths_that_were_dropped_are_warned_of() -> None:
     assert ReportTally().warnings() == []
 
 
+def test_exits_and_commands_outside_of_a_geofence_and_refused_meshes_are_warned_of() -> None:
+    seen = ReportTally()
+    counts = {"left-geofence/uav": 1, "commanded-outside-geofence/uav": 1}
+    for number in (7, 8):
+        seen.add(2, [Report(source="world", counts=counts)], number)
+    seen.add(2, [Report(source="world", counts={"mesh-refused/crate": 1})], 9)
+    commanded, *others = seen.warnings()
+    assert commanded.endswith(
+        " outside of its geofence in 2 frames, first in frame 7 of episode 2, and kept within"
+    )
+    assert others == [
+        "'uav' of world left its geofence 2 times, first in frame 7 of episode 2",
+        "mesh 'crate' of world was refused in frame 9 of episode 2; its objects were boxes",
+    ]
+
+
 def test_people_who_are_shown_elsewhere_at_once_are_warned_of() -> None:
     """Jumps that a body walked are counted in the reports, and need no warning."""
     moved = ReportTally()
