@@ -29,6 +29,7 @@ from caviar_services.mesh.scenery import RadioMaterial, scenery_files
 from caviar_services.mesh.shapes import Mesh, fitted, ply
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
+from caviar_services.world.returned import series_of
 
 _log = logging.getLogger("caviar.service")
 
@@ -229,7 +230,11 @@ class EngineWorld(World[WorldSettings]):
 
     def prefixes(self) -> tuple[str, ...]:
         """Those of the engine."""
-        return tuple(self._engine.prefixes)
+        prefixes = self._engine.prefixes
+        if isinstance(prefixes, str):
+            author = f"{type(self._engine).__name__}.prefixes"
+            raise PayloadError(f"{author} is {prefixes!r}; write ({prefixes!r},)")
+        return tuple(prefixes)
 
     def mesh_classes(self) -> tuple[str, ...]:
         """None: an engine has meshes of its own."""
@@ -265,13 +270,7 @@ class EngineWorld(World[WorldSettings]):
         before, self._elapsed_ns = self._elapsed_ns, elapsed_ns
         previous_ns = elapsed_ns if before < 0 else before
         objects = self._engine.step(elapsed_ns / 1e9, previous_ns / 1e9, self._commands)
-        author = f"{type(self._engine).__name__}.step"
-        if not isinstance(objects, Iterable):
-            raise PayloadError(f"{author} returned {objects!r}; return a list of ObjectState, or yield them")
-        for item in objects:
-            if not isinstance(item, ObjectState):
-                raise PayloadError(f"{author} returned {item!r} among its objects; write ObjectState(…)")
-            yield item
+        return series_of(ObjectState, f"{type(self._engine).__name__}.step", objects)
 
     def checkpoint(self) -> bytes:
         """The state of the engine, and which of its objects came first."""
