@@ -176,6 +176,7 @@ def test_wrong_meshes_while_the_run_goes_on_are_named_once_and_leave_boxes(
     assert (scene(results[0]).dimensions > 0).all()
     assert scene(results[0]).dimensions[1].tolist() == [3.0, 3.0, 3.0]
     assert all(not result.meshes for result in results)
+    assert [dict(result.counts) for result in results] == [{f"mesh-refused/{name}": 1 for name in wrong}, {}]
     assert len(caplog.messages) == len(wrong)
     for message, (name, (_, _, why)) in zip(caplog.messages, wrong.items(), strict=True):
         assert message.startswith(f"mesh {name!r}: ")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -41,6 +41,8 @@ _NEVER: Mapping[str, str] = {
     "receivers",
     WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
 }
+SHOWN_ALIKE = 8
+"""Warnings of one source that differ in a name alone."""
 # What a count means in whatever frames have it, likewise.
 _EVER: Mapping[str, str] = {
     "dropped": "{source} dropped {paths} with values that are not finite, in {frames}: what its model "
@@ -244,23 +246,11 @@ class ReportTally:
         """Warn of what the user probably did not mean: a policy that an agent refused, an agent without users
         in any frame, a device without an object, paths that were dropped for values that are not finite, an
         object outside of its geofence, a mesh that was refused, a key without effect."""
-        never, ever, unmatched = [], [], []
+        never, unmatched = [], []
         for (source, name), frames in sorted(self._frames_with.items()):
             never_prefix = next(filter(name.startswith, _NEVER), "")
             if never_prefix and frames == self._frames:
                 never.append(_NEVER[never_prefix].format(source=source, rest=name.removeprefix(never_prefix)))
-            elif prefix := next((p for p in _EVER if name == p or (p[-1] == "/" and name.startswith(p))), ""):
-                episode, number = self._first[source, name]
-                ever.append(
-                    _EVER[prefix].format(
-                        source=source,
-                        rest=name.removeprefix(prefix),
-                        paths=counted(self._sums[source, name], "path"),
-                        times=counted(self._sums[source, name], "time"),
-                        frames=counted(frames, "frame"),
-                        first=f"frame {number} of episode {episode}",
-                    )
-                )
             # A channel that joined late has reported of fewer frames than there are.
             elif name.startswith(UNMATCHED_PREFIX) and frames == self._reported[source]:
                 unmatched.append(
@@ -272,7 +262,27 @@ class ReportTally:
             f"{value.partition(' ')[2]}"
             for source, value in self._refused
         ]
-        return [*refused, *never, *ever, *unmatched]
+        return [*refused, *never, *self._ever(), *unmatched]
+
+    def _ever(self) -> Iterator[str]:
+        """Say what was counted that a run had better be without; of one kind and source a few."""
+        alike = Counter[tuple[str, str]]()
+        for (source, name), frames in sorted(self._frames_with.items()):
+            kind = next((p for p in _EVER if name == p or (p[-1] == "/" and name.startswith(p))), "")
+            alike[source, kind] += 1
+            if kind and alike[source, kind] <= SHOWN_ALIKE:
+                episode, number = self._first[source, name]
+                yield _EVER[kind].format(
+                    source=source,
+                    rest=name.removeprefix(kind),
+                    paths=counted(self._sums[source, name], "path"),
+                    times=counted(self._sums[source, name], "time"),
+                    frames=counted(frames, "frame"),
+                    first=f"frame {number} of episode {episode}",
+                )
+        for (source, kind), count in alike.items():
+            if kind and count > SHOWN_ALIKE:
+                yield f"{source}: {count - SHOWN_ALIKE} more counts of {kind.rstrip('/')!r}"
 
 
 class PacketTotals:

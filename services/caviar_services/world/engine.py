@@ -24,6 +24,7 @@ from caviar_protocol.messages import Input
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action
 from caviar_protocol.topics.link import Command
+from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.scenery import RadioMaterial, scenery_files
 from caviar_services.mesh.shapes import Mesh, fitted, ply
@@ -227,6 +228,8 @@ class EngineWorld(World[WorldSettings]):
         self._elapsed_ns = -1
         self._commands: list[Command] = []
         self._refusals: set[str] = set()
+        # Of these, what the report of the next frame has.
+        self._refused: dict[str, int] = {}
 
     def prefixes(self) -> tuple[str, ...]:
         """Those of the engine."""
@@ -257,13 +260,16 @@ class EngineWorld(World[WorldSettings]):
         """Reset the engine."""
         self._elapsed_ns = -1
         self._refusals.clear()
+        self._refused = {}
         self._engine.seed_episode = episode
         self._engine.reset(seed, self._t0_ns / 1e9)
 
     def step(self, frame: Frame) -> StepResult:
         """Advance the engine, with the commands of the frame before."""
         self._commands = [c for action in frame.payloads("action", Action).values() for c in action.commands]
-        return super().step(frame)
+        made = super().step(frame)
+        refused, self._refused = self._refused, {}
+        return msgspec.structs.replace(made, counts={**made.counts, **refused})
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """The engine's objects."""
@@ -299,6 +305,7 @@ class EngineWorld(World[WorldSettings]):
                 raise AssetError(problem) from error
             if problem not in self._refusals:
                 self._refusals.add(problem)
+                self._refused[f"{MESH_REFUSED_PREFIX}{name}"] = 1
                 _log.warning("%s; objects with it are boxes", problem)
             return OfferedMesh("", *_box_of(mesh))
         content = ply(unit, material)
