@@ -1,11 +1,12 @@
 """What the tilt of a UAV does to its beams: one flight, an antenna fixed to the body, a level one beside it.
 
-Scenario ``uav-wind``, on the base install; with the extra ``plot`` also a picture, ``tilted-beams.png``. Run
-as ``python examples/tilted_beams.py [--frames 300]``.
+Scenario ``uav-wind``, on the base install; with the extra ``plot`` also a picture, in the directory of the
+run or where ``--out`` says. Run as ``python examples/tilted_beams.py [--frames 300] [--out tilt.png]``.
 """
 
 import argparse
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from caviar_protocol.space.coordinates import euler_from_quaternion
 
 parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
 parser.add_argument("--frames", type=int, default=300)
+parser.add_argument("--out", type=Path, help="the picture; default: tilted-beams.png in the run's directory")
 args = parser.parse_args()
 
 run = caviar.open(caviar.run("uav-wind", frames=args.frames))
@@ -55,4 +57,6 @@ if importlib.util.find_spec("matplotlib") is not None:
     below.set_ylabel("|y| [dB]")
     below.set_xlabel("time [s]")
     below.legend(loc="lower right")
-    figure.savefig("tilted-beams.png", dpi=110)
+    picture = args.out or run.directory / "tilted-beams.png"
+    figure.savefig(picture, dpi=110)
+    print(f"picture: {picture}")

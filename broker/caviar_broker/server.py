@@ -32,7 +32,7 @@ from caviar_broker.supervision import CHECK_NS, Watchdog
 from caviar_protocol import messages as m
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import check_parts, decode_message, encode_message
-from caviar_protocol.errors import ProtocolError
+from caviar_protocol.errors import ProtocolError, one_line
 from caviar_protocol.files import Durability, file_system_of
 from caviar_protocol.host import SignOfLife
 
@@ -413,7 +413,7 @@ class BrokerServer:
 
     def note(self, service: str, text: str, kind: str = "note") -> None:
         """Tell the observer something about a service, or in general."""
-        self._observer.notice(ev.Notice(kind, service, text, self.clock.episode))
+        self._observer.notice(ev.Notice(kind, service, one_line(text), self.clock.episode))
 
 
 def _payload_size(payload: Sequence[zmq.Frame]) -> int:

@@ -134,6 +134,19 @@ class RunError(CaviarError):
     """A run ended before its last frame. The text names the service, the frame and the phase."""
 
 
+def one_line(text: str) -> str:
+    """Write a text of several lines as one, for logs and tables of which each line is an entry.
+
+    Args:
+        text: What an exception says, perhaps one that is not ours.
+
+    Example:
+        >>> one_line("shapes differ:\\n\\tweights: 3\\r\\n\\n")
+        'shapes differ: / weights: 3'
+    """
+    return " / ".join(line.strip() for line in text.splitlines() if line.strip())
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Say which known name was probably meant, for an error.
 

@@ -45,7 +45,8 @@ MAX_SUBCARRIERS = 65536
 # --- types ------------------------------------------------------------------------------------------------
 
 # ``$`` alone would let a line feed pass at the end, which breaks a log line.
-_PRINTABLE = r"^[^\x00-\x1f\x7f]+$(?!\n)"
+PRINTABLE = r"^[^\x00-\x1f\x7f]*$(?!\n)"
+"""Pattern of names, which stand in tables, logs and file names: no control characters."""
 # Neither ``.`` nor ``..`` as a segment, so that a path never leads out of its folder.
 _SEGMENT = r"(?!\.{1,2}(?:/|$))[^/\\\x00-\x1f\x7f]+"
 
@@ -54,7 +55,7 @@ Name = Annotated[str, described("name of a service or topic that was declared", 
 
 NewName = Annotated[
     str,
-    described("declares a name, no control characters", min_length=1, max_length=128, pattern=_PRINTABLE),
+    described("declares a name, no control characters", min_length=1, max_length=128, pattern=PRINTABLE),
 ]
 AssetName = Annotated[
     str,

@@ -7,6 +7,7 @@ string. `caviar_protocol.validation` applies them to every scene that a service 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
@@ -15,6 +16,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device, turned_back
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
@@ -228,7 +230,7 @@ def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
 
 
 def wrong_order(scene: Scene) -> str:
-    """The first name of an object or device that is there twice, or not in its place."""
+    """The first name of an object or device that has control characters, occurs twice, or is out of order."""
     devices = [device.name for device in scene.devices]
     return (
         _unsorted("object", scene.names)
@@ -238,6 +240,9 @@ def wrong_order(scene: Scene) -> str:
 
 
 def _unsorted(kind: str, names: Sequence[str]) -> str:
+    for name in names:
+        if not re.search(PRINTABLE, name):
+            return f"{kind} {name!r} has control characters: leave them out"
     for name, following in pairwise(names):
         if name == following:
             return f"two {kind}s are named {name!r}"

@@ -35,6 +35,7 @@ from caviar_services.conversion import (
     granted_frame,
     is_needed,
     plain_done,
+    returned,
     run_info,
     sorted_products,
 )
@@ -42,6 +43,7 @@ from caviar_services.run_time_geometry import AnnouncedMeshes, FollowedMeshes
 from caviar_services.service import (
     Frame,
     Preparation,
+    Prepared,
     Progress,
     Service,
     StepResult,
@@ -332,15 +334,14 @@ class ServiceSession:
     def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
         files = self._store.folder_of(assets) if assets else {}
         demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
-        prepared = self.running.prepare(
-            Preparation(
-                demand=demand,
-                assets=files,
-                producers=order.producers,
-                files=self._found,
-                max_faces=order.max_faces,
-            )
+        preparation = Preparation(
+            demand=demand,
+            assets=files,
+            producers=order.producers,
+            files=self._found,
+            max_faces=order.max_faces,
         )
+        prepared = returned(Prepared, self.running.prepare(preparation), self.running, "prepare")
         self._followed.begin(assets)
         self._ready(
             m.Ready(
@@ -421,7 +422,7 @@ class ServiceSession:
         """
         phase = "step"
         try:
-            result = self.running.step(frame)
+            result = returned(StepResult, self.running.step(frame), self.running, "step")
             phase = "encode"
             sorted_products(self.use, result)  # each is of its topic's class
             phase = "release"
@@ -444,7 +445,7 @@ class ServiceSession:
             self._followed.begin_frame(grant.frame)
             frame = self._frame(reset, grant, parts)
             began = time.monotonic_ns()
-            result = self.running.step(frame)
+            result = returned(StepResult, self.running.step(frame), self.running, "step")
             step_ns = time.monotonic_ns() - began
             phase = "encode"
             answer: Answer = self._done(grant, result, step_ns)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
+import socket
 import subprocess
 import sys
 import threading
@@ -229,6 +231,24 @@ def test_a_right_client_that_speaks_websocket_fails_nothing(tmp_path: Path) -> N
     found = json.loads(file.read_text())
     assert failures([Verdict(**verdict) for verdict in found["verdicts"]]) == {}, result.output
     assert found["pass"] >= 30
+
+
+@pytest.mark.parametrize("more", [[], ["--ws"]])
+def test_a_client_that_is_given_the_address_is_judged_while_the_usual_port_is_taken(more: list[str]) -> None:
+    from typer.testing import CliRunner
+
+    wrapper = ["tests/scenarios/websocket_zmq.py"] if more else []
+    agent = python(*(ROOT / part for part in (*wrapper, "clients/minimal/agent.py")))
+    with socket.socket() as taken:
+        with contextlib.suppress(OSError):  # another program has it: as good
+            taken.bind(("127.0.0.1", 5590))
+            taken.listen()
+        words = ["conform", *more, "--name", "mine", "--case", "hello"]
+        judged = CliRunner().invoke(app, [*words, "--command", f"{agent} {{endpoint}} {{name}}"])
+        assert judged.exit_code == 0, judged.output
+        # A client that has the address in itself gets the usual one.
+        refused = CliRunner().invoke(app, [*words, "--command", str(agent)])
+        assert "5590" in f"{refused.output}{refused.exception}"
 
 
 def test_python_in_a_command_is_the_one_that_runs_where_no_environment_is_activated(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import os
 import re
 import shlex
@@ -61,6 +62,15 @@ def test_tilted_beams(tmp_path: Path) -> None:
     lost = re.search(r"without knowing the tilt: ([\d.]+) dB lost in the mean", printed)
     assert lost is not None
     assert float(lost[1]) > 5
+    if importlib.util.find_spec("matplotlib") is not None:
+        assert [file.name for file in tmp_path.iterdir()] == ["runs"]
+        picture = re.search(r"^picture: (runs/uav-wind-\S+/tilted-beams\.png)$", printed, re.MULTILINE)
+        assert picture is not None
+        assert (tmp_path / picture[1]).is_file()
+        assert "\npicture: tilt.png\n" in started(
+            tmp_path, "tilted_beams.py", "--frames", "3", "--out", "tilt.png"
+        )
+        assert (tmp_path / "tilt.png").is_file()
 
 
 def test_two_agents_deliver(tmp_path: Path) -> None:

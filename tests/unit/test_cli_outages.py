@@ -6,7 +6,7 @@ from pathlib import Path
 
 from recording_builders import frame, frame_of, link, record, scene
 
-from caviar_clients.cli.summary import ReportTally, summarise
+from caviar_clients.cli.summary import SHOWN_ALIKE, ReportTally, summarise
 from caviar_clients.cli.summary_table import SHOWN_INSIDE, outage_lines
 from caviar_protocol.messages import Report
 from caviar_protocol.recording import Recording
@@ -55,6 +55,30 @@ def test_paths_that_were_dropped_are_warned_of() -> None:
     (warning,) = dropped.warnings()
     assert warning.startswith("channel dropped 7 paths with values that are not finite, in 2 frames: ")
     assert ReportTally().warnings() == []
+
+
+def test_exits_and_commands_outside_of_a_geofence_and_refused_meshes_are_warned_of() -> None:
+    seen = ReportTally()
+    counts = {"left-geofence/uav": 1, "commanded-outside-geofence/uav": 1}
+    for number in (7, 8):
+        seen.add(2, [Report(source="world", counts=counts)], number)
+    seen.add(2, [Report(source="world", counts={"mesh-refused/crate": 1})], 9)
+    commanded, *others = seen.warnings()
+    assert commanded.endswith(
+        " outside of its geofence in 2 frames, first in frame 7 of episode 2, and kept within"
+    )
+    assert others == [
+        "'uav' of world left its geofence 2 times, first in frame 7 of episode 2",
+        "mesh 'crate' of world was refused in frame 9 of episode 2; its objects were boxes",
+    ]
+
+
+def test_warnings_that_differ_in_a_name_alone_are_a_few() -> None:
+    seen = ReportTally()
+    seen.add(0, [Report(source="world", counts={f"mesh-refused/{n:02}": 1 for n in range(SHOWN_ALIKE + 3)})])
+    warnings = seen.warnings()
+    assert len(warnings) == SHOWN_ALIKE + 1
+    assert warnings[-1] == "world: 3 more counts of 'mesh-refused'"
 
 
 def test_people_who_are_shown_elsewhere_at_once_are_warned_of() -> None:

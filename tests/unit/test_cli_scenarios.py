@@ -106,6 +106,19 @@ def test_a_run_without_its_extras_is_refused_with_one_command(monkeypatch: pytes
     scenarios.require_extras(load_scenario("smoke"))
 
 
+def test_a_quadrotor_in_mujoco_without_it_is_refused_before_there_is_a_directory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = shipped_scenarios()["uav-wind"].read_text()
+    (tmp_path / "uav.toml").write_text(text.replace("on_collision =", 'engine = "mujoco"\non_collision ='))
+    monkeypatch.setattr(shared, "has_extra", lambda extra: extra != "mujoco")
+    out = tmp_path / "runs"
+    result = runner.invoke(app, ["run", str(tmp_path / "uav.toml"), "--out", str(out)], env=ENVIRONMENT)
+    assert isinstance(result.exception, SetupError)
+    assert "pip install 'caviar-sim[mujoco]'" in str(result.exception)
+    assert not out.exists()
+
+
 def test_the_install_command_names_this_interpreter_and_an_extra_that_exists(repository: Path) -> None:
     python, *_, wanted = shlex.split(host.install_command("plot"))
     assert (python, wanted) == (sys.executable, "caviar-sim[plot]")

@@ -13,11 +13,11 @@ from caviar_protocol import messages as m
 WORDS = "scene of 'world', frame 0: object 'car': orientation (2, 0, 0, 0) has norm 2"
 
 
-def refused(culprit: str, **channel_has: Any) -> Simulation:
+def refused(culprit: str, words: str = WORDS, **channel_has: Any) -> Simulation:
     """A run in which the channel answers frame 0 with FAULT, and names this culprit."""
     services = loop(channel={"latency": 20 * MS, **channel_has})
     run = Simulation(services).join().run(lambda run: bool(run.grants("channel")))
-    fault = m.Fault(epoch=1, attempt=1, episode=0, frame=0, phase="step", message=WORDS, culprit=culprit)
+    fault = m.Fault(epoch=1, attempt=1, episode=0, frame=0, phase="step", message=words, culprit=culprit)
     run.feed(ev.FaultReceived("channel", fault))
     return run
 
@@ -38,6 +38,16 @@ def test_a_culprit_that_made_none_of_the_inputs_is_not_believed(culprit: str) ->
     run = refused(culprit).run()
     assert run.outcome.culprit == "channel"
     assert "channel 'channel' failed in frame 0, step: " in run.outcome.error
+
+
+@pytest.mark.parametrize("policy", ["wait", "hold"])
+def test_what_a_service_says_in_several_lines_is_one_in_errors_and_notices(policy: str) -> None:
+    run = refused("", "ValueError: shapes:\r\n\tweights: 3\n", policy=policy).run()
+    said = "step: ValueError: shapes: / weights: 3"
+    if policy == "wait":
+        assert run.outcome.error == f"channel 'channel' failed in frame 0, {said}"
+    else:
+        assert said in [notice.text for notice in run.notices("fault", "channel")]
 
 
 def test_consumers_are_told_the_prefixes_of_all_worlds() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -387,6 +388,17 @@ def test_a_name_that_is_too_long_for_a_directory_is_refused_with_the_limit(tmp_p
     (tmp_path / "long.toml").write_text(text)
     with pytest.raises(ScenarioError, match=r"long\.toml:\d+: run\.name.*matches .*\{0,199\}"):
         load_scenario(tmp_path / "long.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("crossing", r"run\.name"), ("mmwave", r"carriers\[0\]\.name"), ("bs", r"devices\[0\]\.name")],
+)
+def test_a_name_with_a_control_character_is_refused_and_shown_escaped(
+    name: str, key: str, folder: Path
+) -> None:
+    error = failure(GOOD.replace(f'"{name}"', f'"{name}\\n"'), folder)
+    assert re.search(rf"{key}: .*'{name}\\n'", str(error))
 
 
 def test_frames_of_the_command_line_are_within_the_longest_duration() -> None:

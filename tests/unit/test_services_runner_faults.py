@@ -18,6 +18,7 @@ FAULTS = {
     "prepare": ("prepare", "ZeroDivisionError: nothing to divide in prepare"),
     "reset": ("reset", "ZeroDivisionError: nothing to divide in reset"),
     "step": ("step", "ZeroDivisionError: nothing to divide in step"),
+    "nothing": ("step", ".step returned None; return a StepResult"),
     "told by name": ("step", "town.toml:7: devices.0: the mast is 3 m too low"),
     "non-finite": ("encode", "scans[0].points[0, 0] is nan"),
     "wrong type": ("encode", "a payload Action for the topic 'lidar'"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,6 +49,27 @@ def test_objects_are_sorted_and_keep_their_own_values() -> None:
     assert scene.position.tolist() == [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
     assert scene.velocity.tolist() == [[0.0, 0.0, 0.0], [4.0, 5.0, 6.0]]
     assert scene.dimensions.tolist() == [[9.0, 8.0, 7.0], [4.0, 2.0, 1.5]]
+
+
+@pytest.mark.parametrize("odd", [None, "car", b"car", [("car", 1)]])
+def test_what_a_world_returns_that_is_no_object_is_named_with_its_method(odd: object) -> None:
+    class Odd(ScriptedWorld):
+        def objects_at(self, elapsed_ns: int) -> Any:
+            return odd
+
+    wrong = odd[0] if isinstance(odd, list) else odd
+    with pytest.raises(
+        PayloadError, match=rf"^Odd\.objects_at returned {re.escape(repr(wrong))}.*ObjectState"
+    ):
+        scene_at(Odd([[]]), 0)
+
+
+@pytest.mark.parametrize("method", ["prefixes", "mesh_classes"])
+@pytest.mark.parametrize("odd", [None, "car"])
+def test_names_that_are_no_series_are_named_with_their_method(method: str, odd: object) -> None:
+    made = type("Odd", (ScriptedWorld,), {method: lambda self: odd})([[]])
+    with pytest.raises(PayloadError, match=rf"^Odd\.{method} returned {odd!r}; return a list of str"):
+        made.scenery() and made.prepare(Preparation(demand={}))
 
 
 def test_an_empty_world_is_a_scene_too() -> None:

@@ -121,7 +121,8 @@ def test_a_mesh_that_comes_later_is_announced_once_and_is_a_box_where_the_run_ta
     ("objects", "said"),
     [
         (None, r"Odd\.step returned None; return a list of ObjectState"),
-        ("car", r"Odd\.step returned 'c' among its objects"),
+        ("car", r"Odd\.step returned 'car'; return a list of ObjectState"),
+        (["car"], r"Odd\.step returned 'car' among others; the items have to be ObjectState"),
         ([ObjectState("car\n", "car", STILL, LEVEL, STILL, SIZE)], r"named 'car\\n'"),
     ],
 )
@@ -132,6 +133,16 @@ def test_what_a_step_returns_is_named_where_it_is_no_object(objects: object, sai
 
     with pytest.raises(PayloadError, match=said):
         stepped(world(Odd()), 0)
+
+
+def test_prefixes_that_are_one_text_are_refused() -> None:
+    """Each letter would be one."""
+
+    class Odd(Yard):
+        prefixes = "car"  # type: ignore[assignment]
+
+    with pytest.raises(PayloadError, match=r"Odd\.prefixes is 'car'; write \('car',\)"):
+        world(Odd())
 
 
 def test_a_state_that_is_no_bytes_is_refused() -> None:
@@ -165,6 +176,7 @@ def test_wrong_meshes_while_the_run_goes_on_are_named_once_and_leave_boxes(
     assert (scene(results[0]).dimensions > 0).all()
     assert scene(results[0]).dimensions[1].tolist() == [3.0, 3.0, 3.0]
     assert all(not result.meshes for result in results)
+    assert [dict(result.counts) for result in results] == [{f"mesh-refused/{name}": 1 for name in wrong}, {}]
     assert len(caplog.messages) == len(wrong)
     for message, (name, (_, _, why)) in zip(caplog.messages, wrong.items(), strict=True):
         assert message.startswith(f"mesh {name!r}: ")

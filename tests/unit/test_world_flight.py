@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -191,6 +192,26 @@ def test_the_geofence_and_the_ground_are_limits() -> None:
     down = fly(made, VelocityCommand(object="low", velocity=(0.0, 0.0, -9.0)), 80, first=81)[-1]
     assert 0.125 <= state(down, "low")[0][2] < 0.145  # it stands on the ground
     assert state(down, "low")[1].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.01)
+
+
+def test_a_waypoint_out_of_the_geofence_is_warned_of_once_and_counted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    made = world(flown(maximum_m=(10.0, 20.0, 40.0)))
+    out = fly(made, WaypointCommand(object="uav", position=(1e8, 0.0, 30.0), speed=9.0), 30)
+    assert state(out[-1])[0][0] <= 10.0
+    assert all(result.counts["commanded-outside-geofence/uav"] == 1 for result in out)
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert re.match(
+        r"episode 0, frame 1: agent '\w+' commands 'uav' to \[100000000.0, 0.0, 30.0\] m, outside", told
+    )
+
+
+def test_a_waypoint_out_of_any_range_is_refused() -> None:
+    with pytest.raises(
+        PayloadError, match=r"'uav' to \[1000000000000.0, .* at most 1e\+09 m from the origin"
+    ):
+        fly(world(), WaypointCommand(object="uav", position=(1e12, 0.0, 30.0), speed=9.0), 1)
 
 
 def test_scripted_objects_follow_their_script_beside_it() -> None:

@@ -218,6 +218,43 @@ def test_bounds_of_commands_hold_and_are_counted() -> None:
     assert fast[0].counts["limited-speed"] == 1
 
 
+def test_each_exit_from_the_geofence_is_counted_once_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """A tilt that is commanded takes it out, as a gale would; then it comes back, and goes out again."""
+    made = world(flown(minimum_m=(-10.0, -20.0, 5.0), maximum_m=(10.0, 20.0, 40.0)))
+    tilt = quaternion_from_euler(0.0, math.radians(20.0))
+    out, number = list[StepResult](), 1
+    for _ in range(2):
+        away = AttitudeCommand(object="uav", orientation=tilt, thrust=9.81 / math.cos(math.radians(20.0)))
+        out += fly(made, away, 40, first=number)
+        out += fly(made, WaypointCommand(object="uav", position=START, speed=10.0), 120, first=number + 40)
+        number += 160
+    exits = [n for n, result in enumerate(out, 1) if result.counts.get("left-geofence/uav")]
+    assert len(exits) == 2
+    for left in exits:
+        assert position(out[left - 2])[0] < 10.0 + RADIUS < position(out[left - 1])[0]
+    told = [record.getMessage() for record in caplog.records if "left its geofence" in record.getMessage()]
+    assert len(told) == 2
+    assert told[0].startswith(f"episode 0, frame {exits[0]}: 'uav' left its geofence from [-10.0, ")
+
+
+def test_gusts_that_it_withstands_at_its_bound_are_no_exit() -> None:
+    made = world(flown(maximum_m=(10.0, 20.0, 40.0)), wind=GUSTY)
+    out = fly(made, WaypointCommand(object="uav", position=(10.0, 0.0, 30.0), speed=8.0), 200)
+    assert max(position(result)[0] for result in out) > 10.0
+    assert counted(out)["left-geofence/uav"] == 0
+
+
+def test_a_path_out_of_the_geofence_is_clipped_counted_and_warned_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    made = world(flown(maximum_m=(10.0, 20.0, 40.0)))
+    out = fly(made, PathCommand(object="uav", points=(START, (90.0, 0.0, 30.0)), speed=5.0), 80)
+    assert max(position(result)[0] for result in out) < 10.3
+    assert counted(out)["commanded-outside-geofence/uav"] == 80
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert told.startswith("episode 0, frame 1: agent 'a' commands 'uav' to [90.0, 0.0, 30.0] m, outside of")
+
+
 @pytest.mark.parametrize("mode", ["stop", "bounce", "land", "fall", "ignore"])
 def test_a_wall_is_touched_once_and_what_follows_is_as_configured(tmp_path: Path, mode: str) -> None:
     made = world(flown(on_collision=mode), scenery=wall(tmp_path))

@@ -335,6 +335,20 @@ def test_an_object_without_size_is_refused() -> None:
         convert_settings(TrajectorySettings, {"objects": [flat]})
 
 
+def test_control_characters_in_a_name_or_prefix_are_refused_and_other_signs_are_not() -> None:
+    rows = [[0.0, 0.0, 0.0, 0.0]]
+    for odd in ("uav\n", "u\0av", "\x1b[2Juav"):
+        with pytest.raises(ScenarioError) as caught:
+            convert_settings(TrajectorySettings, {"objects": [{"name": odd, "waypoints": rows}]})
+        assert f"objects[0].name: is {odd!r}, write a string of 1 to 100 characters without" in str(
+            caught.value
+        )
+        with pytest.raises(ScenarioError, match=r"prefix: is .*, write a string without control characters"):
+            convert_settings(TrajectorySettings, {"prefix": odd})
+    for name in ("größe 1.a/b", "無人機", "a"):
+        convert_settings(TrajectorySettings, {"prefix": "", "objects": [{"name": name, "waypoints": rows}]})
+
+
 def test_a_waypoint_that_is_no_number_is_named_with_row_and_column() -> None:
     uav = {"name": "uav", "waypoints": [[0.0, 0.0, 0.0, 0.0], [1.0, "two", 0.0, 0.0]]}
     with pytest.raises(ScenarioError, match=r"waypoints\[1\]\[1\]: is 'two', write a number"):

@@ -11,6 +11,7 @@ from caviar_broker.core.dispatch import Dispatcher
 from caviar_broker.core.geometry import GeometryLedger
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
+from caviar_protocol.errors import one_line
 from caviar_protocol.messages import (
     RUN_COMPLETE,
     Cancel,
@@ -304,7 +305,7 @@ class Episodes:
     def handle_fault(self, event: ev.FaultReceived, now: int) -> None:
         """Take FAULT: fatal, unless it is in a frame that the run can do without."""
         run, member, message = self._run, self._run.members[event.service], event.message
-        text = f"{message.phase}: {located(message.message, member.name, run.plan.source)}"
+        text = one_line(f"{message.phase}: {located(message.message, member.name, run.plan.source)}")
         if message.frame < 0 or self.checkpoints.concerns(member, message):
             if not run.current(member, message.epoch, message.attempt, "FAULT"):
                 return

@@ -23,6 +23,7 @@ from caviar_broker.core.transitions import (
     step,
 )
 from caviar_protocol.digest import RunDigest
+from caviar_protocol.errors import one_line
 from caviar_protocol.messages import (
     Asset,
     Error,
@@ -301,14 +302,14 @@ class Run:
         """End the run with blame; the first blame counts.
 
         Args:
-            error: The one line that blames.
+            error: What blames; its lines become one.
             culprit: The service whose fault it is; empty where it is none's.
             now: The time [ns].
         """
         # What fails later mostly follows from the first failure.
         if not self.over:
-            self.error, self.culprit = error, culprit
-            self.stop(error, now)
+            self.error, self.culprit = one_line(error), culprit
+            self.stop(self.error, now)
 
     def stop(self, reason: str, now: int) -> None:
         """End the run: SHUTDOWN to every service."""
@@ -360,7 +361,7 @@ class Run:
 
     def notice(self, kind: str, service: str, text: str, frame: int = -1) -> None:
         """Have the user notified."""
-        self.actions.append(Notice(kind, service, text, self.episode, frame))
+        self.actions.append(Notice(kind, service, one_line(text), self.episode, frame))
 
     # --- what came out of turn -----------------------------------------------------------------------
 

@@ -276,7 +276,13 @@ def bench_broker(
 
 @app.command(rich_help_panel=OPERATE)
 def conform(
-    listen: Annotated[str, typer.Option(help="address to listen on; port 0: any")] = "tcp://127.0.0.1:5590",
+    listen: Annotated[
+        str,
+        typer.Option(
+            help="address to listen on; port 0: any; default: any port of 127.0.0.1 where {endpoint} in "
+            "--command passes it on, else tcp://127.0.0.1:5590"
+        ),
+    ] = "",
     role: Annotated[
         str, typer.Option(help="role that the client has to declare: agent, world, …; by default any")
     ] = "",

@@ -378,7 +378,8 @@ def conform_client(
 
     Args:
         console: Where verdicts are shown as they come.
-        listen: Address at which the kit listens; with ``websocket``, at which WebSockets are served.
+        listen: Address at which the kit listens; with ``websocket``, at which WebSockets are served. Empty:
+            any port of 127.0.0.1 where ``command`` passes it on, else the one that a user has to know.
         rules: What the client has to declare, and in which time it has to answer.
         command: Starts the client for each case; empty: the user does.
         names: Cases that are played; empty: all.
@@ -404,6 +405,8 @@ def conform_client(
         console.print(line + Text(f"{verdict.case}: {verdict.title}", style="default"), soft_wrap=True)
 
     require_writable(json_file, markdown_file)
+    # Another kit, say, may have the usual port; a client that is given the address does not need it.
+    listen = listen or f"tcp://127.0.0.1:{0 if '{endpoint}' in command else 5590}"
     options: dict[str, Any] = {"command": command, "names": names, "rules": rules, "tell": tell, "each": each}
     if websocket:
         # The gateway has the address that clients know; the kit is behind it, at any.

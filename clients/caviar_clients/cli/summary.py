@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -24,19 +24,35 @@ from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
-from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX
+from caviar_protocol.topics.scene import (
+    LEFT_GEOFENCE_PREFIX,
+    MESH_REFUSED_PREFIX,
+    OUTSIDE_GEOFENCE_PREFIX,
+    WITHOUT_OBJECT_PREFIX,
+)
 
 STATE = "state:"
 """Begins the name of a decision that is no choice, but what a service knew when the episode began."""
 
-_PUT_ELSEWHERE = "persons-put-elsewhere"
 _CAUSES = {cause.count_name: cause for cause in Cause}
-_DROPPED = "dropped"
 # What a count means that every frame of a run has, by the count's name or what that begins with.
 _NEVER: Mapping[str, str] = {
     "frames-without-users": "{source} had no user to serve in any frame; see its `users`, and `on` of the "
     "receivers",
     WITHOUT_OBJECT_PREFIX: "device {rest!r} stood on no object of {source} in any frame; see its `on`",
+}
+SHOWN_ALIKE = 8
+"""Warnings of one source that differ in a name alone."""
+# What a count means in whatever frames have it, likewise.
+_EVER: Mapping[str, str] = {
+    "dropped": "{source} dropped {paths} with values that are not finite, in {frames}: what its model "
+    "computes is wrong there",
+    "persons-put-elsewhere": "{source} shows people elsewhere at once {times}: SUMO put them farther away "
+    "than they walk; see its option --pedestrian.model",
+    LEFT_GEOFENCE_PREFIX: "{rest!r} of {source} left its geofence {times}, first in {first}",
+    OUTSIDE_GEOFENCE_PREFIX: "{rest!r} of {source} was commanded to places outside of its geofence in "
+    "{frames}, first in {first}, and kept within",
+    MESH_REFUSED_PREFIX: "mesh {rest!r} of {source} was refused in {first}; its objects were boxes",
 }
 
 
@@ -150,6 +166,8 @@ class ReportTally:
         # By source and name of a count: its sum, and the frames in which it was not 0.
         self._sums: Counter[tuple[str, str]] = Counter()
         self._frames_with: Counter[tuple[str, str]] = Counter()
+        # Episode and frame of the first of these.
+        self._first: dict[tuple[str, str], tuple[int, int]] = {}
         # By source and name of a decision: its values, the last one with its episode, and its changes.
         self._values: dict[tuple[str, str], Counter[str]] = {}
         self._last: dict[tuple[str, str], tuple[int, str]] = {}
@@ -157,19 +175,22 @@ class ReportTally:
         # Agents and what they could not serve, in the order in which they said so.
         self._refused: dict[tuple[str, str], None] = {}
 
-    def add(self, episode: int, reports: Iterable[Report]) -> None:
+    def add(self, episode: int, reports: Iterable[Report], number: int = 0) -> None:
         """Count the reports of a frame. Frames come in their order.
 
         Args:
             episode: Of the frame.
             reports: What each service reported of it.
+            number: Of the frame.
         """
         self._frames += 1
         for report in reports:
             self._reported[report.source] += 1
             for name, count in report.counts.items():
                 self._sums[report.source, name] += count
-                self._frames_with[report.source, name] += bool(count)
+                if count:
+                    self._frames_with[report.source, name] += 1
+                    self._first.setdefault((report.source, name), (episode, number))
             for name, value in report.decisions.items():
                 if name.startswith(STATE):
                     continue
@@ -223,25 +244,13 @@ class ReportTally:
 
     def warnings(self) -> list[str]:
         """Warn of what the user probably did not mean: a policy that an agent refused, an agent without users
-        in any frame, a device without an object, paths that were dropped for values that are not finite, a
-        key without effect."""
-        never, dropped, unmatched = [], [], []
+        in any frame, a device without an object, paths that were dropped for values that are not finite, an
+        object outside of its geofence, a mesh that was refused, a key without effect."""
+        never, unmatched = [], []
         for (source, name), frames in sorted(self._frames_with.items()):
-            prefix = next((prefix for prefix in _NEVER if name.startswith(prefix)), "")
-            if prefix and frames == self._frames:
-                never.append(_NEVER[prefix].format(source=source, rest=name.removeprefix(prefix)))
-            elif name == _DROPPED and frames:
-                paths = counted(self._sums[source, name], "path")
-                dropped.append(
-                    f"{source} dropped {paths} with values that are not finite, in "
-                    f"{counted(frames, 'frame')}: what its model computes is wrong there"
-                )
-            elif name == _PUT_ELSEWHERE and frames:
-                times = counted(self._sums[source, name], "time")
-                dropped.append(
-                    f"{source} shows people elsewhere at once {times}: SUMO put them farther away than they "
-                    "walk; see its option --pedestrian.model"
-                )
+            never_prefix = next(filter(name.startswith, _NEVER), "")
+            if never_prefix and frames == self._frames:
+                never.append(_NEVER[never_prefix].format(source=source, rest=name.removeprefix(never_prefix)))
             # A channel that joined late has reported of fewer frames than there are.
             elif name.startswith(UNMATCHED_PREFIX) and frames == self._reported[source]:
                 unmatched.append(
@@ -253,7 +262,27 @@ class ReportTally:
             f"{value.partition(' ')[2]}"
             for source, value in self._refused
         ]
-        return [*refused, *never, *dropped, *unmatched]
+        return [*refused, *never, *self._ever(), *unmatched]
+
+    def _ever(self) -> Iterator[str]:
+        """Say what was counted that a run had better be without; of one kind and source a few."""
+        alike = Counter[tuple[str, str]]()
+        for (source, name), frames in sorted(self._frames_with.items()):
+            kind = next((p for p in _EVER if name == p or (p[-1] == "/" and name.startswith(p))), "")
+            alike[source, kind] += 1
+            if kind and alike[source, kind] <= SHOWN_ALIKE:
+                episode, number = self._first[source, name]
+                yield _EVER[kind].format(
+                    source=source,
+                    rest=name.removeprefix(kind),
+                    paths=counted(self._sums[source, name], "path"),
+                    times=counted(self._sums[source, name], "time"),
+                    frames=counted(frames, "frame"),
+                    first=f"frame {number} of episode {episode}",
+                )
+        for (source, kind), count in alike.items():
+            if kind and count > SHOWN_ALIKE:
+                yield f"{source}: {count - SHOWN_ALIKE} more counts of {kind.rstrip('/')!r}"
 
 
 class PacketTotals:
@@ -368,7 +397,7 @@ def summarise(recording: Recording) -> RunSummary:
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
-        reports.add(frame.episode, frame.reports)
+        reports.add(frame.episode, frame.reports, frame.number)
         for entry in frame.inputs:
             key = (entry.topic, entry.source)
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))

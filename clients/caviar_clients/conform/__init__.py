@@ -101,9 +101,12 @@ def conform(
         raise SetupError(f"no client has the role {given.role!r}; {suggestion(given.role, ROLES)}")
     wire = Wire(endpoint)
     verdicts = []
-    # A client that was killed may still write: what it leaves is removed as far as it goes.
-    temporary = TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True)
-    with closing(wire), front(wire.endpoint) as address, temporary as folder:
+    with (
+        closing(wire),
+        front(wire.endpoint) as address,
+        # A client that was killed may still write: what it leaves is removed as far as it goes.
+        TemporaryDirectory(prefix="caviar-conform-", ignore_cleanup_errors=True) as folder,
+    ):
         client: Client = ByHand(wire, address, tell, given.timeout_s)
         if command:
             client = Started(command, address, given.name or "client", Path(folder))

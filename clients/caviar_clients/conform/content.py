@@ -99,8 +99,8 @@ dimensions = _aspect(
 )
 names = _aspect(
     "scene-names",
-    "Objects and devices are sorted by name, and each name is there once.",
-    "names in ascending order of their UTF-8 bytes, none of them twice",
+    "Objects and devices are sorted by name; names occur once, and have no control characters.",
+    "names in ascending order of their UTF-8 bytes, none of them twice or with control characters",
     lambda scene, world, rules: scenes.wrong_order(scene),
 )
 prefixes = _aspect(

@@ -16,7 +16,7 @@ from caviar_broker.core.graph import Edge, Graph
 from caviar_broker.core.plan import RunPlan
 from caviar_clients.session.watchdog import Work
 from caviar_protocol import messages as m
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RunError, one_line
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import located
 from caviar_protocol.validation import ContentCheck
@@ -348,10 +348,10 @@ class DirectFrames:
 
     def _end(self, error: str, culprit: str) -> None:
         if self.outcome is None:  # what fails later mostly follows from the first failure
-            self.outcome = ev.Finished(error, culprit, "")
+            self.outcome = ev.Finished(one_line(error), culprit, "")
 
     def _tell(self, kind: str, part: _Part, text: str, frame: int) -> None:
-        self._notice(ev.Notice(kind, part.name, text, self._episode, frame))
+        self._notice(ev.Notice(kind, part.name, one_line(text), self._episode, frame))
 
 
 def _absent(part: _Part, topic: str, cause: str) -> FrameInput:

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import inspect
 
 from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.fields import PRINTABLE
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -320,6 +321,8 @@ def _describe(expected: inspect.Type) -> str:
     match expected:
         case inspect.BoolType():
             return "true or false"
+        case inspect.StrType(min_length=low, max_length=high, pattern=pattern) if pattern == PRINTABLE:
+            return f"{_describe(inspect.StrType(low, high))} without control characters"
         case inspect.StrType(pattern=pattern) if pattern is not None:
             return f"a string that matches {pattern}"
         case inspect.StrType(min_length=low, max_length=high) if low or high:

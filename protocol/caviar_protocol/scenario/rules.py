@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS
@@ -294,6 +296,8 @@ def _unique(names: Iterable[str], what: str, place: Place) -> None:
         here = place.at(index).at("name")
         if not name:
             raise here.error(f"a {what} needs a name")
+        if not re.search(PRINTABLE, name):
+            raise here.error(f"{name!r} has control characters; leave them out of the name of a {what}")
         if name in first:
             line = place.source.line(place.at(first[name]).at("name").key)
             known = f" (the first stands in line {line})" if line else ""

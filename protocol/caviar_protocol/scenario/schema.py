@@ -99,7 +99,7 @@ class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The run as a whole."""
 
     # The name of the run's directory has a date and a time after it, and 255 B at most.
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$")]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}$(?!\n)")]
     """Name of the scenario, with which the run's directory begins."""
     frames: Annotated[int, quantity("frame", "frames of an episode", ge=1)]
     sampling_period_ns: Annotated[int, quantity("ns", "T_sam, from one frame to the next", gt=0)] = (
@@ -142,7 +142,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
         (0.0, 0.0, 0.75)
     """
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$(?!\n)")]
     """Name of the device, after that of the object it is mounted on."""
     # One struct for all kinds: TOML has no types, and an error can name the kind that a key belongs to.
     kind: Literal["antenna", "lidar", "camera"]

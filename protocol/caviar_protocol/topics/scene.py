@@ -201,3 +201,10 @@ class Scene(Payload, frozen=True, kw_only=True, omit_defaults=True, dict=True):
 
 WITHOUT_OBJECT_PREFIX = "device-without-object/"
 """Before the name of a device in the counts of a world's report: there was no object for it to stand on."""
+MESH_REFUSED_PREFIX = "mesh-refused/"
+"""Before the name of a mesh in the counts of a world's report: it is not used, its objects are boxes."""
+LEFT_GEOFENCE_PREFIX = "left-geofence/"
+"""Before the name of an object in the counts of a world's report: it drifted out of its geofence."""
+OUTSIDE_GEOFENCE_PREFIX = "commanded-outside-geofence/"
+"""Before the name of an object in the counts of a world's report: a place outside of its geofence was
+commanded."""

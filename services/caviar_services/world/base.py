@@ -20,6 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
+from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
@@ -29,6 +30,7 @@ from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.world.returned import series_of
 from caviar_services.world.run_time_meshes import RunTimeMeshes
 from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets, scenery_file
 
@@ -64,7 +66,9 @@ class ObjectState(NamedTuple):
 class WorldSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that all worlds share."""
 
-    prefix: Annotated[str | None, quantity("1", "what the names of its objects begin with")] = None
+    prefix: (
+        Annotated[str, quantity("1", "what the names of its objects begin with", pattern=PRINTABLE)] | None
+    ) = None
     """Unset: the world chooses. No two worlds of a run may share a prefix."""
     scenery: str = ""
     """Static geometry that this world brings: ``sionna:munich`` (a scene that comes with
@@ -196,9 +200,10 @@ class World(Service[W]):
             AssetError: A file is missing or wrong.
             ScenarioError: The pattern file of a device is wrong; names its key.
         """
+        classes = series_of(str, f"{type(self).__name__}.mesh_classes", self.mesh_classes())
         return {
             **scenery_assets(self.settings.scenery),
-            **object_assets(self.mesh_classes()),
+            **object_assets(classes),
             **pattern_assets(self.run.devices),
         }
 
@@ -208,6 +213,7 @@ class World(Service[W]):
         Raises:
             ScenarioError: A device is mounted on an object that can never come; names its key.
         """
+        series_of(str, f"{type(self).__name__}.prefixes", self.prefixes())
         self._check_parents()
         self._meshes.max_faces = preparation.max_faces
         scenery = self.settings.scenery or "none"
@@ -248,7 +254,8 @@ class World(Service[W]):
 
     def step(self, frame: Frame) -> StepResult:
         """The scene at the frame's instant."""
-        states = list(self.objects_at(frame.t_ns - self._t0_ns))
+        objects = self.objects_at(frame.t_ns - self._t0_ns)
+        states = series_of(ObjectState, f"{type(self).__name__}.objects_at", objects)
         scene = self._scene(states)
         counts = {f"{WITHOUT_OBJECT_PREFIX}{name}": 1 for name in self._mounts.without_object}
         # Counted in the run's summary.

@@ -24,11 +24,13 @@ from caviar_protocol.messages import Input
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action
 from caviar_protocol.topics.link import Command
+from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.scenery import RadioMaterial, scenery_files
 from caviar_services.mesh.shapes import Mesh, fitted, ply
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
+from caviar_services.world.returned import series_of
 
 _log = logging.getLogger("caviar.service")
 
@@ -226,10 +228,16 @@ class EngineWorld(World[WorldSettings]):
         self._elapsed_ns = -1
         self._commands: list[Command] = []
         self._refusals: set[str] = set()
+        # Of these, what the report of the next frame has.
+        self._refused: dict[str, int] = {}
 
     def prefixes(self) -> tuple[str, ...]:
         """Those of the engine."""
-        return tuple(self._engine.prefixes)
+        prefixes = self._engine.prefixes
+        if isinstance(prefixes, str):
+            author = f"{type(self._engine).__name__}.prefixes"
+            raise PayloadError(f"{author} is {prefixes!r}; write ({prefixes!r},)")
+        return tuple(prefixes)
 
     def mesh_classes(self) -> tuple[str, ...]:
         """None: an engine has meshes of its own."""
@@ -252,26 +260,23 @@ class EngineWorld(World[WorldSettings]):
         """Reset the engine."""
         self._elapsed_ns = -1
         self._refusals.clear()
+        self._refused = {}
         self._engine.seed_episode = episode
         self._engine.reset(seed, self._t0_ns / 1e9)
 
     def step(self, frame: Frame) -> StepResult:
         """Advance the engine, with the commands of the frame before."""
         self._commands = [c for action in frame.payloads("action", Action).values() for c in action.commands]
-        return super().step(frame)
+        made = super().step(frame)
+        refused, self._refused = self._refused, {}
+        return msgspec.structs.replace(made, counts={**made.counts, **refused})
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """The engine's objects."""
         before, self._elapsed_ns = self._elapsed_ns, elapsed_ns
         previous_ns = elapsed_ns if before < 0 else before
         objects = self._engine.step(elapsed_ns / 1e9, previous_ns / 1e9, self._commands)
-        author = f"{type(self._engine).__name__}.step"
-        if not isinstance(objects, Iterable):
-            raise PayloadError(f"{author} returned {objects!r}; return a list of ObjectState, or yield them")
-        for item in objects:
-            if not isinstance(item, ObjectState):
-                raise PayloadError(f"{author} returned {item!r} among its objects; write ObjectState(…)")
-            yield item
+        return series_of(ObjectState, f"{type(self._engine).__name__}.step", objects)
 
     def checkpoint(self) -> bytes:
         """The state of the engine, and which of its objects came first."""
@@ -300,6 +305,7 @@ class EngineWorld(World[WorldSettings]):
                 raise AssetError(problem) from error
             if problem not in self._refusals:
                 self._refusals.add(problem)
+                self._refused[f"{MESH_REFUSED_PREFIX}{name}"] = 1
                 _log.warning("%s; objects with it are boxes", problem)
             return OfferedMesh("", *_box_of(mesh))
         content = ply(unit, material)

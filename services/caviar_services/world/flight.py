@@ -7,10 +7,10 @@ body with rotors in wind (`quadrotor`), which may touch what is in its way.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
@@ -20,27 +20,25 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.scene_validation import UNIT_TOLERANCE
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler, rotated
 from caviar_protocol.topics import (
     Action,
-    AttitudeCommand,
     DriveCommand,
-    PathCommand,
-    VelocityCommand,
     WaypointCommand,
 )
 from caviar_protocol.topics.link import MotionCommand
+from caviar_protocol.topics.scene import LEFT_GEOFENCE_PREFIX, OUTSIDE_GEOFENCE_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, turning
-from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits, Motion
+from caviar_services.world.flight_commands import motion_of, order_of, place_outside
+from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits
 from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, Plant
 from caviar_services.world.quadrotor.contacts import OnCollision
 from caviar_services.world.quadrotor.control import Controller
 from caviar_services.world.quadrotor.fleet import Fleet
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
-from caviar_services.world.quadrotor.state import Battery, Order, QuadrotorState
+from caviar_services.world.quadrotor.state import Battery, QuadrotorState
 from caviar_services.world.quadrotor.wind import Wind
 from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 from caviar_services.world.trajectory import (
@@ -50,6 +48,8 @@ from caviar_services.world.trajectory import (
     TrajectoryWorld,
     unique_name,
 )
+
+_log = logging.getLogger("caviar.service")
 
 # Triangles at most this high above the ground [m] are the ground.
 _FLAT = 1e-3
@@ -148,6 +148,8 @@ class FlightWorld(TrajectoryWorld):
         self._elapsed_ns = 0
         self._begun = False
         self._alone = True
+        # Objects of which a command to a place outside of their bounds was warned of in this episode.
+        self._warned: set[str] = set()
         quadrotors: dict[str, Quadrotor] = {}
         for index, thing in enumerate(settings.flown):
             key = f"services.{run.name}.settings.flown[{index}]"
@@ -223,6 +225,7 @@ class FlightWorld(TrajectoryWorld):
     def begin(self, episode: int, seed: int) -> None:
         """Every episode starts at the same place; then commands decide."""
         self._elapsed_ns, self._begun = 0, False
+        self._warned.clear()
         starts = {
             name: (thing.start_m, math.radians(thing.start_yaw_deg)) for name, thing in self._flown.items()
         }
@@ -247,29 +250,61 @@ class FlightWorld(TrajectoryWorld):
         # `restore` sets it too: where states are saved, a world that is started again is not lost.
         self._begun = True
         commands = self._commands(frame)
-        motions = {name: _motion(*commands[name]) for name in self._flyers if name in commands}
-        orders = {name: _order(*commands[name]) for name in self._fleet.quadrotors if name in commands}
+        motions = {name: motion_of(*commands[name]) for name in self._flyers if name in commands}
+        orders = {name: order_of(*commands[name]) for name in self._fleet.quadrotors if name in commands}
         self._place(commands)
-        counts: Counter[str] = Counter()
+        counts = self._outside(frame, commands)
         elapsed_ns = frame.t_ns - self._t0_ns
         length_ns = elapsed_ns - self._elapsed_ns
         for name, flyer in self._flyers.items():
             counts.update(flyer.fly(motions.get(name), length_ns))
         counts.update(self._fleet.fly(orders, elapsed_ns))
         self._elapsed_ns = elapsed_ns
+        self._report_exits(frame, counts)
         made = super().step(frame)
         return replace(made, counts={**made.counts, **counts})
+
+    def _outside(self, frame: Frame, commands: Mapping[str, tuple[str, MotionCommand]]) -> Counter[str]:
+        """Count commands to places outside of the bounds; warn of the first of an object and episode."""
+        counts = Counter[str]()
+        for name, (agent, command) in commands.items():
+            limits = self._limits(name)
+            if (place := place_outside(command, limits)) is None:
+                continue
+            counts[OUTSIDE_GEOFENCE_PREFIX + name] = 1
+            if name not in self._warned:
+                self._warned.add(name)
+                _log.warning(
+                    "episode %d, frame %d: agent %r commands %r to %s m, outside of its geofence from %s to "
+                    "%s m; it keeps within, and further such commands of the episode are only counted",
+                    *(frame.episode, frame.number, agent, name, list(place)),
+                    *(list(limits.low), list(limits.high)),
+                )
+        return counts
+
+    def _report_exits(self, frame: Frame, counts: Mapping[str, int]) -> None:
+        """Warn of each quadrotor that drifted out of its bounds in a frame."""
+        for name, seen in self._fleet.seen.items():
+            if counts.get(LEFT_GEOFENCE_PREFIX + name):
+                limits = self._limits(name)
+                _log.warning(
+                    "episode %d, frame %d: %r left its geofence from %s to %s m, and is at %s m",
+                    *(frame.episode, frame.number, name, list(limits.low), list(limits.high)),
+                    [round(at, 3) for at in seen.body.position],
+                )
+
+    def _limits(self, name: str) -> Limits:
+        return (self._flyers.get(name) or self._fleet.quadrotors[name]).limits
 
     def _place(self, commands: Mapping[str, tuple[str, MotionCommand]]) -> None:
         """Put the objects where they are to be at once; they hover there."""
         for name, (_, command) in commands.items():
             if isinstance(command, WaypointCommand) and command.at_once:
                 flyer, uav = self._flyers.get(name), self._fleet.quadrotors.get(name)
-                limits = flyer.limits if flyer else self._fleet.quadrotors[name].limits
+                limits = self._limits(name)
                 obstacles = flyer.obstacles if flyer else self._fleet.obstacles[name]
                 target = command.position
-                inside = all(a <= x <= b for a, x, b in zip(limits.low, target, limits.high, strict=True))
-                if not inside or obstacles.distance(target, limits.kept) < limits.kept:
+                if limits.excess(target) > 0.0 or obstacles.distance(target, limits.kept) < limits.kept:
                     raise PayloadError(
                         f"{name!r} cannot be at {list(target)}: it keeps within {list(limits.low)} and "
                         f"{list(limits.high)}, and {limits.kept:.3f} m clear of scenery; choose another point"
@@ -350,52 +385,6 @@ class FlightWorld(TrajectoryWorld):
                 yaw_rate=turning(z),
                 tilt_rate=(turning(x), turning(y)),
             )
-
-
-def _motion(agent: str, command: MotionCommand) -> Motion:
-    """What a point is commanded."""
-    _check_finite(agent, command)
-    if isinstance(command, WaypointCommand):
-        return Motion(target=command.position, speed=command.speed, at_once=command.at_once)
-    if isinstance(command, VelocityCommand):
-        return Motion(velocity=command.velocity)
-    raise PayloadError(
-        f"agent {agent!r} sends {type(command).__name__} to {command.object!r}, which flies as a point; "
-        'write dynamics = "quadrotor" for it, or send waypoints or velocities'
-    )
-
-
-def _order(agent: str, command: MotionCommand) -> Order:
-    """What a quadrotor is commanded."""
-    _check_finite(agent, command)
-    if isinstance(command, WaypointCommand):
-        return Order(target=command.position, speed=command.speed)
-    if isinstance(command, VelocityCommand):
-        return Order(velocity=command.velocity)
-    if isinstance(command, PathCommand):
-        return Order(points=command.points, speed=command.speed)
-    norm = math.hypot(*command.orientation)
-    if abs(norm - 1.0) > UNIT_TOLERANCE:
-        raise PayloadError(
-            f"agent {agent!r} commands {command}, whose orientation has norm {norm:.6g}; command a unit "
-            "quaternion (w, x, y, z)"
-        )
-    w, x, y, z = command.orientation
-    return Order(orientation=(w / norm, x / norm, y / norm, z / norm), thrust=command.thrust)
-
-
-def _check_finite(agent: str, command: MotionCommand) -> None:
-    values: tuple[float, ...]
-    if isinstance(command, VelocityCommand):
-        values = command.velocity
-    elif isinstance(command, AttitudeCommand):
-        values = (*command.orientation, command.thrust)
-    elif isinstance(command, PathCommand):
-        values = (*chain.from_iterable(command.points), command.speed)
-    else:
-        values = (*command.position, command.speed)
-    if not all(map(math.isfinite, values)):
-        raise PayloadError(f"agent {agent!r} commands {command}, which is not finite; command numbers")
 
 
 def _quadrotor(thing: FlownObject, wind: Wind, key: str) -> Quadrotor:

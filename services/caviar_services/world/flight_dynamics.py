@@ -82,6 +82,14 @@ class Limits:
         """``clearance``, and what a path bends away from its chord in a sub-step: a·h²/8 [m]."""
         return self.clearance + self.acceleration * _H**2 / 8
 
+    def excess(self, place: Vector) -> float:
+        """How far a place is beyond the bound that it exceeds most [m]; 0 and less: it is inside.
+
+        Args:
+            place: [m]
+        """
+        return max(max(low - at, at - high) for low, at, high in zip(self.low, place, self.high, strict=True))
+
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Commanded motion: a velocity, or a target and the speed with which to go there.

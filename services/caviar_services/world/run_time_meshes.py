@@ -7,11 +7,9 @@ from collections.abc import Collection, Mapping
 from typing import ClassVar
 
 from caviar_protocol.geometry import digest_in, mesh_name
+from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 
 _log = logging.getLogger("caviar.service")
-
-REFUSED_PREFIX = "mesh-refused/"
-"""Before the name of a mesh in the counts of a world's report: it is not used, its objects are boxes."""
 
 
 class RunTimeMeshes:
@@ -101,4 +99,4 @@ class RunTimeMeshes:
         # Told once each: the summary adds counts up.
         news = [name for name in self._refused if name not in self._told]
         self._told.update(news)
-        return {f"{REFUSED_PREFIX}{name}": 1 for name in news}
+        return {f"{MESH_REFUSED_PREFIX}{name}": 1 for name in news}

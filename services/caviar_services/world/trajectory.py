@@ -14,6 +14,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.scenario.conversion import Place, csv_rows
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_services.mesh.shapes import SHAPES
@@ -36,7 +37,7 @@ Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
 class NamedObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a scenario says of each object by name, whatever moves it."""
 
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100, pattern=PRINTABLE)]
     """Unique among the objects of the run; where agents fly the object, its actuator is ``motion:<name>``."""
     kind: str = "uav"
     """Class of the object: ``uav``, ``car``, …; one without a mesh of its own is a box."""

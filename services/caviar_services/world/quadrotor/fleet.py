@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 
 from caviar_protocol.seeding import generator
 from caviar_protocol.space.coordinates import Pose, Vector
+from caviar_protocol.topics.scene import LEFT_GEOFENCE_PREFIX
 from caviar_services.world.base import ObjectState
 from caviar_services.world.quadrotor.contacts import Contact, ball_contact, box_contact, scenery_contact
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
@@ -79,7 +80,8 @@ class Fleet:
             elapsed_ns: Since the beginning of the episode [ns].
 
         Returns:
-            What limited the motions, each at most once; collisions that began; energy taken.
+            What limited the motions, each at most once; collisions that began; exits from geofences;
+            energy taken.
         """
         limits, counts = set[str](), Counter[str]()
         for number in range(self._slices, elapsed_ns // SLICE_NS):
@@ -87,6 +89,8 @@ class Fleet:
                 for event in uav.fly_slice(orders.get(name), number):
                     limits.add(event + name if event.endswith("/") else event)
             self._touch((number + 1) * SLICE_NS, counts)
+            for name, uav in self.quadrotors.items():
+                counts[LEFT_GEOFENCE_PREFIX + name] += uav.leaves(self._radii[name])
         self._slices = elapsed_ns // SLICE_NS
         rest = elapsed_ns - self._slices * SLICE_NS
         for name, uav in self.quadrotors.items():

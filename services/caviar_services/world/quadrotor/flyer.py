@@ -204,6 +204,23 @@ class Quadrotor:
         state.touching = tuple(sorted(touching))
         return begun
 
+    def leaves(self, margin: float) -> bool:
+        """Look at the end of a slice whether it drifted out of its bounds.
+
+        Args:
+            margin: How far beyond them it is left unmentioned, as gusts push it that far while it holds its
+                place at a bound [m].
+
+        Returns:
+            Whether it did in this slice: once, until it has been inside again.
+        """
+        state, limits = self.state, self.limits
+        x, y, z = state.body.position
+        # What lands or falls goes down to the ground, wherever the lower bound is.
+        excess = limits.excess((x, y, z if state.mode == "flying" else max(z, limits.low[2])))
+        was, state.outside = state.outside, excess > (0.0 if state.outside else margin)
+        return state.outside and not was
+
     def _answer(self, state: QuadrotorState, contact: Contact, first: bool) -> None:
         bounces = self.on_collision == "bounce" and state.mode == "flying"
         state.body = answered(
@@ -346,7 +363,7 @@ class Quadrotor:
     def _within(self, position: Vector, velocity: Vector, events: set[str]) -> Vector:
         """A velocity, at most the greatest speed, with which it comes to rest within the bounds."""
         limits, gain = self.limits, self._controller.position_1_s
-        scale = min(1.0, limits.speed / math.hypot(*velocity))
+        scale = min(1.0, limits.speed / max(math.hypot(*velocity), _ROUNDING))
         wish = []
         for at, v, low, high in zip(position, velocity, limits.low, limits.high, strict=True):
             up = braking_speed(high - at, gain, _BRAKING * limits.acceleration)
@@ -375,6 +392,9 @@ class Quadrotor:
         state.along = min(lengths[-1], state.along + pace * length)
         x, y, z = self._pilot.towards(state.body.position, self._inside(point, events), speed)
         wish = (x + pace * course[0], y + pace * course[1], z + pace * course[2])
+        # The course itself would lead out, and on.
+        if any(self.limits.excess(corner) > 0.0 for corner in points):
+            return self._within(state.body.position, wish, events)
         scale = min(1.0, self.limits.speed / max(math.hypot(*wish), _ROUNDING))
         return (scale * wish[0], scale * wish[1], scale * wish[2])
 

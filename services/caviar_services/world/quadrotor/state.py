@@ -95,5 +95,7 @@ class QuadrotorState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     counted_j: int = 0
     """Of these, how many were counted in frames."""
     mode: Literal["flying", "landing", "falling", "landed"] = "flying"
+    outside: bool = False
+    """Whether it drifted out of its geofence, and has not come back yet."""
     touching: tuple[str, ...] = ()
     """What it touched at the end of the last slice."""
