@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,6 +15,7 @@ from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
 from caviar_clients.datasets.plan import differences, plan_dataset
+from caviar_clients.session.base import failure_of
 from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RunError, ScenarioError
@@ -30,6 +34,24 @@ class Fails(RandomAgent):
         if frame.number == 2:
             raise ValueError("the agent has no answer")
         return super().step(frame)
+
+
+def _endless(depth: int) -> int:
+    return _endless(depth + 1) + 1
+
+
+class FailsBy(RandomAgent):
+    """Fails in a frame by what `how` raises."""
+
+    how: Callable[[], object] = list
+
+    def step(self, frame: Frame) -> StepResult:
+        type(self).how()
+        return super().step(frame)
+
+
+def _raise(error: BaseException) -> None:
+    raise error
 
 
 def dataset(
@@ -106,6 +128,36 @@ def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> No
     assert DatasetDirectory(tmp_path).finished() == []
     assert not DatasetDirectory(tmp_path).work.exists()
     assert logging.getLogger("caviar.service").level == logging.NOTSET, "as it was"
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        (lambda: _raise(MemoryError()), "MemoryError (at "),
+        (lambda: _endless(0), "RecursionError: maximum recursion depth exceeded (at "),
+        (lambda: _raise(KeyboardInterrupt()), "it raised KeyboardInterrupt (at "),
+        (lambda: _raise(ValueError("I will\n  not\n")), "ValueError: I will not (at "),
+        (lambda: _raise(SystemExit(3)), "it called sys.exit(3) (at "),
+    ],
+)
+def test_an_agent_that_fails_is_named_with_its_line(
+    tmp_path: Path, how: Callable[[], object], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a thread, as tasks of Dask are: Ctrl-C of a terminal never comes there."""
+    monkeypatch.setattr(FailsBy, "how", staticmethod(how))
+    text = SMOKE.read_text().replace('use = "los-beam"', f'use = "{__name__}:FailsBy"', 1)
+    plan = plan_dataset(parse_scenario(text), episodes=1, scenes=3)
+    task = EpisodeTask(plan.scenario, 0, str(tmp_path))
+    with writing_dataset(DatasetDirectory(tmp_path)), ThreadPoolExecutor(1) as thread:
+        error = thread.submit(play_episode, task).result().error
+    assert "agent 'agent' failed in frame 0" in error
+    assert said in error
+    assert re.search(r"test_datasets_episode\.py:\d+ in \w+\)$", error)
+
+
+def test_ctrl_c_of_a_terminal_is_no_failure_of_an_agent() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        failure_of(KeyboardInterrupt())
 
 
 def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:

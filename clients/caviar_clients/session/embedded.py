@@ -28,7 +28,7 @@ from caviar_broker.policies import given_policies
 from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.files import make_folder_of
-from caviar_clients.session.base import Frame, Session, declared
+from caviar_clients.session.base import Frame, Session, declared, failure_of
 from caviar_clients.session.direct import DirectFrames, plays_directly
 from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
@@ -291,11 +291,12 @@ class EmbeddedRun:
         self._at_work = order.service, order.message
         try:
             session.handle(order.message, parts)
-        except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
+        except (SystemExit, KeyboardInterrupt) as error:
+            failure = failure_of(error)
             phase, episode, frame = "start", 0, -1
             if isinstance(order.message, m.Grant):
                 phase, episode, frame = "step", order.message.episode, order.message.frame
-            session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
+            session.report(failure, phase, episode, frame)
         self._at_work = None
         if self._encodes and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)

@@ -9,14 +9,15 @@ from __future__ import annotations
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias
 
 from caviar_broker.core.plan import RunPlan, duration
 from caviar_protocol import messages as m
 from caviar_protocol.codec import message_type
+from caviar_services.places import place_in
 from caviar_services.service import Frame, Service
 
 LOOK_S = 1.0
@@ -44,6 +45,7 @@ class Watchdog:
             for 5 s now (budget 20 ms)``. Then again whenever the time has doubled, and after `stop`.
 
     Example:
+        >>> from pathlib import Path
         >>> from caviar_broker.core.plan import briefings, plan_run
         >>> from caviar_protocol.scenario import load_scenario
         >>> scenario, told = load_scenario("smoke"), SimpleQueue()
@@ -129,7 +131,10 @@ class Watchdog:
             text += f" (budget {duration(service.budget_ns)})"
         elif phase := self._phases.get(name):
             text += f" ({phase})"
-        place = _place(self._watched, self._classes.get(name))
+        frame = sys._current_frames().get(self._watched)
+        place = place_in(
+            self._classes.get(name), ((f.f_code, line) for f, line in traceback.walk_stack(frame))
+        )
         return f"{text}, at {place}" if place else text
 
 
@@ -150,18 +155,3 @@ def _doing(task: m.Message | Frame | None) -> str:
             return f"to end episode {episode}"
         case _:
             return f"to handle {message_type(task)}"
-
-
-def _place(thread: int, cls: type[Service[Any]] | None) -> str:
-    """The line of the modules of a class and its bases that runs in a thread; empty where none does."""
-    modules = (sys.modules.get(base.__module__) for base in (cls.__mro__ if cls else ()))
-    files = {getattr(module, "__file__", None) for module in modules}
-    frame = sys._current_frames().get(thread)
-    while frame is not None and frame.f_code.co_filename not in files:
-        frame = frame.f_back
-    if frame is None:
-        return ""
-    file = Path(frame.f_code.co_filename)
-    if file.is_relative_to(Path.cwd()):
-        file = file.relative_to(Path.cwd())
-    return f"{file}:{frame.f_lineno} in {frame.f_code.co_name}"
