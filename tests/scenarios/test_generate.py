@@ -241,6 +241,40 @@ def test_an_episode_that_fails_is_listed_and_the_others_are_there(tmp_path: Path
     assert there == set(range(EPISODES)) - {5, 7}
 
 
+@pytest.mark.parametrize(
+    ("first", "ends", "said"),
+    [
+        (0, "os._exit(3)", "it exited with status 3 (no signal)"),
+        (0, "os.kill(os.getpid(), 11)", "signal SIGSEGV ended it"),
+        (4, "os._exit(3)", "it exited with status 3 (no signal)"),
+    ],
+)
+def test_an_agent_that_ends_its_process_is_named_with_the_exit_and_costs_its_episode_alone(
+    tmp_path: Path, first: int, ends: str, said: str
+) -> None:
+    """In scenes that are tried (the first), and in a later one, behind which another episode waits."""
+    (tmp_path / "ends.py").write_text(
+        "import os\n"
+        "from caviar_services.agent.baselines import RandomAgent\n"
+        "class Ends(RandomAgent):\n"
+        "    def step(self, frame):\n"
+        f"        if frame.episode == 0 and frame.number == {first}:\n"
+        f"            {ends}\n"
+        "        return super().step(frame)\n"
+    )
+    file, out = tmp_path / "ends.toml", tmp_path / "d"
+    file.write_text(SMOKE.read_text().replace('use = "los-beam"', 'use = "ends:Ends"', 1))
+    command = [*COMMAND, str(file), "--out", str(out), "--episodes", "3", "--scenes", "5", "--workers", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert said in (done.stdout if first else done.stderr)
+    assert not (out / ".work").exists(), "scenes of an episode that failed are not kept"
+    assert "Traceback" not in done.stderr
+    if first:
+        assert "1 episode of 3 failed" in done.stderr
+        assert sorted(path.name[-1] for path in (out / "episodes").iterdir()) == ["1", "2"]
+
+
 def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     command = [

@@ -179,8 +179,8 @@ def test_what_a_killed_command_left_half_written_is_removed(tmp_path: Path) -> N
     assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes"]
 
 
-def interrupted(directory: DatasetDirectory, *begun: str) -> None:
-    with writing_dataset(directory):
+def interrupted(directory: DatasetDirectory, *begun: str, elsewhere: bool = True) -> None:
+    with writing_dataset(directory, elsewhere=elsewhere):
         for name in begun:
             (directory.work / name).mkdir()
         raise KeyboardInterrupt
@@ -192,7 +192,7 @@ def test_what_workers_elsewhere_still_write_is_left_after_a_fault(tmp_path: Path
         interrupted(directory, "4-abc")
     assert [path.name for path in directory.work.iterdir()] == ["4-abc"]
     with pytest.raises(KeyboardInterrupt):
-        interrupted(directory)
+        interrupted(directory, "5-abc", elsewhere=False)
     assert not directory.work.exists()
 
 

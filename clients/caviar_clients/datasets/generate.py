@@ -82,7 +82,7 @@ def generate(
         raise RunError(f"a dataset has {MOST_EPISODES:.0e} episodes at most, and not {plan.episodes}")
     remote = RemoteDataset(str(out)) if is_address(out) else None
     directory = DatasetDirectory(Path(out)) if remote is None else remote.written()
-    with writing_dataset(directory):
+    with writing_dataset(directory, elsewhere=bool(scheduler)):
         if remote is not None:
             _fetch_catalogue(remote, directory)
         settings = plan.settings()
