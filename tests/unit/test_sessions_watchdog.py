@@ -77,6 +77,22 @@ class SlowChannel(FreeSpaceChannel):
         return super().step(frame)
 
 
+def test_a_wait_is_told_again_when_its_time_doubles_or_after_so_long() -> None:
+    scenario = check_implementations(parse_scenario(SMOKE.read_text()))
+    plan = plan_run(scenario, "run", briefings(scenario, Path()))
+    work = ("channel", Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0))
+
+    def times(*again_s: float) -> list[float]:
+        watch = watchdog.Watchdog(plan, {}, lambda: work, tell, *again_s)
+        told_at = [0.0]
+        while told_at[-1] < 600.0:
+            told_at.append(watch._due_s(work, told_at[-1]))
+        return told_at[1:]
+
+    assert times() == [5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0]
+    assert times(5.0) == [5.0 * count for count in range(1, 121)]
+
+
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("LOOK_S", "STEP_S", "LOAD_S"):

@@ -7,6 +7,7 @@ Time stands still here: the run waits for each service it grants a frame, and no
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -120,6 +121,7 @@ class EmbeddedRun:
         on_notice, on_frame: Called with each notice to the user, and with each finished frame.
         on_wait: Called with what the run waits for, where that takes seconds: from another thread, since the
             service has this one. By default a warning of the logger ``caviar.session``.
+        wait_again_s: Time from one such call to the next at most [s]; by default it doubles.
         seats: By name, services that decide outside of the run (`OutsideSession`), and classes that declare
             them.
         imposed: Decisions that services take over in place of their own, as
@@ -141,6 +143,7 @@ class EmbeddedRun:
         on_notice: Callable[[ev.Notice], None] = lambda notice: None,
         on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
         on_wait: Callable[[str], None] = _log.warning,
+        wait_again_s: float = math.inf,
         seats: Mapping[str, type[Service[Any]]] | None = None,
         imposed: Imposed | None = None,
         episode: int | None = None,
@@ -214,7 +217,7 @@ class EmbeddedRun:
         settings = {name: spec.settings for name, spec in scenario.services.items()}
         if any(c.role == "world" and c.changes_geometry_with(settings[n]) for n, c in classes.items()):
             self._without_clock = False
-        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait)
+        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait, wait_again_s)
 
     def run(self) -> ev.Finished:
         """Run to the end.

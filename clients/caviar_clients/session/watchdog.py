@@ -6,6 +6,7 @@ computes, the run itself does nothing. The watchdog looks at the run from a thre
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -43,6 +44,7 @@ class Watchdog:
             thread, and returns the same object for as long as the work lasts.
         tell: Called with each text from the thread of the watchdog: ``waiting for agent 'agent' in frame 3,
             for 5 s now (budget 20 ms)``. Then again whenever the time has doubled, and after `stop`.
+        again_s: Time from one text to the next at most [s].
 
     Example:
         >>> from pathlib import Path
@@ -63,9 +65,11 @@ class Watchdog:
         classes: Mapping[str, type[Service[Any]]],
         present: Callable[[], Work | None],
         tell: Callable[[str], None],
+        again_s: float = math.inf,
     ) -> None:
         self._services = {service.name: service for service in plan.services}
         self._classes, self._present, self._tell = classes, present, tell
+        self._again_s = again_s
         self._phases: dict[str, str] = {}
         # Its `put` may be called from a signal handler that interrupts another `put`; a lock may not.
         self._orders: SimpleQueue[str] = SimpleQueue()
@@ -110,10 +114,13 @@ class Watchdog:
             if work is not seen:  # its time counts from here: the run itself reads no clock for this
                 seen, since, told_at = work, now - wait_s, 0.0
             elapsed = now - since
-            if work is not None and (stopping or elapsed >= max(self._patience_s(work), 2.0 * told_at)):
+            if work is not None and (stopping or elapsed >= self._due_s(work, told_at)):
                 told_at = elapsed
                 self._tell(self._text(work, elapsed))
             wait_s, stopping = LOOK_S, False
+
+    def _due_s(self, work: Work, told_at: float) -> float:
+        return max(self._patience_s(work), min(2.0 * told_at, told_at + self._again_s))
 
     def _patience_s(self, work: Work) -> float:
         service, task = work
