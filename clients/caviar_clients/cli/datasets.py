@@ -188,8 +188,11 @@ def look_command(
             tasks[what] = bar.add_task(what, total=of)
         bar.update(tasks[what], completed=done)
 
+    def note(text: str) -> None:
+        print_line(bar.console, printable(text), "yellow")
+
     with bar:
-        file = write_page(dataset, out, progress)
+        file = write_page(dataset, out, progress, note)
     print_line(console, file)
 
 
