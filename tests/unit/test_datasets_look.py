@@ -373,7 +373,7 @@ def test_units_fit_the_numbers(copy: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("beam", [99999999999, -5, 32])
 def test_beams_that_no_codebook_has_are_left_out_and_told(beam: int, copy: Path) -> None:
-    edit(copy, f"UPDATE users SET tx_beam = {beam} WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'")
+    edit(copy, f"UPDATE users SET tx_beam = {beam} WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'")  # noqa: S608 - our own
     told: list[str] = []
     page = Page(write_page(copy, note=told.append))
     said = (
