@@ -276,6 +276,7 @@ def test_an_agent_that_ends_its_process_is_named_with_the_exit_and_costs_its_epi
 
 
 def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_path: Path) -> None:
+    """As a terminal sends it: to the command and to its processes."""
     out = tmp_path / "d"
     command = [
         *COMMAND,
@@ -289,12 +290,15 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
         "--workers",
         "2",
     ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     wait_for(out, 3, process)
     workers = children(psutil.Process(process.pid))
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     said, errors = process.communicate(timeout=60.0)
     assert process.returncode == 130, errors
+    assert "starting 2 processes …" in said
     assert "the same command goes on" in said
     assert "Traceback" not in errors
     gone, alive = psutil.wait_procs(workers, timeout=10.0)
@@ -397,6 +401,8 @@ class Notes:
         self.texts.append(text)
 
     def traffic(self, now_s: float, end_s: float) -> None: ...
+
+    def tried(self, done: int, of: int) -> None: ...
 
     def estimated(self, *_: object) -> None:
         self.is_estimated = True

@@ -103,19 +103,26 @@ class Episodes:
         try:
             self._connect()
         except BaseException:
-            self._disconnect()
+            self._disconnect(at_once=True)
             raise
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._disconnect()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._disconnect(at_once=kind is not None)
 
-    def run_on_each(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def run_on_each(
+        self,
+        function: Callable[..., Any],
+        *arguments: Any,
+        on_result: Callable[[int, int], None] = lambda done, of: None,
+    ) -> list[Any]:
         """Call a function once in every worker at the same time.
 
         Args:
             function: Which can be pickled.
             arguments: Of it.
+            on_result: Called at the beginning, and with each result, with their number so far and that of
+                the workers.
 
         Returns:
             What it returned, by worker; those that are gone meanwhile are left out.
@@ -131,8 +138,12 @@ class Episodes:
             for address in self._last_seen()
         }
         self._watch.progressed(time.monotonic())
+        found, workers = list[Any](), len(pending)
+        on_result(0, workers)
         try:
-            found = list(self._tried(pending))
+            for result in self._tried(pending):
+                found.append(result)
+                on_result(len(found), workers)
         except (LostSchedulerError, OSError, TimeoutError) as error:
             raise RunError(
                 f"the Dask scheduler {self._where} was lost while scenes were tried "
@@ -356,8 +367,10 @@ class Episodes:
         self._watch.progressed(time.monotonic())
         self._connected.subscribe_topic(TOPIC, self._watch.tell)
 
-    def _disconnect(self) -> None:
-        self._client = None
+    def _disconnect(self, *, at_once: bool = False) -> None:
+        from caviar_clients.datasets.exits import NotingNanny
+
+        self._client, NotingNanny.at_once = None, at_once
         self._stack.close()
 
     def _reconnect(self, cause: Exception) -> None:

@@ -1,10 +1,13 @@
-"""How processes of this machine that played episodes have ended."""
+"""The processes of this machine that play episodes: Ctrl-C, how they are ended, and how they have ended."""
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import MutableMapping
+from contextlib import suppress
+from typing import Any, ClassVar
 
 # Of the extra `datasets`: who imports this module needs it.
 from distributed import Nanny
@@ -24,7 +27,27 @@ _HINTS = {
 
 
 class NotingNanny(Nanny):  # type: ignore[misc]  # distributed has no types
-    """Starts the process of a worker anew when it ends, as its base does, and notes how it ended."""
+    """Starts the process of a worker anew when it ends, as its base does, and notes how it ended.
+
+    Ctrl-C in a terminal, which goes to all processes of the command, is left to the command.
+    """
+
+    at_once: ClassVar[bool] = False
+    """Whether processes are ended without waiting for their steps: what is complete is in its place."""
+
+    async def instantiate(self) -> Any:
+        """Start the process."""
+        # A process inherits what the thread that starts it blocks, here that of Dask's loop. A handler in the
+        # process itself would come too late: it loads for a second.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        return await super().instantiate()
+
+    async def kill(self, *arguments: Any, **named: Any) -> None:
+        """End the process."""
+        if self.at_once and self.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+        await super().kill(*arguments, **named)
 
     def _on_worker_exit_sync(self, exitcode: int) -> None:
         if address := self.worker_address:
