@@ -215,7 +215,7 @@ def test_another_dataset_is_not_continued(scenario: Path, reference: Path) -> No
     before = content(reference)
     done = generate(scenario, reference, "--seed", "5")
     assert done.returncode == 1
-    assert "holds another dataset: scenario.run.seed was 1, is 5" in done.stderr
+    assert "holds another dataset: run.seed was 1, is 5" in done.stderr
     assert content(reference) == before
     again = generate(scenario, reference)
     assert again.returncode == 0
@@ -376,7 +376,7 @@ def test_a_dataset_at_an_address_has_the_bytes_of_a_folder(
     assert list(verify(address)) == []
     other = generate(scenario, address, "--seed", "5")
     assert other.returncode == 1
-    assert "holds another dataset: scenario.run.seed was 1, is 5" in other.stderr
+    assert "holds another dataset: run.seed was 1, is 5" in other.stderr
 
 
 def test_addresses_that_cannot_be_used_are_refused(scenario: Path, tmp_path: Path) -> None:
