@@ -22,11 +22,12 @@ from caviar_protocol import messages as m
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.errors import CaviarError, PayloadError, ProductError
+from caviar_protocol.errors import CaviarError, PayloadError, ProductError, one_line
 from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_services.places import place_of_error
 from caviar_services.service import (
     Frame,
     FrameInput,
@@ -342,9 +343,15 @@ def sorted_products(use: str, result: StepResult) -> list[tuple[str, Payload]]:
 
 
 def fault_from(
-    error: Exception, identity: Mapping[str, int], phase: str, episode: int = 0, frame: int = -1
+    error: Exception,
+    identity: Mapping[str, int],
+    phase: str,
+    episode: int = 0,
+    frame: int = -1,
+    cls: type | None = None,
 ) -> m.Fault:
-    """Make a FAULT that says what an exception says, with a traceback where it is no `CaviarError`.
+    """Make a FAULT that says what an exception says; where it is no `CaviarError`, in one line with the place
+    in the service's code, and with a traceback.
 
     Args:
         error: The exception.
@@ -352,13 +359,19 @@ def fault_from(
         phase: What the service was doing.
         episode: Number of the episode.
         frame: Number of the frame; −1: none.
+        cls: Implementation of the service; None: no place is named.
 
     Example:
         >>> fault_from(PayloadError("no scene"), {"epoch": 1, "attempt": 1}, "step", 0, 3).message
         'no scene'
     """
     known = isinstance(error, CaviarError)
-    text = str(error) if known else f"{type(error).__name__}: {error}"
+    text = one_line(str(error))
+    if not known:
+        text = ": ".join(filter(None, (type(error).__name__, text)))
+    text = text[:MAX_MESSAGE]
+    if not known and (place := place_of_error(cls, error.__traceback__)):
+        text = f"{text} (at {place})"
     detail = "" if known else "".join(traceback.format_exception(error))
     _log.error(detail or text)
     return m.Fault(
@@ -366,7 +379,7 @@ def fault_from(
         episode=episode,
         frame=frame,
         phase=phase,
-        message=_sendable(text[:MAX_MESSAGE]),
+        message=_sendable(text),
         detail=_sendable(detail[-MAX_DETAIL:]),  # the end: the line that failed is the last
         culprit=error.source if isinstance(error, ProductError) else "",
     )

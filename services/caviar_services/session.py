@@ -452,7 +452,7 @@ class ServiceSession:
             self._send(*answer)
         except Exception as error:
             self.failed = True
-            answer = fault_from(error, self._identity, phase, grant.episode, grant.frame), ()
+            answer = fault_from(error, self._identity, phase, grant.episode, grant.frame, self.cls), ()
             self._send(*answer)
         return answer
 
@@ -545,7 +545,7 @@ class ServiceSession:
             frame: In which it came; −1: in none.
         """
         self.failed = True
-        self._send(fault_from(error, self._identity, phase, episode, frame), ())
+        self._send(fault_from(error, self._identity, phase, episode, frame, self.cls), ())
 
     def _unexpected(self, message: m.Message, why: str) -> None:
         kind = message_type(message)

@@ -215,7 +215,7 @@ def test_another_dataset_is_not_continued(scenario: Path, reference: Path) -> No
     before = content(reference)
     done = generate(scenario, reference, "--seed", "5")
     assert done.returncode == 1
-    assert "holds another dataset: scenario.run.seed was 1, is 5" in done.stderr
+    assert "holds another dataset: run.seed was 1, is 5" in done.stderr
     assert content(reference) == before
     again = generate(scenario, reference)
     assert again.returncode == 0
@@ -241,7 +241,42 @@ def test_an_episode_that_fails_is_listed_and_the_others_are_there(tmp_path: Path
     assert there == set(range(EPISODES)) - {5, 7}
 
 
+@pytest.mark.parametrize(
+    ("first", "ends", "said"),
+    [
+        (0, "os._exit(3)", "it exited with status 3 (no signal)"),
+        (0, "os.kill(os.getpid(), 11)", "signal SIGSEGV ended it"),
+        (4, "os._exit(3)", "it exited with status 3 (no signal)"),
+    ],
+)
+def test_an_agent_that_ends_its_process_is_named_with_the_exit_and_costs_its_episode_alone(
+    tmp_path: Path, first: int, ends: str, said: str
+) -> None:
+    """In scenes that are tried (the first), and in a later one, behind which another episode waits."""
+    (tmp_path / "ends.py").write_text(
+        "import os\n"
+        "from caviar_services.agent.baselines import RandomAgent\n"
+        "class Ends(RandomAgent):\n"
+        "    def step(self, frame):\n"
+        f"        if frame.episode == 0 and frame.number == {first}:\n"
+        f"            {ends}\n"
+        "        return super().step(frame)\n"
+    )
+    file, out = tmp_path / "ends.toml", tmp_path / "d"
+    file.write_text(SMOKE.read_text().replace('use = "los-beam"', 'use = "ends:Ends"', 1))
+    command = [*COMMAND, str(file), "--out", str(out), "--episodes", "3", "--scenes", "5", "--workers", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert said in (done.stdout if first else done.stderr)
+    assert not (out / ".work").exists(), "scenes of an episode that failed are not kept"
+    assert "Traceback" not in done.stderr
+    if first:
+        assert "1 episode of 3 failed" in done.stderr
+        assert sorted(path.name[-1] for path in (out / "episodes").iterdir()) == ["1", "2"]
+
+
 def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_path: Path) -> None:
+    """As a terminal sends it: to the command and to its processes."""
     out = tmp_path / "d"
     command = [
         *COMMAND,
@@ -255,12 +290,15 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
         "--workers",
         "2",
     ]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     wait_for(out, 3, process)
     workers = children(psutil.Process(process.pid))
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     said, errors = process.communicate(timeout=60.0)
     assert process.returncode == 130, errors
+    assert "starting 2 processes …" in said
     assert "the same command goes on" in said
     assert "Traceback" not in errors
     gone, alive = psutil.wait_procs(workers, timeout=10.0)
@@ -338,7 +376,7 @@ def test_a_dataset_at_an_address_has_the_bytes_of_a_folder(
     assert list(verify(address)) == []
     other = generate(scenario, address, "--seed", "5")
     assert other.returncode == 1
-    assert "holds another dataset: scenario.run.seed was 1, is 5" in other.stderr
+    assert "holds another dataset: run.seed was 1, is 5" in other.stderr
 
 
 def test_addresses_that_cannot_be_used_are_refused(scenario: Path, tmp_path: Path) -> None:
@@ -363,6 +401,8 @@ class Notes:
         self.texts.append(text)
 
     def traffic(self, now_s: float, end_s: float) -> None: ...
+
+    def tried(self, done: int, of: int) -> None: ...
 
     def estimated(self, *_: object) -> None:
         self.is_estimated = True

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from caviar_clients.datasets.catalogue import fingerprint
+from caviar_clients.datasets.differences import differences
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
-from caviar_clients.datasets.plan import differences, plan_dataset
+from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.session.base import failure_of
 from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RunError, ScenarioError
@@ -30,6 +35,24 @@ class Fails(RandomAgent):
         if frame.number == 2:
             raise ValueError("the agent has no answer")
         return super().step(frame)
+
+
+def _endless(depth: int) -> int:
+    return _endless(depth + 1) + 1
+
+
+class FailsBy(RandomAgent):
+    """Fails in a frame by what `how` raises."""
+
+    how: Callable[[], object] = list
+
+    def step(self, frame: Frame) -> StepResult:
+        type(self).how()
+        return super().step(frame)
+
+
+def _raise(error: BaseException) -> None:
+    raise error
 
 
 def dataset(
@@ -108,6 +131,36 @@ def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> No
     assert logging.getLogger("caviar.service").level == logging.NOTSET, "as it was"
 
 
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        (lambda: _raise(MemoryError()), "MemoryError (at "),
+        (lambda: _endless(0), "RecursionError: maximum recursion depth exceeded (at "),
+        (lambda: _raise(KeyboardInterrupt()), "it raised KeyboardInterrupt (at "),
+        (lambda: _raise(ValueError("I will\n  not\n")), "ValueError: I will not (at "),
+        (lambda: _raise(SystemExit(3)), "it called sys.exit(3) (at "),
+    ],
+)
+def test_an_agent_that_fails_is_named_with_its_line(
+    tmp_path: Path, how: Callable[[], object], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a thread, as tasks of Dask are: Ctrl-C of a terminal never comes there."""
+    monkeypatch.setattr(FailsBy, "how", staticmethod(how))
+    text = SMOKE.read_text().replace('use = "los-beam"', f'use = "{__name__}:FailsBy"', 1)
+    plan = plan_dataset(parse_scenario(text), episodes=1, scenes=3)
+    task = EpisodeTask(plan.scenario, 0, str(tmp_path))
+    with writing_dataset(DatasetDirectory(tmp_path)), ThreadPoolExecutor(1) as thread:
+        error = thread.submit(play_episode, task).result().error
+    assert "agent 'agent' failed in frame 0" in error
+    assert said in error
+    assert re.search(r"test_datasets_episode\.py:\d+ in \w+\)$", error)
+
+
+def test_ctrl_c_of_a_terminal_is_no_failure_of_an_agent() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        failure_of(KeyboardInterrupt())
+
+
 def test_two_commands_do_not_write_one_dataset(tmp_path: Path) -> None:
     directory = DatasetDirectory(tmp_path)
     with (
@@ -127,8 +180,8 @@ def test_what_a_killed_command_left_half_written_is_removed(tmp_path: Path) -> N
     assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes"]
 
 
-def interrupted(directory: DatasetDirectory, *begun: str) -> None:
-    with writing_dataset(directory):
+def interrupted(directory: DatasetDirectory, *begun: str, elsewhere: bool = True) -> None:
+    with writing_dataset(directory, elsewhere=elsewhere):
         for name in begun:
             (directory.work / name).mkdir()
         raise KeyboardInterrupt
@@ -140,7 +193,7 @@ def test_what_workers_elsewhere_still_write_is_left_after_a_fault(tmp_path: Path
         interrupted(directory, "4-abc")
     assert [path.name for path in directory.work.iterdir()] == ["4-abc"]
     with pytest.raises(KeyboardInterrupt):
-        interrupted(directory)
+        interrupted(directory, "5-abc", elsewhere=False)
     assert not directory.work.exists()
 
 
@@ -173,7 +226,7 @@ def test_a_dataset_is_told_from_another_by_what_its_bytes_follow_from() -> None:
     more = plan_dataset(scenario, episodes=9, scenes=3).settings()
     other = plan_dataset(scenario, episodes=2, scenes=3, seed=7).settings()
     assert fingerprint(same) == fingerprint(more) != fingerprint(other)
-    assert list(differences(same, other)) == ["scenario.run.seed was 1, is 7"]
+    assert list(differences(same, other)) == ["run.seed was 1, is 7"]
 
 
 def test_topics_that_are_not_named_are_not_recorded(tmp_path: Path) -> None:

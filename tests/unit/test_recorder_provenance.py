@@ -10,8 +10,9 @@ from typing import Any
 import msgspec
 import pytest
 
+from caviar_clients.datasets.differences import differences
 from caviar_clients.datasets.episode import MEASURED, EpisodeTask, play_episode
-from caviar_clients.datasets.plan import differences, plan_dataset
+from caviar_clients.datasets.plan import plan_dataset
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario, parse_scenario
 from caviar_services.recorder import provenance
@@ -131,7 +132,7 @@ def test_code_of_the_user_is_a_part_of_what_a_dataset_is(own: Path) -> None:
         with (own / file).open("a") as stream:
             stream.write("# edited\n")
         (found,) = differences(was, plan.settings())
-        assert found.startswith("code.agent_of_mine was '")
+        assert found == "agent_of_mine.py, or a module that it imports, has changed"
 
 
 def test_the_code_stands_in_recordings(own: Path) -> None:
@@ -214,8 +215,8 @@ def test_files_of_one_name_and_meshes_of_scenery_are_told_apart(tmp_path: Path) 
         "street.xml",
     ]
     (tmp_path / "wall.ply").write_bytes(WALL.replace(b"9", b"8"))
-    (changed,) = differences(found, _digests(_files({"settings": settings})))
-    assert changed.startswith("scenery/wall.ply was '")
+    changed = differences({"files": found}, {"files": _digests(_files({"settings": settings}))})
+    assert list(changed) == ["scenery/wall.ply has changed"]
 
 
 WALL = b"""ply

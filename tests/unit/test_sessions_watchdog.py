@@ -77,6 +77,24 @@ class SlowChannel(FreeSpaceChannel):
         return super().step(frame)
 
 
+def test_a_wait_is_told_again_when_its_time_doubles_or_after_so_long() -> None:
+    scenario = check_implementations(parse_scenario(SMOKE.read_text()))
+    plan = plan_run(scenario, "run", briefings(scenario, Path()))
+    work = ("channel", Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0))
+
+    def times(*again_s: float) -> list[float]:
+        watch = watchdog.Watchdog(plan, {}, lambda: work, tell, *again_s)
+        told_at = [0.0]
+        while len(told_at) < 6:
+            told_at.append(watch._due_s(work, told_at[-1]))
+        return told_at[1:]
+
+    assert times() == [watchdog.STEP_S * factor for factor in (1, 2, 4, 8, 16)]
+    assert times(2.0 * watchdog.STEP_S) == pytest.approx(
+        [watchdog.STEP_S * factor for factor in (1, 2, 4, 6, 8)]
+    )
+
+
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("LOOK_S", "STEP_S", "LOAD_S"):

@@ -188,8 +188,11 @@ def look_command(
             tasks[what] = bar.add_task(what, total=of)
         bar.update(tasks[what], completed=done)
 
+    def note(text: str) -> None:
+        print_line(bar.console, printable(text), "yellow")
+
     with bar:
-        file = write_page(dataset, out, progress)
+        file = write_page(dataset, out, progress, note)
     print_line(console, file)
 
 
@@ -263,6 +266,7 @@ class _Screen:
         )
         self._traffic: Any = None
         self._task: Any = None
+        self._trials: Any = None
         self._done, self._scenes, self._began = 0, 0, 0.0
 
     def __enter__(self) -> _Screen:
@@ -289,6 +293,12 @@ class _Screen:
             self._bar.remove_task(self._traffic)
             self._traffic = None
 
+    def tried(self, done: int, of: int) -> None:
+        """See `generate.Observer`."""
+        if self._trials is None:
+            self._trials = self._bar.add_task("workers ready", total=of, rate="")
+        self._bar.update(self._trials, completed=done)
+
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """See `generate.Observer`."""
         space = bytes_text(found.bytes) + ("" if free is None else f" of {bytes_text(free)} that are free")
@@ -296,6 +306,8 @@ class _Screen:
             self._bar.console,
             f"estimate: {duration_text(found.wall_s)} with {counted(workers, 'worker')}, {space}",
         )
+        if self._trials is not None:
+            self._bar.remove_task(self._trials)
         self._began = time.monotonic()
         self._task = self._bar.add_task("episodes", total=episodes, rate="")
 

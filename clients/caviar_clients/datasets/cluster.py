@@ -103,19 +103,26 @@ class Episodes:
         try:
             self._connect()
         except BaseException:
-            self._disconnect()
+            self._disconnect(at_once=True)
             raise
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._disconnect()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._disconnect(at_once=kind is not None)
 
-    def run_on_each(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def run_on_each(
+        self,
+        function: Callable[..., Any],
+        *arguments: Any,
+        on_result: Callable[[int, int], None] = lambda done, of: None,
+    ) -> list[Any]:
         """Call a function once in every worker at the same time.
 
         Args:
             function: Which can be pickled.
             arguments: Of it.
+            on_result: Called at the beginning, and with each result, with their number so far and that of
+                the workers.
 
         Returns:
             What it returned, by worker; those that are gone meanwhile are left out.
@@ -131,8 +138,12 @@ class Episodes:
             for address in self._last_seen()
         }
         self._watch.progressed(time.monotonic())
+        found, workers = list[Any](), len(pending)
+        on_result(0, workers)
         try:
-            found = list(self._tried(pending))
+            for result in self._tried(pending):
+                found.append(result)
+                on_result(len(found), workers)
         except (LostSchedulerError, OSError, TimeoutError) as error:
             raise RunError(
                 f"the Dask scheduler {self._where} was lost while scenes were tried "
@@ -151,13 +162,26 @@ class Episodes:
         while pending:
             for future in self._ended(pending):
                 del pending[future]
-                yield _result_of_trial(future)
+                yield self._result_of_trial(future)
             for stall in self._watch.look(time.monotonic(), what, None).values():
                 raise RunError(f"no scene can be played: {stall.error}")
             # No other worker may have the task of one that is gone.
             if there := self._watch.present:
                 for future in [one for one, address in pending.items() if address not in there]:
                     del pending[future]
+
+    def _result_of_trial(self, future: Future) -> Any:
+        if future.status == "finished":
+            return future.result(timeout=ANSWER_S)
+        error = future.exception(timeout=ANSWER_S)
+        if isinstance(error, CaviarError):
+            raise error
+        if type(error).__name__ != "KilledWorker":  # of Dask: the process died, or its machine is gone
+            raise RunError(f"no scene can be played: {type(error).__name__}: {error}") from error
+        raise RunError(
+            f"a process that tried a scene beforehand died ({self._exit_of(error)}); caviar run SCENARIO "
+            "--embedded plays it in one process and shows what it prints"
+        ) from error
 
     def play(self, tasks: Iterable[EpisodeTask]) -> Iterator[EpisodeResult]:
         """Play episodes, and yield what came of each, as they end.
@@ -201,7 +225,10 @@ class Episodes:
 
     def _fill(self, source: Iterator[EpisodeTask], waiting: deque[EpisodeTask], playing: _Playing) -> None:
         while len(playing.tasks) < self.workers * QUEUED:
-            task = waiting.popleft() if waiting else next(source, None)
+            task = next(source, None)
+            # What ended with its process comes last and queues behind none: another may have ended that.
+            if task is None and waiting and len(playing.tasks) < self.workers:
+                task = waiting.popleft()
             if task is None:
                 if (straggler := playing.straggler(self.workers)) is not None:
                     playing.begin(self._submit(straggler), straggler)
@@ -268,7 +295,14 @@ class Episodes:
         name = type(error).__name__
         if name != "KilledWorker":
             return EpisodeResult(task.episode, f"{name}: {error}")
-        return self._again(task, playing, "which died, of a signal or a lack of memory")
+        return self._again(task, playing, f"that died ({self._exit_of(error)})")
+
+    def _exit_of(self, error: Any) -> str:
+        """How the process of a `KilledWorker` of Dask ended."""
+        from caviar_clients.datasets.exits import exit_of
+
+        address = error.last_worker.address
+        return f"how is in the log of the worker {address}" if self._scheduler else exit_of(address)
 
     def _again(self, task: EpisodeTask, playing: _Playing, why: str) -> EpisodeResult | None:
         if playing.attempts[task.episode] < ATTEMPTS:
@@ -312,11 +346,13 @@ class Episodes:
             self._watch_workers()
             self.workers = len(self._last_seen())
             return
+        from caviar_clients.datasets.exits import NotingNanny
+
         cluster = self._stack.enter_context(
             LocalCluster(
                 n_workers=self.workers,
                 threads_per_worker=1,
-                processes=True,
+                worker_class=NotingNanny,
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
                 memory_limit=0,
@@ -331,8 +367,10 @@ class Episodes:
         self._watch.progressed(time.monotonic())
         self._connected.subscribe_topic(TOPIC, self._watch.tell)
 
-    def _disconnect(self) -> None:
-        self._client = None
+    def _disconnect(self, *, at_once: bool = False) -> None:
+        from caviar_clients.datasets.exits import NotingNanny
+
+        self._client, NotingNanny.at_once = None, at_once
         self._stack.close()
 
     def _reconnect(self, cause: Exception) -> None:
@@ -423,17 +461,3 @@ async def _exit() -> None:
     """End this process, as a fault would."""
     await asyncio.sleep(0.1)  # the scheduler has its answer first
     os._exit(1)
-
-
-def _result_of_trial(future: Future) -> Any:
-    if future.status == "finished":
-        return future.result(timeout=ANSWER_S)
-    error = future.exception(timeout=ANSWER_S)
-    if isinstance(error, CaviarError):
-        raise error
-    if type(error).__name__ != "KilledWorker":  # of Dask: the process died, or its machine is gone
-        raise RunError(f"no scene can be played: {type(error).__name__}: {error}") from error
-    raise RunError(
-        "a process that tried a scene beforehand died, of a signal, a lack of memory or an exit of a "
-        "service; play it alone with --workers 1 to see it"
-    ) from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from caviar_protocol.errors import RunError
@@ -17,7 +17,10 @@ from caviar_protocol.errors import RunError
 TOPIC = "caviar-waiting"
 """Of the events by which workers tell what they wait for."""
 LOOK_S = 5.0
-"""[s] without a result after which the scheduler is asked for its workers, and between two such questions."""
+"""[s] without a result after which the scheduler is asked for its workers, between two such questions, and
+between two reports of a step that goes on."""
+REPORTED_S = 15.0
+"""[s] without a report of a step after which it has ended, or its process gives no sign of life."""
 NOTE_S = 30.0
 """[s] without a result after which a note says what is waited for, and between two such notes."""
 SILENT_S = 30.0
@@ -82,7 +85,7 @@ class Stall:
     text: str
     """Service, frame and line of code."""
     stands_s: float
-    """For how long, when the worker reported it [s]."""
+    """For how long [s]."""
     worker: str
     """Address of the process."""
     reported: float
@@ -171,8 +174,13 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         Raises:
             RunError: There has been no worker for `NO_WORKER_S`, or `NO_PROCESS_S`.
         """
-        if now - max(self._progressed, self._looked) < LOOK_S:
-            return {}
+        stalls = {n: s for n, s in self._standing_now(now).items() if episodes is None or n in episodes}
+        over = {number: stall for number, stall in stalls.items() if stall.stands_s >= STALLED_S}
+        for number in over:
+            del self._stalls[number]
+        # Of other episodes results may come meanwhile.
+        if over or now - max(self._progressed, self._looked) < LOOK_S:
+            return over
         self._looked = now
         seen = self.last_seen()
         self.present = frozenset(seen)
@@ -181,15 +189,22 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
             address: old if (old := self._seen.get(address)) and old[0] == stamp else (stamp, now)
             for address, stamp in seen.items()
         }
-        stalls = {n: stall for n, stall in self._stalls.copy().items() if episodes is None or n in episodes}
-        strange = [*self._without_workers(now), *self._silent(now), *_standing(now, stalls)]
+        strange = [*self._without_workers(now), *self._silent(now), *_standing(stalls)]
         waited_s = now - self._progressed
         is_due = now - max(self._progressed, self._noted) >= NOTE_S
         if is_due and (strange or waited_s >= 2.0 * mean_s):
             self._noted = now
             at_workers = "" if episodes is None else f": {_at_workers(episodes)}"
             self.note("; ".join([f"{what} for {waited_s:.0f} s{at_workers}", *strange]))
-        return {n: self._stalls.pop(n) for n, stall in stalls.items() if stall.stands_s >= STALLED_S}
+        return {}
+
+    def _standing_now(self, now: float) -> dict[int, Stall]:
+        """Steps that go on, each with its time of now: a worker reports them every `LOOK_S`."""
+        return {
+            number: replace(stall, stands_s=stall.stands_s + now - stall.reported)
+            for number, stall in self._stalls.copy().items()
+            if now - stall.reported <= REPORTED_S
+        }
 
     def _without_workers(self, now: float) -> list[str]:
         if self._seen:
@@ -214,14 +229,8 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         return [f"{len(silent)} of {len(self._seen)} workers give no sign of life: {named}{_more(silent)}"]
 
 
-def _standing(now: float, stalls: Mapping[int, Stall]) -> list[str]:
-    # A step that goes on is reported again when its time has doubled: what is older has ended.
-    standing = [
-        f"episode {number}: {stall.text}"
-        for number, stall in sorted(stalls.items())
-        if now - stall.reported <= stall.stands_s + 2.0 * LOOK_S
-    ]
-    return standing[:SHOWN]
+def _standing(stalls: Mapping[int, Stall]) -> list[str]:
+    return [f"episode {number}: {stall.text}" for number, stall in sorted(stalls.items())[:SHOWN]]
 
 
 def _at_workers(episodes: Collection[int]) -> str:

@@ -139,13 +139,15 @@ class DatasetDirectory:
 
 
 @contextmanager
-def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
+def writing_dataset(directory: DatasetDirectory, *, elsewhere: bool = False) -> Iterator[None]:
     """Hold a dataset for as long as the block lasts, and remove what killed processes left half-written.
 
-    The folder of half-written recordings goes with the block, unless one is left in it.
+    The folder of half-written recordings goes with the block.
 
     Args:
         directory: Of the dataset; it is made where it is not there.
+        elsewhere: Whether processes that this one does not end write there: after a fault their recordings
+            are left.
 
     Raises:
         RunError: Another process writes it, or it cannot be written.
@@ -168,11 +170,14 @@ def writing_dataset(directory: DatasetDirectory) -> Iterator[None]:
             clear_work(directory)
         except OSError as error:
             raise unwritable(error.filename or directory.work, error) from error
+        is_over = not elsewhere
         try:
             yield
-            clear_work(directory)
+            is_over = True
         finally:
-            with suppress(OSError):  # after a fault, workers elsewhere may still write there
+            with suppress(OSError):
+                if is_over:
+                    clear_work(directory)
                 directory.work.rmdir()
     finally:
         os.close(lock)

@@ -20,7 +20,7 @@ from typing import Any
 
 import msgspec
 
-from caviar_clients.datasets.cluster_watch import StepWatch
+from caviar_clients.datasets.cluster_watch import LOOK_S, StepWatch
 from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there, unwritable
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
@@ -154,6 +154,7 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
         folder,
         on_frame=watch.frame_finished,
         on_wait=watch.waits,
+        wait_again_s=LOOK_S,
         episode=task.episode,
         with_journal=False,
     )

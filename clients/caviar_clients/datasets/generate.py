@@ -34,6 +34,9 @@ class Observer(Protocol):
     def traffic(self, now_s: float, end_s: float) -> None:
         """How far the pass through the traffic has come [s]."""
 
+    def tried(self, done: int, of: int) -> None:
+        """How many workers have played their scenes for the estimate."""
+
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """What the episodes that are left take, and what is free on the disk [B]; None: of an address."""
 
@@ -82,7 +85,7 @@ def generate(
         raise RunError(f"a dataset has {MOST_EPISODES:.0e} episodes at most, and not {plan.episodes}")
     remote = RemoteDataset(str(out)) if is_address(out) else None
     directory = DatasetDirectory(Path(out)) if remote is None else remote.written()
-    with writing_dataset(directory):
+    with writing_dataset(directory, elsewhere=bool(scheduler)):
         if remote is not None:
             _fetch_catalogue(remote, directory)
         settings = plan.settings()
@@ -143,7 +146,10 @@ def _generate(ledger: Ledger, observer: Observer, workers: int, scheduler: str) 
     check_least(ledger.directory.path, len(left), plan.scenes, has_recordings=ledger.remote is None)
     traffic = SharedTraffic(plan.scenario)
     traffic.save(plan.episodes, observer.traffic)
-    with Episodes(workers, scheduler, observer.note) as episodes:
+    episodes = Episodes(workers, scheduler, observer.note)
+    begun = counted(episodes.workers, "process", "processes")
+    observer.note(f"connecting to the Dask scheduler {scheduler} …" if scheduler else f"starting {begun} …")
+    with episodes:
         _estimate(ledger, left, traffic, episodes, observer)
         ledger.keep_plan()
         began = time.monotonic()
@@ -184,9 +190,11 @@ def _estimate(
     plan = ledger.plan
     tried = [left[len(left) * quarter // 4] for quarter in (1, 2, 3)]
     workers = counted(episodes.workers, "process", "processes")
-    observer.note(f"{workers} started, which try three scenes for an estimate")
+    observer.note(f"{workers} started: each loads the scenery and tries three scenes for an estimate …")
     cached = {name: data for number in tried for name, data in traffic.states_of(number).items()}
-    trials = episodes.run_on_each(try_worker, plan.scenario, ledger.place, tried, cached)
+    trials = episodes.run_on_each(
+        try_worker, plan.scenario, ledger.place, tried, cached, on_result=observer.tried
+    )
     good = [trial for trial in trials if trial.scenes]
     if not good:
         raise RunError(f"no scene can be played: {trials[0].error}")

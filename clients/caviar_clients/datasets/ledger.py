@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,10 @@ from typing import Any
 import msgspec
 
 from caviar_clients.datasets.catalogue import Catalogue, fingerprint
+from caviar_clients.datasets.differences import refusal
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.episode import MEASURED, SETTINGS
-from caviar_clients.datasets.plan import DatasetPlan, differences
+from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset
 from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.texts import counted
@@ -30,9 +31,7 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import resolved
 
 SHOWN = 3
-"""Differences and recordings that an error names."""
-SHOWN_CHARACTERS = 160
-"""Of a difference between two datasets."""
+"""Recordings that an error names."""
 
 
 class _Measured(msgspec.Struct):
@@ -143,10 +142,9 @@ class Ledger:
         elif fingerprint(before) != fingerprint(self.settings) and (
             self.catalogue.episodes() or self.sizes()
         ):
-            raise RunError(
-                f"{self.out} holds another dataset: {_shortened(differences(before, self.settings))}; "
-                "give another --out (--overwrite deletes the dataset that is there, with all its episodes)"
-            )
+            what = f"{self.out} holds another dataset"
+            text = refusal(what, _with_defaults(before), _with_defaults(self.settings))
+            raise RunError(text or refusal(what, before, self.settings))
 
     def compare_with_recordings(self, note: Callable[[str], None]) -> None:
         """List recordings that are not in the catalogue, and forget those that were removed.
@@ -226,14 +224,10 @@ class Ledger:
         found = {"scenario": recording.metadata.scenario, "versions": recording.metadata.versions}
         code = {f"code of {name}": digest[:16] for name, digest in self.settings.get("code", {}).items()}
         right = {"scenario": self.settings["scenario"], "versions": {**self.settings["versions"], **code}}
-        text = _shortened(differences(_with_defaults(found), _with_defaults(right)))
-        if not text and settings:
-            text = "the device, or the content of a file, is another one"
-        if text:
-            raise RunError(
-                f"{self._at(number)} is of another dataset: {text}; give another --out (--overwrite deletes "
-                "the dataset that is there, with all its episodes)"
-            )
+        otherwise = "the device, or the content of a file, is another one" if settings else ""
+        what = f"{self._at(number)} is of another dataset"
+        if text := refusal(what, _with_defaults(found), _with_defaults(right), otherwise):
+            raise RunError(text)
 
 
 def _with_defaults(made_from: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -244,14 +238,6 @@ def _with_defaults(made_from: Mapping[str, Any]) -> Mapping[str, Any]:
         return made_from
     # As JSON: tuples and lists are the same there.
     return {**made_from, "scenario": msgspec.json.decode(msgspec.json.encode(resolved(scenario)))}
-
-
-def _shortened(found: Iterator[str]) -> str:
-    texts = list(found)
-    shown = [
-        text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}…" for text in texts[:SHOWN]
-    ]
-    return "; ".join(shown) + (f" (and {len(texts) - SHOWN} more)" if len(texts) > SHOWN else "")
 
 
 def _measured(folder: Path) -> _Measured:

@@ -119,28 +119,6 @@ def with_own_traffic(scenario: Scenario) -> Scenario:
     return replace(scenario, services=services)
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
-    """Keys of the settings in which two datasets differ, each with both values.
-
-    Args:
-        before: Settings of one.
-        now: Settings of the other.
-
-    Example:
-        >>> list(differences({"device": "llvm"}, {"device": "cuda"}))
-        ["device was 'llvm', is 'cuda'"]
-    """
-    yield from _differences("", before, now)
-
-
-def _differences(key: str, before: Any, now: Any) -> Iterator[str]:
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in dict.fromkeys((*before, *now)):
-            yield from _differences(f"{key}.{name}" if key else name, before.get(name), now.get(name))
-    elif before != now:
-        yield f"{key} was {before!r}, is {now!r}"
-
-
 def _without_folders(value: Any) -> Any:
     if isinstance(value, str) and value.startswith("/"):
         return f"file:{Path(value).name}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -192,6 +193,24 @@ class OutsideAgent(Service[OutsideSettings]):
         """Wait for the decision."""
         self.run.progress("waiting for a decision", PATIENCE_S)
         return type(self).decide(frame)
+
+
+def failure_of(error: SystemExit | KeyboardInterrupt) -> RuntimeError:
+    """What a service failed by, whose code would end the program of the run without a word.
+
+    Args:
+        error: That the service raised.
+
+    Raises:
+        KeyboardInterrupt: It is Ctrl-C of the terminal, which Python raises in the main thread alone.
+    """
+    if isinstance(error, SystemExit):
+        text = f"it called sys.exit({error.code!r})"
+    elif threading.current_thread() is threading.main_thread():
+        raise error
+    else:
+        text = "it raised KeyboardInterrupt"
+    return RuntimeError(text).with_traceback(error.__traceback__)
 
 
 def declared(

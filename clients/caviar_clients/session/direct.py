@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from caviar_broker.core import events as ev
 from caviar_broker.core.graph import Edge, Graph
 from caviar_broker.core.plan import RunPlan
+from caviar_clients.session.base import failure_of
 from caviar_clients.session.watchdog import Work
 from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError, one_line
@@ -244,9 +245,8 @@ class DirectFrames:
         self.at_work = part.name, frame
         try:
             result = part.session.compute(frame)
-        except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
-            reason = RuntimeError(f"it called sys.exit({error.code!r})")
-            part.session.report(reason, "step", frame.episode, frame.number)
+        except (SystemExit, KeyboardInterrupt) as error:
+            part.session.report(failure_of(error), "step", frame.episode, frame.number)
             result = None
         self.at_work = None
         while self._sent:

@@ -7,6 +7,7 @@ Time stands still here: the run waits for each service it grants a frame, and no
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -28,7 +29,7 @@ from caviar_broker.policies import given_policies
 from caviar_broker.run_record import with_replay
 from caviar_broker.statistics import Statistics
 from caviar_clients.files import make_folder_of
-from caviar_clients.session.base import Frame, Session, declared
+from caviar_clients.session.base import Frame, Session, declared, failure_of
 from caviar_clients.session.direct import DirectFrames, plays_directly
 from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
@@ -120,6 +121,7 @@ class EmbeddedRun:
         on_notice, on_frame: Called with each notice to the user, and with each finished frame.
         on_wait: Called with what the run waits for, where that takes seconds: from another thread, since the
             service has this one. By default a warning of the logger ``caviar.session``.
+        wait_again_s: Time from one such call to the next at most [s]; by default it doubles.
         seats: By name, services that decide outside of the run (`OutsideSession`), and classes that declare
             them.
         imposed: Decisions that services take over in place of their own, as
@@ -141,6 +143,7 @@ class EmbeddedRun:
         on_notice: Callable[[ev.Notice], None] = lambda notice: None,
         on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
         on_wait: Callable[[str], None] = _log.warning,
+        wait_again_s: float = math.inf,
         seats: Mapping[str, type[Service[Any]]] | None = None,
         imposed: Imposed | None = None,
         episode: int | None = None,
@@ -214,7 +217,7 @@ class EmbeddedRun:
         settings = {name: spec.settings for name, spec in scenario.services.items()}
         if any(c.role == "world" and c.changes_geometry_with(settings[n]) for n, c in classes.items()):
             self._without_clock = False
-        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait)
+        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait, wait_again_s)
 
     def run(self) -> ev.Finished:
         """Run to the end.
@@ -291,11 +294,12 @@ class EmbeddedRun:
         self._at_work = order.service, order.message
         try:
             session.handle(order.message, parts)
-        except SystemExit as error:  # of a plug-in: it would end the caller's program without a word
+        except (SystemExit, KeyboardInterrupt) as error:
+            failure = failure_of(error)
             phase, episode, frame = "start", 0, -1
             if isinstance(order.message, m.Grant):
                 phase, episode, frame = "step", order.message.episode, order.message.frame
-            session.report(RuntimeError(f"it called sys.exit({error.code!r})"), phase, episode, frame)
+            session.report(failure, phase, episode, frame)
         self._at_work = None
         if self._encodes and type(order.message) is m.Grant:
             self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)

@@ -6,17 +6,19 @@ computes, the run itself does nothing. The watchdog looks at the run from a thre
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias
 
 from caviar_broker.core.plan import RunPlan, duration
 from caviar_protocol import messages as m
 from caviar_protocol.codec import message_type
+from caviar_services.places import place_in
 from caviar_services.service import Frame, Service
 
 LOOK_S = 1.0
@@ -42,8 +44,10 @@ class Watchdog:
             thread, and returns the same object for as long as the work lasts.
         tell: Called with each text from the thread of the watchdog: ``waiting for agent 'agent' in frame 3,
             for 5 s now (budget 20 ms)``. Then again whenever the time has doubled, and after `stop`.
+        again_s: Time from one text to the next at most [s].
 
     Example:
+        >>> from pathlib import Path
         >>> from caviar_broker.core.plan import briefings, plan_run
         >>> from caviar_protocol.scenario import load_scenario
         >>> scenario, told = load_scenario("smoke"), SimpleQueue()
@@ -61,9 +65,11 @@ class Watchdog:
         classes: Mapping[str, type[Service[Any]]],
         present: Callable[[], Work | None],
         tell: Callable[[str], None],
+        again_s: float = math.inf,
     ) -> None:
         self._services = {service.name: service for service in plan.services}
         self._classes, self._present, self._tell = classes, present, tell
+        self._again_s = again_s
         self._phases: dict[str, str] = {}
         # Its `put` may be called from a signal handler that interrupts another `put`; a lock may not.
         self._orders: SimpleQueue[str] = SimpleQueue()
@@ -108,10 +114,13 @@ class Watchdog:
             if work is not seen:  # its time counts from here: the run itself reads no clock for this
                 seen, since, told_at = work, now - wait_s, 0.0
             elapsed = now - since
-            if work is not None and (stopping or elapsed >= max(self._patience_s(work), 2.0 * told_at)):
+            if work is not None and (stopping or elapsed >= self._due_s(work, told_at)):
                 told_at = elapsed
                 self._tell(self._text(work, elapsed))
             wait_s, stopping = LOOK_S, False
+
+    def _due_s(self, work: Work, told_at: float) -> float:
+        return max(self._patience_s(work), min(2.0 * told_at, told_at + self._again_s))
 
     def _patience_s(self, work: Work) -> float:
         service, task = work
@@ -129,7 +138,10 @@ class Watchdog:
             text += f" (budget {duration(service.budget_ns)})"
         elif phase := self._phases.get(name):
             text += f" ({phase})"
-        place = _place(self._watched, self._classes.get(name))
+        frame = sys._current_frames().get(self._watched)
+        place = place_in(
+            self._classes.get(name), ((f.f_code, line) for f, line in traceback.walk_stack(frame))
+        )
         return f"{text}, at {place}" if place else text
 
 
@@ -150,18 +162,3 @@ def _doing(task: m.Message | Frame | None) -> str:
             return f"to end episode {episode}"
         case _:
             return f"to handle {message_type(task)}"
-
-
-def _place(thread: int, cls: type[Service[Any]] | None) -> str:
-    """The line of the modules of a class and its bases that runs in a thread; empty where none does."""
-    modules = (sys.modules.get(base.__module__) for base in (cls.__mro__ if cls else ()))
-    files = {getattr(module, "__file__", None) for module in modules}
-    frame = sys._current_frames().get(thread)
-    while frame is not None and frame.f_code.co_filename not in files:
-        frame = frame.f_back
-    if frame is None:
-        return ""
-    file = Path(frame.f_code.co_filename)
-    if file.is_relative_to(Path.cwd()):
-        file = file.relative_to(Path.cwd())
-    return f"{file}:{frame.f_lineno} in {frame.f_code.co_name}"

@@ -5,7 +5,6 @@ The file is whole: pictures are in it, nothing is loaded from elsewhere, and it 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.look.beams import BEAM_COLUMNS, beams_section, impossible_beams
 from caviar_clients.datasets.look.data import (
     Content,
     Progress,
+    Sample,
     UserColumns,
     read_sample,
     read_users,
 )
 from caviar_clients.datasets.look.description import name_of, scenario_of, what_it_is
 from caviar_clients.datasets.look.distributions import (
-    beams_height,
     draw_angles,
-    draw_beams,
     draw_correlation,
     draw_counts,
     draw_histograms,
@@ -52,21 +51,24 @@ from caviar_services.mesh.scenery import find_scenery, read_scenery
 CLASSES = 12
 """Classes of objects with a bar of their own at most."""
 
-MOST_PAIRS = 2**24
-"""Pairs of beams of a picture: more are finer than its pixels, and take the memory of the machine."""
 
-
-def _quiet(_what: str, _done: int, _of: int) -> None:
+def _quiet(*_: object) -> None:
     """Tell nobody."""
 
 
-def write_page(dataset: str | Path, out: Path | None = None, progress: Progress = _quiet) -> Path:
+def write_page(
+    dataset: str | Path,
+    out: Path | None = None,
+    progress: Progress = _quiet,
+    note: Callable[[str], None] = _quiet,
+) -> Path:
     """Write the page of a dataset.
 
     Args:
         dataset: Folder or address of the dataset.
         out: The file; None: ``look.html`` in the folder, of an address in that of the cache.
         progress: Is told how far it is.
+        note: Called with a line for each kind of thing that is left out: how many, and why.
 
     Returns:
         The file.
@@ -83,16 +85,17 @@ def write_page(dataset: str | Path, out: Path | None = None, progress: Progress 
     data = Dataset(dataset)  # before anything is written: a folder that is no dataset stays as it is
     file = out or data.directory.page
     with reserved(file):
-        write_file(file, page(data, progress))
+        write_file(file, page(data, progress, note))
     return file
 
 
-def page(data: Dataset, progress: Progress = _quiet) -> str:
+def page(data: Dataset, progress: Progress = _quiet, note: Callable[[str], None] = _quiet) -> str:
     """Make the page of a dataset.
 
     Args:
         data: The dataset.
         progress: Is told how far it is.
+        note: As of `write_page`.
 
     Returns:
         HTML.
@@ -103,12 +106,15 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
     """
     catalogue = Catalogue(data.directory.catalogue)
     try:
-        refuse_impossible(catalogue)
+        refuse_impossible(catalogue, but=BEAM_COLUMNS)
         _, rows = catalogue.query("SELECT DISTINCT topic FROM products WHERE status <> 'absent'")
         topics = {topic for (topic,) in rows}
         found, error = _scenery(data)
         users = read_users(catalogue, progress)
         content = Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
+        for text in (impossible_beams(content), _unread(content.sample)):
+            if text:
+                note(f"{text}; caviar verify {data.location} says more")
         sections = list[Section]()
         for at, (name, title, make) in enumerate(_SECTIONS):
             some = len(data) or name in ("dataset", "generation")
@@ -118,6 +124,15 @@ def page(data: Dataset, progress: Progress = _quiet) -> str:
     finally:
         catalogue.close()
     return document(name_of(data), data.name, sections)
+
+
+def _unread(sample: Sample) -> str:
+    """Which recordings are left out, and why; empty where none is."""
+    if not sample.left_out:
+        return ""
+    number, why = sample.left_out[0]
+    read = f"{len(sample.left_out)} of {counted(len(sample.episodes), 'recording')}"
+    return f"left out: {read} that cannot be read, the first of episode {number}: {why}"
 
 
 def _scenery(data: Dataset) -> tuple[Footprints | None, str]:
@@ -316,60 +331,6 @@ def _angles(content: Content) -> Iterator[str]:
         )
 
 
-def _beams(content: Content) -> Iterator[str]:
-    users = content.users
-    if "link" not in content.topics:
-        yield absent("No link is recorded: the best beams are not known.")
-        return
-    some = (users.tx_beam >= 0) & (users.rx_beam >= 0)
-    if not some.any():
-        yield absent("No user has a best pair of beams.")
-        return
-    beams = [
-        max(_codebook(content, role), int(column[some].max()) + 1)
-        for role, column in (("tx", users.tx_beam), ("rx", users.rx_beam))
-    ]
-    if math.prod(beams) > MOST_PAIRS:
-        yield absent(f"Codebooks of {beams[0]:,} and {beams[1]:,} beams have too many pairs to be drawn.")
-        return
-    counts = np.bincount(users.group[some], minlength=len(users.groups))
-    shown = [int(group) for group in np.argsort(-counts, kind="stable")[:PANELS] if counts[group]]
-    panels = []
-    for group in sorted(shown):
-        mask = some & (users.group == group)
-        carrier, tx = users.groups[group]
-        panels.append((f"{tx}, {carrier}", users.tx_beam[mask], users.rx_beam[mask]))
-    codebooks = beams[0], beams[1]
-    pairs, numbers = np.unique(
-        np.stack([users.group, users.tx_beam, users.rx_beam])[:, some], axis=1, return_counts=True
-    )
-    at = int(numbers.argmax())
-    carrier, tx = users.groups[pairs[0, at]]
-    left = int((counts > 0).sum()) - len(shown)
-    left_out = f" Left out: {left} more with fewer users." if left else ""
-    yield figure(
-        picture(
-            draw_beams(panels, codebooks),
-            f"Heat map of how often each pair of beams is the best; the most frequent one is beam "
-            f"{pairs[1, at]} of {tx} with beam {pairs[2, at]} of the receiver.",
-            beams_height(panels),
-        ),
-        f"How often a pair of beams is the best of all, on a logarithmic scale: of "
-        f"{counted(pairs.shape[1], 'pair')} that occur, most often "
-        f"({percent(numbers[at] / some.sum())}) beam {pairs[1, at]} of {tx} with beam {pairs[2, at]} of the "
-        f"receiver, on carrier {carrier}.{left_out}",
-    )
-
-
-def _codebook(content: Content, role: str) -> int:
-    """Beams that the largest array of this role has at least."""
-    sizes = [1]
-    for device in scenario_of(content.data).get("devices", ()):
-        if device.get("role") in (role, "both") and isinstance(array := device.get("array"), dict):
-            sizes.append(array.get("rows", 1) * array.get("columns", 1))
-    return max(sizes)
-
-
 def _correlation(content: Content) -> Iterator[str]:
     sample = content.sample
     _, ((most,),) = content.catalogue.query("SELECT max(scenes) FROM episodes")
@@ -407,7 +368,7 @@ _SECTIONS: tuple[tuple[str, str, Callable[[Content], Iterator[str]]], ...] = (
     ("sight", "Line of sight and paths", _sight),
     ("gain", "Gain and delay spread", _gain),
     ("angles", "Angles", _angles),
-    ("beams", "Best beams", _beams),
+    ("beams", "Best beams", beams_section),
     ("correlation", "Correlation of consecutive scenes", _correlation),
     ("lidar", "LIDAR", lidar_section),
     ("cameras", "Cameras", camera_section),
