@@ -137,7 +137,7 @@ def test_an_episode_that_fails_leaves_nothing_and_says_why(tmp_path: Path) -> No
         (lambda: _raise(MemoryError()), "MemoryError (at "),
         (lambda: _endless(0), "RecursionError: maximum recursion depth exceeded (at "),
         (lambda: _raise(KeyboardInterrupt()), "it raised KeyboardInterrupt (at "),
-        (lambda: _raise(ValueError("I will\n  not\n")), "ValueError: I will not (at "),
+        (lambda: _raise(ValueError("I will\n  not\n")), "ValueError: I will / not (at "),
         (lambda: _raise(SystemExit(3)), "it called sys.exit(3) (at "),
     ],
 )
