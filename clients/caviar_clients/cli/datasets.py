@@ -131,7 +131,7 @@ def generate_command(
     )
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
-            print_line(console, f"episode {number} failed: {printable(error)}", "red")
+            print_line(console, f"episode {number} failed: {printable(' '.join(error.split()))}", "red")
         raise RunError(
             f"{counted(len(outcome.failed), 'episode')} of {plan.episodes} failed, all are listed in "
             f"table failures of {out.rstrip('/')}/catalogue.sqlite; the same command tries them again"
