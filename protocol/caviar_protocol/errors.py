@@ -162,6 +162,8 @@ def suggestion(name: str, known: Iterable[str]) -> str:
         "did you mean 'frames'?"
     """
     names = sorted(known)
+    if cased := next((known for known in names if known.lower() == name.lower()), None):
+        return f"did you mean {cased!r}?"
     # 0.6 finds one or two wrong letters in a short word, and rarely a word that was not meant.
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if near:

@@ -407,6 +407,8 @@ class Notes:
     def estimated(self, *_: object) -> None:
         self.is_estimated = True
 
+    def returned(self) -> None: ...
+
     def ended(self, _: object) -> None: ...
 
 

@@ -45,6 +45,15 @@ def test_what_has_no_end_is_counted() -> None:
     assert plain_progress.line_of(bar.tasks[0]) == "frames: 12"
 
 
+def test_the_time_left_is_that_of_the_command_where_it_knows() -> None:
+    bar = plain_progress.PlainProgress(console=Console(file=io.StringIO()))
+    task = bar.add_task("episodes", total=4, left="")
+    bar.update(task, completed=1)
+    assert plain_progress.line_of(bar.tasks[0]) == "episodes: 25 %"
+    bar.update(task, left="0:00:09 left")
+    assert plain_progress.line_of(bar.tasks[0]) == "episodes: 25 %, 0:00:09 left"
+
+
 def test_every_task_that_has_not_ended_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a page with several parts, or a traffic before the episodes, not the first one for ever."""
     output, ended = io.StringIO(), iter((False, True))

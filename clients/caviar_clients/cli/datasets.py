@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -86,8 +88,7 @@ def generate_command(
     ] = False,
 ) -> None:
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
-    require_installed("caviar generate", ["datasets"])
-    from caviar_clients.cli.scenarios import require_extras
+    from caviar_clients.cli.scenarios import extras_of
     from caviar_clients.datasets.generate import generate
     from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
     from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
@@ -107,7 +108,7 @@ def generate_command(
         loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
-    require_extras(loaded)
+    require_installed(f"caviar generate {scenario}", ("datasets", *extras_of(loaded)))
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
     if overwrite:
         _remove(out)
@@ -130,7 +131,7 @@ def generate_command(
     )
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
-            print_line(console, f"episode {number} failed: {printable(error)}", "red")
+            print_line(console, f"episode {number} failed: {printable(' '.join(error.split()))}", "red")
         raise RunError(
             f"{counted(len(outcome.failed), 'episode')} of {plan.episodes} failed, all are listed in "
             f"table failures of {out.rstrip('/')}/catalogue.sqlite; the same command tries them again"
@@ -254,20 +255,54 @@ def _remove(out: str) -> None:
             file.unlink(missing_ok=True)
 
 
+@dataclass
+class Pace:
+    """How fast episodes are played, and what time is left.
+
+    Example:
+        >>> pace = Pace(episodes=6, began=100.0)
+        >>> pace.ended(scenes=10)
+        >>> pace.texts(110.0)  # of one episode nothing follows
+        ('', '')
+        >>> pace.ended(scenes=10)
+        >>> pace.texts(120.0)
+        ('1.00 scenes/s', '0:00:40 left')
+    """
+
+    episodes: int
+    """That are left."""
+    began: float
+    """When the first of them began, of any clock [s]."""
+    done: int = 0
+    scenes: int = 0
+
+    def ended(self, scenes: int) -> None:
+        """Count an episode, with its scenes."""
+        self.episodes, self.done, self.scenes = self.episodes - 1, self.done + 1, self.scenes + scenes
+
+    def texts(self, now: float) -> tuple[str, str]:
+        """Rate and time left; empty where fewer than two episodes have ended."""
+        if self.done < 2 or now <= self.began:
+            return "", ""
+        left_s = round((now - self.began) / self.done * self.episodes)
+        left = f"{timedelta(seconds=left_s)} left" if self.episodes else ""
+        return f"{self.scenes / (now - self.began):.2f} scenes/s", left
+
+
 class _Screen:
     """Shows how a generation goes on: as a bar, or as lines where no bar can be drawn."""
 
     def __init__(self, console: Console) -> None:
-        from rich.progress import MofNCompleteColumn, TimeRemainingColumn
+        from rich.progress import MofNCompleteColumn
 
         self._console = console
         self._bar: Progress = progress_bar(
-            console, MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn(), transient=True
+            console, MofNCompleteColumn(), "{task.fields[rate]}", "{task.fields[left]}", transient=True
         )
         self._traffic: Any = None
         self._task: Any = None
         self._trials: Any = None
-        self._done, self._scenes, self._began = 0, 0, 0.0
+        self._done, self._pace = 0, Pace(0, 0.0)
 
     def __enter__(self) -> _Screen:
         self._bar.start()
@@ -287,8 +322,11 @@ class _Screen:
                 self._bar.console,
                 f"one pass through {duration_text(end_s)} of traffic, kept for all episodes",
             )
-            self._traffic = self._bar.add_task("traffic", total=end_s, rate="s")
-        self._bar.update(self._traffic, completed=round(now_s))
+            self._traffic = self._bar.add_task("traffic", total=end_s, rate="s", left="")
+            self._pace = Pace(0, time.monotonic())
+        left_s = (time.monotonic() - self._pace.began) * (end_s / max(now_s, 1.0) - 1.0)
+        left = f"{timedelta(seconds=round(left_s))} left"
+        self._bar.update(self._traffic, completed=round(now_s), left=left)
         if now_s >= end_s:
             self._bar.remove_task(self._traffic)
             self._traffic = None
@@ -296,7 +334,7 @@ class _Screen:
     def tried(self, done: int, of: int) -> None:
         """See `generate.Observer`."""
         if self._trials is None:
-            self._trials = self._bar.add_task("workers ready", total=of, rate="")
+            self._trials = self._bar.add_task("workers ready", total=of, rate="", left="")
         self._bar.update(self._trials, completed=done)
 
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
@@ -308,13 +346,18 @@ class _Screen:
         )
         if self._trials is not None:
             self._bar.remove_task(self._trials)
-        self._began = time.monotonic()
-        self._task = self._bar.add_task("episodes", total=episodes, rate="")
+        self._pace = Pace(episodes, time.monotonic())
+        self._task = self._bar.add_task("episodes", total=episodes, rate="", left="")
+
+    def returned(self) -> None:
+        """See `generate.Observer`."""
+        if self._task is not None:
+            self._pace = Pace(self._pace.episodes, time.monotonic())
+            self._bar.update(self._task, rate="", left="")
 
     def ended(self, result: EpisodeResult) -> None:
         """See `generate.Observer`."""
-        now = time.monotonic()
         self._done += 1
-        self._scenes += len(result.rows.scenes) if result.rows else 0
-        rate = self._scenes / max(now - self._began, 1e-9)
-        self._bar.update(self._task, completed=self._done, rate=f"{rate:.2f} scenes/s")
+        self._pace.ended(len(result.rows.scenes) if result.rows else 0)
+        rate, left = self._pace.texts(time.monotonic())
+        self._bar.update(self._task, completed=self._done, rate=rate, left=left)

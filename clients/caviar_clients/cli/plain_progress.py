@@ -53,6 +53,8 @@ def line_of(task: Task) -> str:
     start = f"{task.description}: " if task.description else ""
     if task.total is None:
         return f"{start}{task.completed:g}"
+    if (said := task.fields.get("left")) is not None:  # the command knows better
+        return f"{start}{task.percentage:.0f} %{f', {said}' if said else ''}"
     left = task.time_remaining
     if left is None and task.elapsed and 0 < task.completed < task.total:
         left = task.elapsed * (task.total / task.completed - 1)

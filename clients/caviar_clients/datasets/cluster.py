@@ -16,9 +16,9 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
+from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_services.drjit_setup import THREADS_VARIABLE
 
 # Part of the extra `datasets`: imported where it is used.
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ ATTEMPTS = 5
 """Times that an episode is begun, where the processes that play it die."""
 QUEUED = 2
 """Episodes that wait at each worker, so that none waits for this process."""
-CONNECT_S = 10.0
 RECONNECT_S = 600.0
 """[s] for which a scheduler that is gone is waited for."""
 ANSWER_S = 20.0
@@ -36,29 +35,6 @@ ANSWER_S = 20.0
 STRAGGLER = 6.0
 """An episode that takes so many times as long as the mean, when no other is left to begin, is begun on a
 second worker."""
-
-_CONFIG = {
-    # Episodes are begun again by `Episodes`, which counts: one that kills its worker does so a few times.
-    "distributed.scheduler.allowed-failures": 0,
-    # [s] without a sign of life after which a process of this machine is started anew.
-    "distributed.scheduler.worker-ttl": "120s",
-    "distributed.worker.daemon": True,
-    # Its samples of stacks grow by 0.3 MB an episode, for good (distributed 2026.8).
-    "distributed.worker.profile.enabled": False,
-    # A worker's memory is that of ray tracer and SUMO, of which Dask can spill nothing.
-    "distributed.worker.memory.target": False,
-    "distributed.worker.memory.spill": False,
-    "distributed.worker.memory.pause": False,
-    "distributed.worker.memory.terminate": False,
-    "distributed.comm.timeouts.connect": f"{CONNECT_S:.0f}s",
-    # One thread of the ray tracer in each process: two processes do 1.7 times the work of one with two.
-    "distributed.nanny.pre-spawn-environ": {
-        THREADS_VARIABLE: "1",
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-    },
-}
 
 
 class NoWorkerError(RunError):
@@ -76,30 +52,25 @@ class Episodes:
         workers: Processes here; 0: as many as there are cores. Ignored where there is a scheduler.
         scheduler: Address of one that runs already, ``tcp://HOST:8786``; empty: a cluster of this machine.
         on_note: Called with what a user has to know: that a scheduler is waited for.
+        on_return: Called when a scheduler that was lost is there again.
     """
 
     def __init__(
-        self, workers: int, scheduler: str = "", on_note: Callable[[str], None] = lambda _: None
+        self,
+        workers: int,
+        scheduler: str = "",
+        on_note: Callable[[str], None] = lambda _: None,
+        on_return: Callable[[], None] = lambda: None,
     ) -> None:
         self.workers = workers or len(os.sched_getaffinity(0))
         """Processes that play; of a scheduler elsewhere it is known once it is connected."""
-        self._scheduler, self._note = scheduler, on_note
+        self._scheduler, self._note, self._returned = scheduler, on_note, on_return
         self._client: Client | None = None
         self._watch = ClusterWatch(scheduler, dict, on_note)
         self._stack = ExitStack()
 
     def __enter__(self) -> Episodes:
-        import dask
-
-        dask.config.set(_CONFIG)
-        for name in (
-            "distributed",
-            "distributed.nanny",
-            "distributed.scheduler",
-            "distributed.worker",
-            "tornado",
-        ):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
+        set_up_dask()
         try:
             self._connect()
         except BaseException:
@@ -396,6 +367,7 @@ class Episodes:
                     self._note(f"waiting for {now - began:.0f} s: {error}")
                 time.sleep(1.0)
             else:
+                self._returned()
                 return
 
 

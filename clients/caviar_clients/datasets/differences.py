@@ -22,7 +22,8 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[s
     Example:
         >>> before = {"scenario": {"carriers": [{"frequency_hz": 28e9}]}, "code": {"my_agent": "1a"}}
         >>> now = {"scenario": {"carriers": [{"frequency_hz": 60e9}]}, "code": {"my_agent": "2b"}}
-        >>> print(*differences(before, now), sep="\n")
+        >>> for text in differences(before, now):
+        ...     print(text)
         carriers[0].frequency_hz was 28e9, is 60e9
         my_agent.py, or a module that it imports, has changed
     """

@@ -40,6 +40,9 @@ class Observer(Protocol):
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """What the episodes that are left take, and what is free on the disk [B]; None: of an address."""
 
+    def returned(self) -> None:
+        """A scheduler that was lost is there again: what is measured of time begins anew."""
+
     def ended(self, result: EpisodeResult) -> None:
         """An episode ended, well or not."""
 
@@ -146,7 +149,7 @@ def _generate(ledger: Ledger, observer: Observer, workers: int, scheduler: str) 
     check_least(ledger.directory.path, len(left), plan.scenes, has_recordings=ledger.remote is None)
     traffic = SharedTraffic(plan.scenario)
     traffic.save(plan.episodes, observer.traffic)
-    episodes = Episodes(workers, scheduler, observer.note)
+    episodes = Episodes(workers, scheduler, observer.note, observer.returned)
     begun = counted(episodes.workers, "process", "processes")
     observer.note(f"connecting to the Dask scheduler {scheduler} …" if scheduler else f"starting {begun} …")
     with episodes:

@@ -102,7 +102,9 @@ class Dataset:
 
         Raises:
             RecordingError: It is none of this dataset, or its recording cannot be read.
+            TypeError: It is no whole number.
         """
+        number = _number(number, "number is")
         if number not in self.episodes:
             raise RecordingError(
                 f"{self.location} has no episode {number} here; it has {_range(sorted(self.episodes))}"
@@ -120,7 +122,8 @@ class Dataset:
             A dataset for each share; the last one takes what rounding leaves where they add up to 1.
 
         Raises:
-            ValueError: There is no share, one is not positive, or they add up to more than 1.
+            ValueError: There is no share, one is not positive, they add up to more than 1, or a part gets no
+                episode.
             TypeError: It is a number: a part lacks its share.
 
         Example:
@@ -137,6 +140,14 @@ class Dataset:
         order = sorted(self.episodes)
         random.Random(seed).shuffle(order)  # noqa: S311 - no secret; its algorithm is the same everywhere
         bounds = [round(len(order) * sum(shares[:at])) for at in range(len(shares) + 1)]
+        empty = next((at for at, (low, high) in enumerate(pairwise(bounds)) if low == high), None)
+        if empty is not None:
+            least = max(1.0 / max(len(order), 1), 0.01)
+            remedy = f", or give it {least:.2g} at least" if len(order) >= len(shares) else ""
+            raise ValueError(
+                f"shares are {shares}: of {counted(len(order), 'episode')} part {empty + 1} gets none; "
+                f"divide more episodes{remedy}"
+            )
         return tuple(Dataset(self.location, sorted(order[low:high])) for low, high in pairwise(bounds))
 
     def select(self, episodes: Iterable[int]) -> Dataset:
@@ -297,14 +308,23 @@ def _numbers(episodes: Iterable[int]) -> tuple[int, ...]:
         raise TypeError(f"episodes is {episodes!r}: write a list of numbers, as [{episodes!r}]")
     found = list[int]()
     for number in episodes:
-        try:
-            found.append(operator.index(number))
-        except TypeError:
-            raise TypeError(f"episodes has {number!r}: write whole numbers, as [0, 1]") from None
+        found.append(_number(number, "episodes has"))
     if len(set(found)) < len(found):
         twice = next(number for number in found if found.count(number) > 1)
         raise ValueError(f"episodes has {twice} {found.count(twice)} times: name each once")
     return tuple(found)
+
+
+def _number(value: Any, what: str) -> int:
+    """The number of an episode, which begins an error as `what`."""
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        is_whole = isinstance(value, float) and value.is_integer()
+        text = str(int(value) if is_whole else value).strip()
+        raise TypeError(
+            f"{what} {value!r}, a {type(value).__name__}: the number of an episode is an int, write "
+            f"{text if text.isdecimal() else 0}"
+        )
+    return operator.index(value)
 
 
 def _range(episodes: Sequence[int]) -> str:

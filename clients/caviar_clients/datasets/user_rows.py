@@ -71,6 +71,9 @@ class Columns(Mapping[str, NDArray[Any]]):
     def __iter__(self) -> Iterator[str]:
         return iter(self._columns)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns
+
     def __len__(self) -> int:
         """Number of rows."""
         return len(next(iter(self._columns.values()))) if self._columns else 0
@@ -108,6 +111,15 @@ class Users:
         lines = [f"{counted(len(self), 'user')} of {self._dataset.location}"]
         lines += [f"  {name}: {text}" for name, text in about.items()]
         return "\n".join(lines)
+
+    def __getattr__(self, name: str) -> Any:
+        # Only of what is not there.
+        if name.startswith("_"):
+            raise AttributeError(name, name=name, obj=self)
+        meant = [name] if name in self._table else _recorded_like(name)
+        written = " or ".join(f"users[{one!r}]" for one in meant[:3])
+        hint = f"write {written}" if meant else "print(users) lists their names"
+        raise AttributeError(f"users have no attribute {name!r}; {hint}", name=name, obj=self)
 
     def recorded(self) -> dict[str, str]:
         """Names of the recorded arrays, each with what it is, its unit and the shape of a row."""
@@ -251,6 +263,11 @@ class Users:
             raise ValueError(f"names is {names!r}: name a column at least; known: {', '.join(self._table)}")
         for name in names:
             topic, dot, field = name.partition(".")
+            if not dot and name not in self._table and (arrays := _recorded_like(name)):
+                raise RecordingError(
+                    f"there is no column {name!r}; a recorded array has its topic's name in front: "
+                    f"{', '.join(map(repr, arrays))}"
+                )
             if not dot:
                 self._table[name]  # which raises
             elif topic not in _WITH_USERS:
@@ -322,6 +339,18 @@ class Users:
             f"{place}: {table['rx'][user]} has {len(own)} sensors of {topic} on its object, and {len(fixed)} "
             f"stand fixed: it takes one of either; read dataset.episode({table['episode'][user]})[{topic!r}]"
         )
+
+
+def _recorded_like(name: str) -> list[str]:
+    """Names of recorded arrays that are meant by that of a topic, or by one without its topic."""
+    if name.lower() in _WITH_USERS:
+        return [f"{name.lower()}.{field}" for field in TOPIC_ARRAYS[name.lower()].columns]
+    return [
+        f"{topic}.{field}"
+        for topic in _WITH_USERS
+        for field in TOPIC_ARRAYS[topic].columns
+        if field.lower() == name.lower()
+    ]
 
 
 def check_batches(size: int, shuffle: int | None) -> None:

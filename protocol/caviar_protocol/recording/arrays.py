@@ -172,6 +172,13 @@ class TopicArrays(Generic[P, K]):
         self._reference: TopicArrays[Any, K] | None = None
         self._known_sizes: dict[str, tuple[int, ...]] = {}
 
+    def __getattr__(self, name: str) -> Any:
+        # Only of what is not there.
+        hint = suggestion(name, self.columns)
+        topic = self.__dict__.get("topic", type(self).__name__)
+        text = name if name.startswith("_") else f"{topic} has no {name!r}; {hint}"
+        raise AttributeError(text, name=name, obj=self)
+
     # --- frames -------------------------------------------------------------------------------
 
     @property
