@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from caviar_clients.datasets import exits
-from caviar_clients.datasets.exits import NotingNanny, exit_of, exit_text
+from caviar_clients.datasets.exits import exit_of, exit_text, noting_nanny
 
 
 @pytest.mark.parametrize("at_once", [True, False])
@@ -25,9 +25,9 @@ def test_a_command_that_is_interrupted_waits_for_no_step(
     async def ask(**named: Any) -> None:
         asked.append(named)
 
-    monkeypatch.setattr(NotingNanny, "at_once", at_once)
+    monkeypatch.setattr(noting_nanny(), "at_once", at_once)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as process:
-        nanny = NotingNanny.__new__(NotingNanny)
+        nanny = noting_nanny().__new__(noting_nanny())
         nanny.process = SimpleNamespace(pid=process.pid, kill=ask)
         asyncio.run(nanny.kill(timeout=1.0, reason="test"))
         if not at_once:

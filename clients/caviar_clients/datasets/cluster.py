@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
 from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
+from caviar_clients.datasets.exits import exit_of, noting_nanny
 from caviar_protocol.errors import CaviarError, RunError
 
 # Part of the extra `datasets`: imported where it is used.
@@ -270,8 +271,6 @@ class Episodes:
 
     def _exit_of(self, error: Any) -> str:
         """How the process of a `KilledWorker` of Dask ended."""
-        from caviar_clients.datasets.exits import exit_of
-
         address = error.last_worker.address
         return f"how is in the log of the worker {address}" if self._scheduler else exit_of(address)
 
@@ -317,13 +316,11 @@ class Episodes:
             self._watch_workers()
             self.workers = len(self._last_seen())
             return
-        from caviar_clients.datasets.exits import NotingNanny
-
         cluster = self._stack.enter_context(
             LocalCluster(
                 n_workers=self.workers,
                 threads_per_worker=1,
-                worker_class=NotingNanny,
+                worker_class=noting_nanny(),
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
                 memory_limit=0,
@@ -339,9 +336,7 @@ class Episodes:
         self._connected.subscribe_topic(TOPIC, self._watch.tell)
 
     def _disconnect(self, *, at_once: bool = False) -> None:
-        from caviar_clients.datasets.exits import NotingNanny
-
-        self._client, NotingNanny.at_once = None, at_once
+        self._client, noting_nanny().at_once = None, at_once
         self._stack.close()
 
     def _reconnect(self, cause: Exception) -> None:

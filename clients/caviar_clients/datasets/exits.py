@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import time
 from collections.abc import MutableMapping
 from contextlib import suppress
 from typing import Any, ClassVar
-
-# Of the extra `datasets`: who imports this module needs it.
-from distributed import Nanny
 
 KNOWN_S = 2.0
 """[s] within which an exit is noted, once the scheduler has noted the loss of its worker."""
@@ -26,33 +24,43 @@ _HINTS = {
 }
 
 
-class NotingNanny(Nanny):  # type: ignore[misc]  # distributed has no types
-    """Starts the process of a worker anew when it ends, as its base does, and notes how it ended.
+@functools.cache
+def noting_nanny() -> Any:
+    """The class that starts the processes of a cluster on this machine.
 
-    Ctrl-C in a terminal, which goes to all processes of the command, is left to the command.
+    Dask is imported here, since it is of the extra ``datasets``.
     """
+    from distributed import Nanny
 
-    at_once: ClassVar[bool] = False
-    """Whether processes are ended without waiting for their steps: what is complete is in its place."""
+    class NotingNanny(Nanny):  # type: ignore[misc]  # distributed has no types
+        """Starts the process of a worker anew when it ends, as its base does, and notes how it ended.
 
-    async def instantiate(self) -> Any:
-        """Start the process."""
-        # A process inherits what the thread that starts it blocks, here that of Dask's loop. A handler in the
-        # process itself would come too late: it loads for a second.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        return await super().instantiate()
+        Ctrl-C in a terminal, which goes to all processes of the command, is left to the command.
+        """
 
-    async def kill(self, *arguments: Any, **named: Any) -> None:
-        """End the process."""
-        if self.at_once and self.pid is not None:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
-        await super().kill(*arguments, **named)
+        at_once: ClassVar[bool] = False
+        """Whether processes are ended without waiting for their steps: what is complete is in its place."""
 
-    def _on_worker_exit_sync(self, exitcode: int) -> None:
-        if address := self.worker_address:
-            exit_codes[address] = exitcode
-        super()._on_worker_exit_sync(exitcode)
+        async def instantiate(self) -> Any:
+            """Start the process."""
+            # A process inherits what the thread that starts it blocks, here that of Dask's loop. A handler in
+            # the process itself would come too late: it loads for a second.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            return await super().instantiate()
+
+        async def kill(self, *arguments: Any, **named: Any) -> None:
+            """End the process."""
+            if self.at_once and self.pid is not None:
+                with suppress(ProcessLookupError):
+                    os.kill(self.pid, signal.SIGKILL)
+            await super().kill(*arguments, **named)
+
+        def _on_worker_exit_sync(self, exitcode: int) -> None:
+            if address := self.worker_address:
+                exit_codes[address] = exitcode
+            super()._on_worker_exit_sync(exitcode)
+
+    return NotingNanny
 
 
 def exit_of(worker: str) -> str:
