@@ -8,13 +8,12 @@ that is repeated.
 from __future__ import annotations
 
 import logging
-import reprlib
 import time
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -37,8 +36,6 @@ from caviar_services.service import (
     StepResult,
     no_orders,
 )
-
-T = TypeVar("T")
 
 _log = logging.getLogger("caviar.service")
 
@@ -298,30 +295,6 @@ def plain_done(
         geometry_digest=geometry_digest,
     )
     return done, tuple([decoded(payload) for _, payload in products])
-
-
-def returned(cls: type[T], value: object, service: object, method: str) -> T:
-    """What a method of a service returned, where it is what it has to be.
-
-    Args:
-        cls: What it has to be.
-        value: What it returned.
-        service: The service.
-        method: Name of the method.
-
-    Raises:
-        PayloadError: It is something else; the text has class and method.
-
-    Example:
-        >>> returned(StepResult, None, object(), "step")
-        Traceback (most recent call last):
-            ...
-        caviar_protocol.errors.PayloadError: object.step returned None; return a StepResult
-    """
-    if not isinstance(value, cls):
-        author = f"{type(service).__name__}.{method}"
-        raise PayloadError(f"{author} returned {reprlib.repr(value)}; return a {cls.__name__}")
-    return value
 
 
 def sorted_products(use: str, result: StepResult) -> list[tuple[str, Payload]]:

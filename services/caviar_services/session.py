@@ -35,10 +35,10 @@ from caviar_services.conversion import (
     granted_frame,
     is_needed,
     plain_done,
-    returned,
     run_info,
     sorted_products,
 )
+from caviar_services.returned import returned
 from caviar_services.run_time_geometry import AnnouncedMeshes, FollowedMeshes
 from caviar_services.service import (
     Frame,

@@ -39,9 +39,8 @@ def test_a_command_that_is_interrupted_waits_for_no_step(
 
 def test_an_exit_is_said_with_status_or_signal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exits, "exit_codes", {"tcp://a": 3, "tcp://b": -11, "tcp://c": -40})
-    monkeypatch.setattr(exits, "KNOWN_S", 0.0)
-    assert exit_of("tcp://a") == "it exited with status 3 (no signal), as os._exit(3) does"
-    assert exit_of("tcp://b") == "signal SIGSEGV ended it, a fault in compiled code"
-    assert exit_of("tcp://c") == "signal 40 ended it"
-    assert exit_of("tcp://d") == "how is in the log of the worker tcp://d"
+    assert exit_of("tcp://a", wait_s=0.0) == "it exited with status 3 (no signal), as os._exit(3) does"
+    assert exit_of("tcp://b", wait_s=0.0) == "signal SIGSEGV ended it, a fault in compiled code"
+    assert exit_of("tcp://c", wait_s=0.0) == "signal 40 ended it"
+    assert exit_of("tcp://d", wait_s=0.0) == "how is in the log of the worker tcp://d"
     assert "lacks" in exit_text(-signal.SIGKILL)

@@ -295,10 +295,10 @@ def damaged(folder: Path, *episodes: int) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_a_damaged_recording_is_left_out_and_named(copy: Path) -> None:
     damaged(copy, 1)
-    told: list[str] = []
-    page = Page(write_page(copy, note=told.append))
-    assert len(told) == 1
-    assert told[0].startswith("left out: 1 of 3 recordings that cannot be read, the first of episode 1: ")
+    notes: list[str] = []
+    page = Page(write_page(copy, note=notes.append))
+    assert len(notes) == 1
+    assert notes[0].startswith("left out: 1 of 3 recordings that cannot be read, the first of episode 1: ")
     assert "1 recording of the sample cannot be read, and is left out" in page.texts["dataset"]
     assert "the generate command plays it again" in page.texts["dataset"]
     assert re.search(r"why1.*recording-0000\.mcap", page.texts["dataset"], re.DOTALL)
@@ -374,13 +374,13 @@ def test_units_fit_the_numbers(copy: Path) -> None:
 @pytest.mark.parametrize("beam", [99999999999, -5, 32])
 def test_beams_that_no_codebook_has_are_left_out_and_told(beam: int, copy: Path) -> None:
     edit(copy, f"UPDATE users SET tx_beam = {beam} WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'")  # noqa: S608 - our own
-    told: list[str] = []
-    page = Page(write_page(copy, note=told.append))
+    notes: list[str] = []
+    page = Page(write_page(copy, note=notes.append))
     said = (
         "left out: best beams of 1 of 24 users that no codebook has (TX 0 to 31, RX 0 to 3), the first of "
         f"episode 1, scene 2, car/rx: TX {beam}, RX 3"
     )
-    assert told == [f"{said}; caviar verify {copy} says more"]
+    assert notes == [f"{said}; caviar verify {copy} says more"]
     assert said in page.texts["beams"]
     assert page.pictures["beams"] == 1
 
@@ -390,12 +390,12 @@ def test_codebooks_of_a_link_of_ones_own_may_be_larger_than_arrays(copy: Path) -
     own = "UPDATE dataset SET value = json_set(value, '$.scenario.services.link.use', 'my:Link')"
     edit(copy, f"{own} WHERE key = 'settings'")
     edit(copy, "UPDATE users SET tx_beam = 1000000000")
-    told: list[str] = []
-    page = Page(write_page(copy, note=told.append))
+    notes: list[str] = []
+    page = Page(write_page(copy, note=notes.append))
     assert "have too many pairs to be drawn" in page.texts["beams"]
     edit(copy, "UPDATE users SET tx_beam = 40")
-    assert Page(write_page(copy, note=told.append)).pictures["beams"] == 1
-    assert told == []
+    assert Page(write_page(copy, note=notes.append)).pictures["beams"] == 1
+    assert notes == []
     assert "left out" not in page.texts["beams"]
 
 

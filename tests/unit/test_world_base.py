@@ -86,6 +86,13 @@ def test_negative_zero_does_not_change_the_bytes() -> None:
     assert wire_bytes(scene_at(plain, 0)) == wire_bytes(scene_at(signed, 0))
 
 
+def test_names_have_the_characters_that_the_protocol_allows() -> None:
+    """A no-break space, which Python does not count as printable, is no control character."""
+    assert scene_at(ScriptedWorld([[state("car\u00a01")]]), 0).names == ("car\u00a01",)
+    with pytest.raises(PayloadError, match=r"has an object named 'car\\n'; leave out the control characters"):
+        scene_at(ScriptedWorld([[state("car\n")]]), 0)
+
+
 def test_two_objects_of_one_name_are_refused_by_name() -> None:
     world = ScriptedWorld([[state("car.a"), state("car.b"), state("car.a", position=(1.0, 0.0, 0.0))]])
     with pytest.raises(PayloadError, match=r"world 'world' has two objects named 'car\.a'"):

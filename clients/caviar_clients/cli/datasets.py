@@ -24,7 +24,7 @@ from caviar_clients.cli.shared import (
 )
 from caviar_clients.datasets.texts import bytes_text, duration_text
 from caviar_clients.files import printable
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RunError, one_line
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -131,7 +131,7 @@ def generate_command(
     )
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
-            print_line(console, f"episode {number} failed: {printable(' '.join(error.split()))}", "red")
+            print_line(console, f"episode {number} failed: {printable(one_line(error))}", "red")
         raise RunError(
             f"{counted(len(outcome.failed), 'episode')} of {plan.episodes} failed, all are listed in "
             f"table failures of {out.rstrip('/')}/catalogue.sqlite; the same command tries them again"

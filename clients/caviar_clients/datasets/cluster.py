@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
 from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
-from caviar_clients.datasets.exits import exit_of, noting_nanny
+from caviar_clients.datasets.exits import KNOWN_S, exit_of, noting_nanny
 from caviar_protocol.errors import CaviarError, RunError
 
 # Part of the extra `datasets`: imported where it is used.
@@ -271,8 +271,7 @@ class Episodes:
 
     def _exit_of(self, error: Any) -> str:
         """How the process of a `KilledWorker` of Dask ended."""
-        address = error.last_worker.address
-        return f"how is in the log of the worker {address}" if self._scheduler else exit_of(address)
+        return exit_of(error.last_worker.address, wait_s=0.0 if self._scheduler else KNOWN_S)
 
     def _again(self, task: EpisodeTask, playing: _Playing, why: str) -> EpisodeResult | None:
         if playing.attempts[task.episode] < ATTEMPTS:

@@ -63,16 +63,17 @@ def noting_nanny() -> Any:
     return NotingNanny
 
 
-def exit_of(worker: str) -> str:
+def exit_of(worker: str, wait_s: float = KNOWN_S) -> str:
     """Say how the process of a worker ended: its status, or the name of the signal.
 
     Args:
         worker: Its address.
+        wait_s: For how long its exit may still be noted [s]; 0: another program started it.
 
     Returns:
         That it is not known, where another program started the process.
     """
-    deadline = time.monotonic() + KNOWN_S
+    deadline = time.monotonic() + wait_s
     while worker not in exit_codes and time.monotonic() < deadline:
         time.sleep(0.02)
     code = exit_codes.get(worker)

@@ -29,8 +29,8 @@ from caviar_protocol.scenario.schema import carries, fixed_device, mounted_devic
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
+from caviar_services.returned import series_of
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.returned import series_of
 from caviar_services.world.run_time_meshes import RunTimeMeshes
 from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets, scenery_file
 
@@ -329,7 +329,7 @@ class World(Service[W]):
             twice = next(name for name, following in pairwise(names) if name == following)
             raise PayloadError(f"world {self.run.name!r} has two objects named {twice!r}")
         # They stand in tables, logs and file names.
-        if odd := next((name for name in names if not name.isprintable()), None):
+        if odd := next((name for name in names if not re.search(PRINTABLE, name)), None):
             raise PayloadError(
                 f"world {self.run.name!r} has an object named {odd!r}; leave out the control characters"
             )

@@ -28,9 +28,9 @@ from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.scenery import RadioMaterial, scenery_files
 from caviar_services.mesh.shapes import Mesh, fitted, ply
+from caviar_services.returned import series_of
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
-from caviar_services.world.returned import series_of
 
 _log = logging.getLogger("caviar.service")
 

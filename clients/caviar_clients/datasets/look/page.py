@@ -53,7 +53,7 @@ CLASSES = 12
 
 
 def _quiet(*_: object) -> None:
-    """Tell nobody."""
+    """Discard what is reported."""
 
 
 def write_page(

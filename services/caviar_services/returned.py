@@ -11,6 +11,31 @@ from caviar_protocol.errors import PayloadError
 T = TypeVar("T")
 
 
+def returned(cls: type[T], value: object, service: object, method: str) -> T:
+    """What a method of a service returned, where it is what it has to be.
+
+    Args:
+        cls: What it has to be.
+        value: What it returned.
+        service: The service.
+        method: Name of the method.
+
+    Raises:
+        PayloadError: It is something else; the text has class and method.
+
+    Example:
+        >>> from caviar_services.service import StepResult
+        >>> returned(StepResult, None, object(), "step")
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.PayloadError: object.step returned None; return a StepResult
+    """
+    if not isinstance(value, cls):
+        author = f"{type(service).__name__}.{method}"
+        raise PayloadError(f"{author} returned {reprlib.repr(value)}; return a {cls.__name__}")
+    return value
+
+
 def series_of(cls: type[T], author: str, values: object) -> list[T]:
     """List the items that a method returned.
 
