@@ -330,6 +330,18 @@ class _Part:
         self._parameters.update()
 
 
+def _end_gpu_kernel(*results: Any) -> None:
+    """Evaluate what rays met, where a GPU traces them.
+
+    With OptiX a kernel has the shader binding table of one scene: of rays in two scenes Dr.Jit leaves out
+    those in one of them, which then hit nothing (mitsuba3, issue 1349).
+    """
+    import drjit as dr
+
+    if dr.backend_v(results[0]) == dr.JitBackend.CUDA:
+        dr.eval(*results)
+
+
 class TracedScene:
     """Scenery and the bodies of moving objects, for rays. Build and use it under `active_variant`.
 
@@ -438,7 +450,9 @@ class TracedScene:
         hit = self._moving.scene.ray_intersect_preliminary(ray, coherent=True)
         if self._scenery is None:
             return hit.t, hit.prim_index
+        _end_gpu_kernel(hit.t, hit.prim_index)
         fixed = self._scenery.scene.ray_intersect_preliminary(ray, coherent=True)
+        _end_gpu_kernel(fixed.t, fixed.prim_index)
         # Faces of scenery come first in the tables (`face_owner`), so those of bodies are counted on.
         moving = hit.t < fixed.t
         face = dr.select(moving, hit.prim_index + mi.UInt32(self.scenery_faces), fixed.prim_index)
@@ -454,7 +468,9 @@ class TracedScene:
         """
         hit = self._moving.scene.ray_test(ray, coherent=coherent, active=active)
         if self._scenery is not None:
+            _end_gpu_kernel(hit)
             hit |= self._scenery.scene.ray_test(ray, coherent=coherent, active=active)
+            _end_gpu_kernel(hit)
         return hit
 
     def face_normals(self) -> Float32Array:
