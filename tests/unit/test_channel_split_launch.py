@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from caviar_services.channel.sionna.candidates import MANY_RAYS, Chains, chains_of
 from caviar_services.channel.sionna.ray_launcher import REFLECTED, Bounce, Launch
+from caviar_services.drjit_setup import activate_llvm, choose_variant
+from caviar_services.sensors.base import active_variant
+
+pytestmark = pytest.mark.channel
 
 
-class Column:
-    """An array of the ray tracer."""
-
-    def __init__(self, values: list[int]) -> None:
-        self._values = np.array(values, np.uint32)
-
-    def numpy(self) -> Any:
-        return self._values
+@pytest.fixture(autouse=True)
+def ray_tracer() -> Iterator[None]:
+    """The ray tracer's arrays are of the channel's variant."""
+    activate_llvm()
+    with active_variant(choose_variant()):
+        yield
 
 
 def launched(*planes: list[int]) -> Chains:
     """Chains of a launch whose rays met these planes, bounce by bounce; −1: the ray has ended."""
+    import mitsuba as mi
+
     bounces = tuple(
         Bounce(
-            kind=Column([REFLECTED if plane >= 0 else 0 for plane in met]),
-            shape=Column([0] * len(met)),
-            primitive=Column([max(plane, 0) for plane in met]),
+            kind=mi.UInt([REFLECTED if plane >= 0 else 0 for plane in met]),
+            shape=mi.UInt([0] * len(met)),
+            primitive=mi.UInt([max(plane, 0) for plane in met]),
             point=None,
             normal=None,
             probability=None,
@@ -71,3 +77,10 @@ def test_what_half_misses_is_the_mean_over_all_ways_to_halve_the_launch() -> Non
     for chain, rays in of_chain.items():
         missed = float(np.mean(~halves[:, rays].any(1)))
         assert abs(missed - 0.5 ** launched(FIRST).rays_of(np.array([[chain]]), np.array([1]))[0]) < 0.01
+
+
+def test_a_ray_between_that_ended_leaves_the_chain_of_its_neighbours_one() -> None:
+    found = launched([4, -1, 4, 4, 2], [1, -1, 1, -1, -1])
+    assert found.planes.tolist() == [[2, -1], [4, -1], [4, 1]]
+    assert found.rays.tolist() == [1, 3, 2]
+    assert found.ray.tolist() == [4, 0, 0]

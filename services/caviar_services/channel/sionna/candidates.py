@@ -11,7 +11,7 @@ at which rays were scattered, are the candidates. Those by way of moving objects
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from caviar_services.channel.sionna.ray_launcher import (
     LaunchOptions,
 )
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.drjit_setup import aligned_indices
 
 MANY_RAYS = 1000
 """Of a chain that no half of a launch would miss."""
@@ -153,41 +154,31 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
         scene: Where they went.
         max_depth: Interactions at most.
     """
-    ray = np.zeros(0, np.int64)
-    chain = np.zeros(0, np.int64)
     planes, straight = np.full((1, max_depth), -1, np.int32), np.ones(1, np.bool_)
     none = np.zeros(0, np.int64)
     found = [Chains(none, none, planes[:0], straight[:0], none)]
-    for d, bounce in enumerate(launch.bounces):
-        kinds = bounce.kind.numpy()
-        if d == 0:
-            ray = np.flatnonzero(kinds)
-            # All rays begin in the one chain of no interaction.
-            chain = np.zeros(len(ray), np.int64)
-        else:
-            going = kinds[ray] != 0
-            ray, chain = ray[going], chain[going]
-        if not len(ray):
+    # All rays begin in the one chain of no interaction.
+    before, chain = np.zeros(1, np.int64), np.zeros(1, np.int64)
+    for d, begins in enumerate(_runs(launch)):
+        lengths = np.diff(np.append(begins, launch.rays))
+        on = _column(launch.bounces[d].kind, begins) != 0
+        heads = begins[on]
+        if not len(heads):
             break
-        # Neighbouring rays mostly meet the same: only the first of each run is looked at.
-        begins = _begins(launch, d, ray, chain)
-        heads = np.flatnonzero(begins)
-        kind, plane, token, tokens = _tokens(launch, d, ray[heads], scene)
+        kind, plane, token, tokens = _tokens(launch, d, heads, scene)
         # One integer for the chain before and the interaction that follows it.
-        key = chain[heads] * tokens + token
+        key = chain[np.searchsorted(before, heads, side="right") - 1] * tokens + token
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        kind, plane, first = kind[first], plane[first], heads[first]
-        before = chain[first]
-        planes, straight = planes[before], straight[before] & ((kind == REFLECTED) | (kind == REFRACTED))
+        kind, plane, last = kind[first], plane[first], key[first] // tokens
+        planes, straight = planes[last], straight[last] & ((kind == REFLECTED) | (kind == REFRACTED))
         planes[:, d] = np.where(kind == REFLECTED, plane, -1)
-        run_lengths = np.diff(np.append(heads, len(ray)))
-        rays = np.bincount(inverse.reshape(-1), weights=run_lengths).astype(np.int64)
-        # Every ray of a run has the chain of its head.
-        chain = inverse.reshape(-1)[np.cumsum(begins) - 1]
+        rays = np.bincount(inverse.reshape(-1), weights=lengths[on]).astype(np.int64)
+        before, chain = begins, np.full(len(begins), -1, np.int64)
+        chain[on] = inverse.reshape(-1)
         specular = kind != SCATTERED
         found.append(
             Chains(
-                ray[first][specular],
+                heads[first][specular],
                 np.full(int(specular.sum()), d + 1, np.int64),
                 planes[specular],
                 straight[specular],
@@ -197,17 +188,47 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
     return Chains.joined(found)
 
 
-def _begins(launch: Launch, d: int, ray: Int64Array, chain: Int64Array) -> BoolArray:
-    """Which rays differ from those before them, in what they met or the chain that they come from."""
-    bounce = launch.bounces[d]
-    told_apart = [chain, *(column.numpy()[ray] for column in (bounce.kind, bounce.shape, bounce.primitive))]
+def _runs(launch: Launch) -> Iterator[Int64Array]:
+    """First rays of the runs of neighbours that met the same until each interaction, the ended ones too.
+
+    Neighbouring rays mostly meet the same, so that only the first of each run is looked at. Runs are found
+    where the rays are: on a GPU, or on all cores.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if not launch.rays:
+        return
+    lane = dr.arange(mi.UInt, launch.rays)
+    previous = dr.maximum(lane, 1) - 1
+    begins = lane == 0
     if launch.wedges is not None:
-        told_apart.append(launch.wedges.local_edge.numpy()[ray])
-    begins = np.ones(len(ray), np.bool_)
-    begins[1:] = False
-    for column in told_apart:
-        begins[1:] |= column[1:] != column[:-1]
-    return begins
+        begins |= _differs(launch.wedges.local_edge, previous)
+    for bounce in launch.bounces:
+        # Evaluated before it goes on, so that all interactions are found by one kernel.
+        dr.make_opaque(begins)
+        going = bounce.kind != 0
+        begins |= _differs(bounce.kind, previous)
+        begins |= going & (_differs(bounce.shape, previous) | _differs(bounce.primitive, previous))
+        first: Any = dr.compress(begins)
+        yield first.numpy().astype(np.int64)
+
+
+def _differs(column: Any, previous: Any) -> Any:
+    import drjit as dr
+
+    return column != dr.gather(type(column), column, previous)
+
+
+def _column(column: Any, rays: Int64Array) -> Int64Array:
+    """What a column of the ray tracer's has for some rays."""
+    import drjit as dr
+    import mitsuba as mi
+
+    # Two more, since to Dr.Jit an array of one element is another kernel.
+    index = mi.UInt(aligned_indices(np.append(rays, (0, 0))))
+    values: Int64Array = dr.gather(type(column), column, index).numpy()[: len(rays)].astype(np.int64)
+    return values
 
 
 def _tokens(
@@ -241,14 +262,12 @@ def _met_at(
     """Kind and plane of an interaction of rays, and a number that tells it apart in all launches: the
     plane, or one for each kind, or one for each edge."""
     bounce = launch.bounces[d]
-    kind = bounce.kind.numpy()[ray].astype(np.int64)
-    shape = bounce.shape.numpy()[ray].astype(np.int64)
-    plane = scene.surface_of[scene.triangle_numbers(shape, bounce.primitive.numpy()[ray].astype(np.int64))]
+    kind, shape, primitive = (_column(of, ray) for of in (bounce.kind, bounce.shape, bounce.primitive))
+    plane = scene.surface_of[scene.triangle_numbers(shape, primitive)]
     token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
     bent = kind == DIFFRACTED
     if bent.any():
-        edge = launch.wedges.local_edge.numpy()[ray[bent]].astype(np.int64)
-        token[bent] = _first_edge(scene) + edge
+        token[bent] = _first_edge(scene) + _column(launch.wedges.local_edge, ray[bent])
     return kind, plane, token
 
 
