@@ -73,7 +73,11 @@ def scattered_of(launch: Launch) -> Scattered:
     Args:
         launch: The rays.
     """
-    rays = [np.flatnonzero(bounce.kind.numpy() == SCATTERED) for bounce in launch.bounces]
+    import drjit as dr
+
+    # Looked for where the rays are: on a GPU few of them come back.
+    found: list[Any] = [dr.compress(bounce.kind == SCATTERED) for bounce in launch.bounces]
+    rays = [numbers.numpy().astype(np.int64) for numbers in found]
     depth = np.repeat(np.arange(1, len(rays) + 1), np.array([len(ray) for ray in rays], np.int64))
     return Scattered(np.concatenate([np.zeros(0, np.int64), *rays]), depth, np.zeros((0, len(depth))))
 
