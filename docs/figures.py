@@ -77,6 +77,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "detail.md",
         {"mesh-detail": ""},
     ),
+    "devices": Measurement(
+        "python tests/bench/bench_devices.py --frames 12 --markdown {out}/devices.md",
+        "python tests/bench/bench_devices.py --frames 50 --rounds 3 --markdown {out}/devices.md",
+        "devices.md",
+        {"devices": ""},
+    ),
     "diffuse": Measurement(
         f"{_DIFFUSE} --paths 300 500 0 --scenes 10 --markdown {{out}}/diffuse.md",
         f"{_DIFFUSE} --paths 300 500 0 --markdown {{out}}/diffuse.md",
