@@ -15,8 +15,7 @@ adaptive ladder mostly do.
 from __future__ import annotations
 
 import gc
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -28,13 +27,14 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.geometry import is_mesh_name, material_of
+from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.fresnel import Media
+from caviar_services.channel.sionna.body_pool import BodyPool, own_materials
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
@@ -45,7 +45,6 @@ from caviar_services.channel.sionna.materials import (
     OutsideUse,
     SurfaceMaterial,
     UsedSurfaces,
-    body_kind,
     itu_material,
 )
 from caviar_services.channel.sionna.scene_loading import (
@@ -63,12 +62,11 @@ from caviar_services.channel.sionna.scene_loading import (
     near_middle,
     object_materials,
     set_materials,
-    unit_mesh,
     with_detail,
 )
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
-from caviar_services.mesh.shapes import Mesh, assign_bodies, placed, unit_box
+from caviar_services.mesh.shapes import Mesh, placed, unit_box
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
@@ -101,30 +99,6 @@ class SceneSettings:
     """Which objects and pieces of scenery are foliage: waves do not meet them."""
     pool_keys: Mapping[str, str] = field(default_factory=dict, compare=False)
     """Key of the scenario that says how many bodies there are, by asset, for errors."""
-
-
-def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:
-    """Find the materials that meshes of objects name in their files, by asset.
-
-    Args:
-        assets: Files of the run by name.
-    """
-    named = {name: material_of(file) for name, file in assets.items() if name.startswith("objects/")}
-    return {name: material for name, material in named.items() if material}
-
-
-@dataclass(frozen=True)
-class LaterBodies:
-    """Meshes that came while the run goes on, and the bodies that there are for them."""
-
-    meshes: Mapping[str, Mesh] = field(default_factory=dict)
-    """By asset."""
-    materials: Mapping[str, str] = field(default_factory=dict)
-    """By asset: of those that name one."""
-    room: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    """Bodies by mesh and material; those of the box are for objects whose mesh is not there."""
-    changed: bool = False
-    """Whether bodies have to be made for them."""
 
 
 class SionnaScene(NumberedTriangles):
@@ -163,47 +137,33 @@ class SionnaScene(NumberedTriangles):
         self.foliage_meshes = {name: meshes.pop(name) for name in list(meshes) if self._foliage.of(name)}
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(meshes)
-        self._later = LaterBodies()
-        self._own_materials = own_materials(assets)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
-        made = self._made = self._with_own_materials(made)
+        made = self._made = self._with_materials_of_meshes(made, set(own_materials(assets).values()))
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
         full = by_material(self._scene, meshes, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = bounds(shapes)
-        units = {asset: unit_mesh(asset, assets) for asset in pool}
-        # Each material of bodies is a shape of its own, with a pool of its own.
-        kinds = {(asset, m): body_kind(asset, m) for m in ("", *made) for asset in sorted(pool)}
-        self._pool = {kind: pool[asset] for (asset, _), kind in kinds.items()}
-        self._pool_keys = {kind: settings.pool_keys.get(asset, "") for (asset, _), kind in kinds.items()}
-        self._meshes = {kind: units[asset] for (asset, _), kind in kinds.items()}
-        self._first_pool, self._first_meshes = dict(self._pool), dict(self._meshes)
-        of_material = {
-            m: [(kind, slot) for (asset, of), kind in kinds.items() if of == m for slot in range(pool[asset])]
-            for m in ("", *made)
-        }
-        bodies = [body for of in of_material.values() for body in of]
-        self._bodies_of, self._at_rest = of_material, shapes
-        self._first_bodies_of = of_material
+        # Made after the scenery was read, whose faults are named first.
+        self._pool = BodyPool(assets, pool, settings.pool_keys, self._objects, made)
+        self._at_rest = shapes
         self._standing: frozenset[Body] = frozenset()
         self.turning: Turning | None = None
         """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
-        skin = self._skin = RadioMaterial(
+        self._skin = RadioMaterial(
             f"{_SKIN}-skin", BODY_THICKNESS, *(skins[0].constants if skins else (1.0, 0.0))
         )
-        self._moving = [self._body_shape(of_material[""], _SKIN, skin)]
-        if bodied:
-            self._moving += [
-                self._body_shape(of_material[m], f"{_SKIN}-of-{m}", of.radio) for m, of in made.items()
-            ]
-        else:  # the ray tracer needs a shape also where there is neither scenery nor a body
-            self._moving = [Shape(_NOTHING, skin, [_NOTHING], [self._shrunk(unit_box())])]
+        self._moving = self._body_shapes()
         self._shapes = [*shapes, *self._moving]
         # The note names the piece that is so far from the others that the ray tracer is coarse there.
         centre, self.far_note = counting_centre(shapes)
         super().__init__(
-            self._shapes, self._replace_shapes(centre), bodies, self._meshes, centre, len(self._moving)
+            self._shapes,
+            self._replace_shapes(centre),
+            self._pool.bodies,
+            self._pool.meshes,
+            centre,
+            len(self._moving),
         )
         self.edges: SceneEdges | None = None
         """None where nothing is diffracted."""
@@ -219,7 +179,9 @@ class SionnaScene(NumberedTriangles):
         self.outside: tuple[OutsideUse, ...] = ()
         """Materials used where they are not defined, by carrier."""
         # Of meshes that are gone, materials stay known to the ray tracer, and are used by nothing.
-        used_by_bodies = {m for m, bodies in self._bodies_of.items() if bodies} | set(self._objects.names)
+        used_by_bodies = {m for m, bodies in self._pool.of_material.items() if bodies} | set(
+            self._objects.names
+        )
         made = {name: of for name, of in self._made.items() if name in used_by_bodies}
         for carrier, frequency in enumerate(settings.frequencies_hz):
             found = itu_materials(self._scene, frequency, settings.materials)
@@ -310,7 +272,7 @@ class SionnaScene(NumberedTriangles):
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
         """Of the kinds of bodies that there are (`body_kind`)."""
-        return {kind: mesh for kind, mesh in self._meshes.items() if self._pool[kind]}
+        return self._pool.unit_meshes
 
     @property
     def standing_bodies(self) -> tuple[int, ...]:
@@ -320,21 +282,13 @@ class SionnaScene(NumberedTriangles):
     # --- meshes that come while the run goes on ------------------------------------------------------
 
     def use_meshes(self, meshes: Mapping[str, Path]) -> None:
-        """Take meshes that objects may have from the next frame on, beside those of the beginning.
-
-        Bodies for them are made by `make_room`, when it is known how many objects have them.
+        """See `BodyPool.use_meshes`; bodies for them are made by `make_room`, when it is known how many
+        objects have them.
 
         Args:
-            meshes: Files by asset name; those of an earlier call that are not here are gone.
-
-        Raises:
-            AssetError: A file is no mesh.
+            meshes: Files by asset name.
         """
-        self._later = LaterBodies(
-            meshes={name: unit_mesh(name, meshes) for name in sorted(meshes)},
-            materials=own_materials(meshes),
-            changed=True,
-        )
+        self._pool.use_meshes(meshes)
 
     def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
         """Make bodies for objects with meshes that came while the run goes on, where there are too few.
@@ -345,52 +299,17 @@ class SionnaScene(NumberedTriangles):
             scene: The scene of a frame.
             without_body: Classes of objects that waves pass through.
         """
-        later = self._later
-        if not later.changed and not any(map(is_mesh_name, scene.assets)):
+        if not self._pool.awaits_meshes and not any(map(is_mesh_name, scene.assets)):
             return
-        solid = self._solid(scene, without_body)
-        # Boxes stand in for meshes that are not there, beside those of objects that have none.
-        mine = {self._body_of(scene, i) for i in solid if is_mesh_name(scene.assets[i])}
-        needed = Counter(key for i in solid if (key := self._body_of(scene, i)) in mine)
-        short = any(n > self._pool.get(body_kind(*key), 0) for key, n in needed.items())
-        if not later.changed and not short:
+        if not self._pool.make_room(scene, self._solid(scene, without_body)):
             return
-        # In powers of two: objects that come one by one seldom make bodies anew.
-        room = {} if later.changed else dict(later.room)
-        for key, n in needed.items():
-            room[key] = max(room.get(key, 0), 1 << (n - 1).bit_length())
-        self._later = replace(later, room=room, changed=False)
-        self._make_bodies()
-
-    def _make_bodies(self) -> None:
-        """Put other bodies in place of those that there are; scenery stays."""
-        later = self._later
-        pool, meshes = dict(self._first_pool), dict(self._first_meshes)
-        of_material = {m: [*bodies] for m, bodies in self._first_bodies_of.items()}
-        self._made = self._with_own_materials(self._made)
-        for (asset, material), count in sorted(later.room.items()):
-            kind = body_kind(asset, material)
-            before = pool.get(kind, 0)
-            pool[kind] = max(before, count)
-            meshes[kind] = later.meshes[asset] if asset in later.meshes else self._first_meshes[asset]
-            more = [(kind, slot) for slot in range(before, pool[kind])]
-            of_material[material] = of_material.get(material, []) + more
-        self._pool, self._meshes, self._bodies_of = pool, meshes, of_material
-        moving = [
-            self._body_shape(
-                bodies, f"{_SKIN}-of-{m}" if m else _SKIN, self._made[m].radio if m else self._skin
-            )
-            for m, bodies in of_material.items()
-            if bodies
-        ]
-        self._replace_bodies(moving)
-
-    def _replace_bodies(self, moving: list[Shape]) -> None:
-        self._moving = moving or [Shape(_NOTHING, self._skin, [_NOTHING], [self._shrunk(unit_box())])]
+        self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
+        self._moving = self._body_shapes()
         self._shapes = [*self._at_rest, *self._moving]
-        version, bodies = self.version, [body for of in self._bodies_of.values() for body in of]
-        ids = self._replace_shapes(self.centre)
-        super().__init__(self._shapes, ids, bodies, self._meshes, self.centre, len(self._moving))
+        version, ids = self.version, self._replace_shapes(self.centre)
+        super().__init__(
+            self._shapes, ids, self._pool.bodies, self._pool.meshes, self.centre, len(self._moving)
+        )
         self.version = version + 1
         self._standing = frozenset()
         self.bodies_version += 1
@@ -399,15 +318,16 @@ class SionnaScene(NumberedTriangles):
             self.edges = SceneEdges(self, self.unit_meshes, self._settings.free_edges)
         self._set_carriers()
 
-    def _with_own_materials(self, made: Mapping[str, ObjectMaterial]) -> dict[str, ObjectMaterial]:
+    def _with_materials_of_meshes(
+        self, made: Mapping[str, ObjectMaterial], named: set[str]
+    ) -> dict[str, ObjectMaterial]:
         """Materials of bodies, with those that meshes name."""
-        named = {*self._own_materials.values(), *self._later.materials.values()} - made.keys()
         # A mesh says what it is made of wherever it is used: where P.2040 does not define that at a carrier,
         # the nearest constants count.
         policy = self._settings.materials
         if policy.outside == "error":
             policy = replace(policy, outside="nearest")
-        own = ObjectMaterials({name: name for name in sorted(named)})
+        own = ObjectMaterials({name: name for name in sorted(named - made.keys())})
         return {**made, **object_materials(own, self._settings.frequencies_hz, policy)}
 
     def place(self, scene: Scene, without_body: frozenset[str]) -> tuple[tuple[str, ...], Float64Array]:
@@ -425,7 +345,7 @@ class SionnaScene(NumberedTriangles):
             PayloadError: The pool is too small, or an object has the name of a piece of scenery.
         """
         solid = self._solid(scene, without_body)
-        return self.place_bodies(scene, {i: self._kind(scene, i) for i in solid})
+        return self.place_bodies(scene, {i: self._pool.kind(scene, i) for i in solid})
 
     def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
         """Objects of a scene that waves meet, by their index."""
@@ -452,16 +372,16 @@ class SionnaScene(NumberedTriangles):
             self._count_from_objects(scene.position[solid])
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
         objects = ((scene.names[i], kind) for i, kind in kinds.items())
-        taken = assign_bodies(objects, self._pool, self._pool_keys)
+        taken = self._pool.assign(objects)
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
         turning = None
         if scene.angular_velocity is not None and scene.angular_velocity.any():
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
         vertices = self.moving_vertices
-        begin = len(vertices) - sum(len(self._meshes[asset].vertices) for asset, _ in self._bodies)
+        begin = len(vertices) - sum(len(self._pool.meshes[asset].vertices) for asset, _ in self._bodies)
         for number, body in enumerate(self._bodies, start=self.first_body_piece):
-            mesh = self._meshes[body[0]]
+            mesh = self._pool.meshes[body[0]]
             rows = slice(begin, begin + len(mesh.vertices))
             begin = rows.stop
             i = standing.get(body)
@@ -511,10 +431,18 @@ class SionnaScene(NumberedTriangles):
     def _middle(self) -> Float64Array:
         return (self.low + self.high) / 2
 
-    def _body_shape(self, bodies: Sequence[Body], name: str, radio: Any) -> Shape:
-        """Moving bodies of one material, none of which stands for anything yet."""
-        names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
-        return Shape(name, radio, names, [self._shrunk(self._meshes[kind]) for kind, _ in bodies])
+    def _body_shapes(self) -> list[Shape]:
+        """The bodies as a shape of each material; none of them stands for anything yet."""
+        shapes = []
+        for material, bodies in self._pool.of_material.items():
+            if bodies:
+                name = f"{_SKIN}-of-{material}" if material else _SKIN
+                radio = self._made[material].radio if material else self._skin
+                names = [f"{_SKIN}-{kind or 'box'}-{slot}" for kind, slot in bodies]
+                meshes = [self._shrunk(self._pool.meshes[kind]) for kind, _ in bodies]
+                shapes.append(Shape(name, radio, names, meshes))
+        # The ray tracer needs a shape also where there is neither scenery nor a body.
+        return shapes or [Shape(_NOTHING, self._skin, [_NOTHING], [self._shrunk(unit_box())])]
 
     def _shrunk(self, mesh: Mesh) -> Mesh:
         """A mesh as a point, which no ray hits."""
@@ -527,18 +455,6 @@ class SionnaScene(NumberedTriangles):
             end = begin + sum(len(mesh.vertices) for mesh in shape.meshes)
             yield shape, slice(begin, end)
             begin = end
-
-    def _kind(self, scene: Scene, i: int) -> str:
-        """Which bodies may stand for an object of a scene."""
-        return body_kind(*self._body_of(scene, i))
-
-    def _body_of(self, scene: Scene, i: int) -> tuple[str, str]:
-        """Mesh and material of the body of an object of a scene; the box for a mesh that is not there."""
-        asset = scene.assets[i]
-        if is_mesh_name(asset) and asset not in self._later.meshes and asset not in self._first_meshes:
-            asset = ""
-        own = self._later.materials.get(asset) or self._own_materials.get(asset, "")
-        return asset, self._objects.of(scene.names[i], scene.classes[i]) or own
 
     def _replace_shapes(self, centre: Float64Array) -> Int64Array:
         """Put the shapes in place of what was there. Returns their process-local numbers."""
