@@ -2122,13 +2122,16 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         {
             if (_state != State.Over)
                 throw new InvalidOperationException("the world '" + Name + "' takes part in a run already");
-            _endpoint = new Uri(endpoint);
             _token = token;
             Name = name;
             ExitStatus = 0;
             _faulted = false;
             EndReason = "";
-            Join(Patience);
+            if (Uri.TryCreate(endpoint, UriKind.Absolute, out _endpoint)
+            && (_endpoint.Scheme == "ws" || _endpoint.Scheme == "wss"))
+                Join(Patience);
+            else
+                End(1, "'" + endpoint + "' is no address of a gateway; write ws://HOST:PORT/ws");
         }
 
         /// <summary>Handle what came, at most one frame; false once the world has left. Never

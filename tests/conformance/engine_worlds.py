@@ -569,6 +569,17 @@ def check_slow_and_wrong(folder: Path, command: Sequence[str]) -> None:
     assert ticks == [3, 6, 9, 12, 15][: len(ticks)]
 
 
+def check_no_gateway(command: Sequence[str]) -> None:
+    """An address of ZeroMQ, and half of one, are refused at once, with what to write."""
+    for address in ("tcp://127.0.0.1:5570", "127.0.0.1:8080"):
+        done = subprocess.run(
+            [*command, address, "world"], capture_output=True, text=True, timeout=WITHIN_S, check=False
+        )
+        assert done.returncode == 1, done.stdout + done.stderr
+        wanted = f"'{address}' is no address of a gateway; write ws://HOST:PORT/ws"
+        assert wanted in done.stdout + done.stderr
+
+
 def schema_is_current(source: Path) -> bool:
     """Whether a source holds the schema that ``clients/schema.py`` makes today."""
     text = source.read_text("utf-8")

@@ -85,6 +85,10 @@ def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path,
     worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
 
 
+def test_an_address_that_is_no_gateways_is_refused_at_once(command: list[str]) -> None:
+    worlds.check_no_gateway(command)
+
+
 @pytest.mark.exhaustive
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
     command: list[str], tmp_path: Path

@@ -80,6 +80,10 @@ def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(godot: str, 
     worlds.check_slow_and_wrong(tmp_path, [godot, "--path", str(GODOT), "-s", script])
 
 
+def test_an_address_that_is_no_gateways_is_refused_at_once(godot: str) -> None:
+    worlds.check_no_gateway([godot, "--path", str(GODOT), "-s", "world.gd"])
+
+
 TREE = """extends SceneTree
 
 func _init():

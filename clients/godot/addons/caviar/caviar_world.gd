@@ -163,7 +163,10 @@ func connect_to(url, world_name, token = ""):
 	exit_status = 0
 	_faulted = false
 	_epoch = 0
-	_join(patience_ms)
+	if url.begins_with("ws://") or url.begins_with("wss://"):
+		_join(patience_ms)
+	else:
+		_end(1, "'%s' is no address of a gateway; write ws://HOST:PORT/ws" % url)
 
 
 # Handle what came, at most one frame; false once the world has left. Never waits.
