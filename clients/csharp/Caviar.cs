@@ -1784,15 +1784,15 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         public void Send(byte[] frame) { if (!_outbox.IsAddingCompleted) _outbox.Add(frame); }
 
-        /// <summary>Send what is left, say goodbye, wait for the gateway's, and end within two
-        /// seconds.</summary>
-        public void Close()
+        /// <summary>Send what is left, say goodbye, and end within a second, or two where the gateway's
+        /// goodbye is waited for.</summary>
+        public void Close(bool waits)
         {
             _outbox.CompleteAdding();
             if (!_sender.ThreadState.HasFlag(ThreadState.Unstarted))
             {
                 _sender.Join(ClosingMs);
-                _receiver.Join(ClosingMs);
+                if (waits) _receiver.Join(ClosingMs);
             }
             Abort();
         }
@@ -1941,7 +1941,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     new Map { { "sequence", sequence }, { "progress", Interlocked.Read(ref _progress) },
                     { "phase", Phase } })));
             }
-            if (Lost == "") wire.Close();
+            if (Lost == "") wire.Close(false);
             else wire.Abort();
         }
 
@@ -2230,7 +2230,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             _heart = null;
             if (_wire != null && _epoch > 0 && _state != State.Connecting)
                 Send("BYE", With(new Map { { "reason", reason } }));
-            if (_wire != null) _wire.Close();
+            if (_wire != null) _wire.Close(true);
             _wire = null;
             End(status, reason);
         }

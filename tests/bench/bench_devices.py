@@ -184,6 +184,10 @@ def main() -> None:
     if told.compute:
         compute(told.compute, told.of, told.frames)
         return
+    if told.frames < 2:
+        parser.error(
+            f"--frames {told.frames}: give 2 at least, since the first one compiles and does not count"
+        )
     if not cuda_devices():
         raise SystemExit(
             "no CUDA device answers (nvidia-smi shows whether the driver has one): there is nothing to "

@@ -564,7 +564,7 @@ def check_slow_and_wrong(folder: Path, command: Sequence[str]) -> None:
     assert "object 'lorry': no prefix of READY begins its name" in " ".join(output.split())
     scenes = [frame.scene() for frame in Recording(next(run.out.glob("*/")))]
     ticks = [scene.position[0, 1] for scene in scenes if scene is not None]
-    # The recorder may still have frames before it when the world fails: these are not complete.
+    # When the world fails, the recorder may not have answered the last frames: those are not complete.
     assert ticks
     assert ticks == [3, 6, 9, 12, 15][: len(ticks)]
 

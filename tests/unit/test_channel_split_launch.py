@@ -20,8 +20,10 @@ pytestmark = pytest.mark.channel
 @pytest.fixture(autouse=True)
 def ray_tracer() -> Iterator[None]:
     """The ray tracer's arrays are of the channel's variant."""
-    activate_llvm()
-    with active_variant(choose_variant()):
+    variant = choose_variant()
+    if variant.startswith("llvm"):
+        activate_llvm()
+    with active_variant(variant):
         yield
 
 
@@ -84,3 +86,21 @@ def test_a_ray_between_that_ended_leaves_the_chain_of_its_neighbours_one() -> No
     assert found.planes.tolist() == [[2, -1], [4, -1], [4, 1]]
     assert found.rays.tolist() == [1, 3, 2]
     assert found.ray.tolist() == [4, 0, 0]
+
+
+@pytest.mark.parametrize("rays", [1, 2, 500])
+@pytest.mark.parametrize("ended", [0.0, 0.3, 1.0])
+def test_chains_are_those_of_a_walk_along_each_ray(rays: int, ended: float) -> None:
+    rng = np.random.default_rng(rays)
+    met = np.repeat(rng.integers(0, 3, (3, rays)), 1 + rays // 100, axis=1)[:, :rays]
+    # What has ended stays so.
+    met[np.logical_or.accumulate(rng.random((3, rays)) < ended)] = -1
+    walked: dict[tuple[int, ...], list[int]] = {}
+    for ray, planes in enumerate(met.T.tolist()):
+        for depth in range(1, 1 + sum(plane >= 0 for plane in planes)):
+            walked.setdefault((*planes[:depth], *[-1] * (3 - depth)), []).append(ray)
+    found = launched(*met.tolist())
+    counted = zip(found.planes.tolist(), found.ray.tolist(), found.rays.tolist(), strict=True)
+    assert {tuple(planes): (first, count) for planes, first, count in counted} == {
+        planes: (along[0], len(along)) for planes, along in walked.items()
+    }

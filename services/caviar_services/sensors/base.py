@@ -442,7 +442,7 @@ class TracedScene:
             ray: Rays in world coordinates, as `mitsuba.Ray3f`.
 
         Returns:
-            Distance [m] and face of each hit, as Dr.Jit arrays that wait for evaluation; where nothing is
+            Distance [m] and face of each hit, as Dr.Jit arrays that may wait for evaluation; where nothing is
             hit, the distance is infinite and the face any number.
         """
         import drjit as dr
@@ -459,7 +459,7 @@ class TracedScene:
         return dr.select(moving, hit.t, fixed.t), face
 
     def occluded(self, ray: Any, active: Any, coherent: bool) -> Any:
-        """Whether each ray hits anything, as a Dr.Jit array that waits for evaluation.
+        """Whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
 
         Args:
             ray: Rays in world coordinates, as `mitsuba.Ray3f`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -57,6 +57,7 @@ class BodyPool:
         pool: How many bodies there are of each asset; an empty asset is the box.
         keys: Key of the scenario that says how many, by asset, for errors.
         objects: Materials of objects that differ from the others.
+        own: Materials that meshes name in their files, by asset (`own_materials`).
         materials: Names of all materials that bodies may have: there are bodies for each.
 
     Raises:
@@ -69,10 +70,11 @@ class BodyPool:
         pool: Mapping[str, int],
         keys: Mapping[str, str],
         objects: ObjectMaterials,
-        materials: Iterable[str],
+        own: Mapping[str, str],
+        materials: Collection[str],
     ) -> None:
         self._objects = objects
-        self._own_materials = own_materials(assets)
+        self._own_materials = own
         self._later = _LaterMeshes()
         units = {asset: unit_mesh(asset, assets) for asset in pool}
         # Each material of bodies is a shape of its own, with a pool of its own.

@@ -189,10 +189,11 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
 
 
 def _runs(launch: Launch) -> Iterator[Int64Array]:
-    """First rays of the runs of neighbours that met the same until each interaction, the ended ones too.
+    """For each interaction, the first ray of each run of neighbours that met the same up to it; rays that
+    have ended are in runs too.
 
     Neighbouring rays mostly meet the same, so that only the first of each run is looked at. Runs are found
-    where the rays are: on a GPU, or on all cores.
+    where the rays are: on a GPU, or on all cores. A ray that has ended stays so: its kind is 0 from there on.
     """
     import drjit as dr
     import mitsuba as mi
@@ -205,7 +206,7 @@ def _runs(launch: Launch) -> Iterator[Int64Array]:
     if launch.wedges is not None:
         begins |= _differs(launch.wedges.local_edge, previous)
     for bounce in launch.bounces:
-        # Evaluated before it goes on, so that all interactions are found by one kernel.
+        # Evaluated, so that the first interaction runs the same kernel as the others.
         dr.make_opaque(begins)
         going = bounce.kind != 0
         begins |= _differs(bounce.kind, previous)

@@ -138,14 +138,15 @@ class SionnaScene(NumberedTriangles):
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(meshes)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
-        made = self._made = self._with_materials_of_meshes(made, set(own_materials(assets).values()))
+        own = own_materials(assets)
+        made = self._made = self._with_materials_of_meshes(made, set(own.values()))
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
         full = by_material(self._scene, meshes, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = bounds(shapes)
         # Made after the scenery was read, whose faults are named first.
-        self._pool = BodyPool(assets, pool, settings.pool_keys, self._objects, made)
+        self._pool = BodyPool(assets, pool, settings.pool_keys, self._objects, own, made)
         self._at_rest = shapes
         self._standing: frozenset[Body] = frozenset()
         self.turning: Turning | None = None
@@ -282,11 +283,15 @@ class SionnaScene(NumberedTriangles):
     # --- meshes that come while the run goes on ------------------------------------------------------
 
     def use_meshes(self, meshes: Mapping[str, Path]) -> None:
-        """See `BodyPool.use_meshes`; bodies for them are made by `make_room`, when it is known how many
-        objects have them.
+        """Take meshes that objects may have from the next frame on, beside those of the beginning.
+
+        Bodies for them are made by `make_room`, when it is known how many objects have them.
 
         Args:
-            meshes: Files by asset name.
+            meshes: Files by asset name; those of an earlier call that are not here are gone.
+
+        Raises:
+            AssetError: A file is no mesh.
         """
         self._pool.use_meshes(meshes)
 
@@ -301,9 +306,10 @@ class SionnaScene(NumberedTriangles):
         """
         if not self._pool.awaits_meshes and not any(map(is_mesh_name, scene.assets)):
             return
+        if self._pool.awaits_meshes:  # before bodies are: where a material is refused, nothing has changed
+            self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
         if not self._pool.make_room(scene, self._solid(scene, without_body)):
             return
-        self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
         self._moving = self._body_shapes()
         self._shapes = [*self._at_rest, *self._moving]
         version, ids = self.version, self._replace_shapes(self.centre)
