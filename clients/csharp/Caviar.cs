@@ -1786,13 +1786,13 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
 
         /// <summary>Send what is left, say goodbye, and end within a second, or two where the gateway's
         /// goodbye is waited for.</summary>
-        public void Close(bool waits)
+        public void Close(bool awaitsGoodbye)
         {
             _outbox.CompleteAdding();
             if (!_sender.ThreadState.HasFlag(ThreadState.Unstarted))
             {
                 _sender.Join(ClosingMs);
-                if (waits) _receiver.Join(ClosingMs);
+                if (awaitsGoodbye) _receiver.Join(ClosingMs);
             }
             Abort();
         }

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
-from bench_lidar import traffic
+from bench_lidar import asset_files, traffic
 
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.messages import GrantInput, Status
@@ -26,7 +26,6 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Camera, CameraDevice, Scene
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
-from caviar_services.world.scenery import object_assets, scenery_assets
 
 DEMANDS: dict[str, dict[str, frozenset[str]]] = {
     "RGB": {"camera": frozenset()},
@@ -98,12 +97,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="PNG of the last frame")
     told = parser.parse_args()
     with TemporaryDirectory() as folder:
-        assets = {}
-        for name, content in {**scenery_assets(f"sionna:{told.scene}"), **object_assets(["car"])}.items():
-            assets[name] = content if isinstance(content, Path) else Path(folder) / name
-            if isinstance(content, bytes):
-                assets[name].parent.mkdir(exist_ok=True)
-                assets[name].write_bytes(content)
+        assets = asset_files(told.scene, Path(folder))
         print(f"{told.scene}, {told.objects} cars, 640×480")
         last = [measured(assets, told, what) for what in DEMANDS]
     if told.picture:

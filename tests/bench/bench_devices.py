@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -41,7 +41,6 @@ from caviar_services.drjit_setup import cuda_devices
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.scenery import object_assets, scenery_assets
 
 LAUNCHED = {"candidates": "launched"}
 CHANNELS: dict[str, tuple[int, dict[str, Any]]] = {
@@ -85,12 +84,7 @@ def sensor_frames(kind: str, frames: int) -> Iterator[tuple[float, Arrays]]:
     """Time [s] and arrays of each frame of a sensor."""
     scene, cars = ("simple_street_canyon", 15) if kind == "LIDAR" else ("munich", 36)
     with TemporaryDirectory() as folder:
-        assets = {}
-        for name, content in {**scenery_assets(f"sionna:{scene}"), **object_assets(["car"])}.items():
-            assets[name] = content if isinstance(content, Path) else Path(folder) / name
-            if isinstance(content, bytes):
-                assets[name].parent.mkdir(exist_ok=True)
-                assets[name].write_bytes(content)
+        assets = bench_lidar.asset_files(scene, Path(folder))
         service: Any
         if kind == "LIDAR":
             service = LidarSensors(LidarSettings(bodies_per_asset=cars), RunInfo(name="lidar"))
@@ -146,14 +140,13 @@ def difference(ours: Arrays, theirs: Arrays, name: str, frames: int) -> str:
     def pairs(key: str) -> list[tuple[Any, Any]]:
         return [(ours[f"{name}/{n}/{key}"], theirs[f"{name}/{n}/{key}"]) for n in range(frames)]
 
-    count: Callable[[Any], int] = lambda several: int(sum(np.count_nonzero(one) for one in several))  # noqa: E731
     if name == "LIDAR":
         # Where neither ray hits anything, infinity less infinity is no number, and no difference.
         with np.errstate(invalid="ignore"):
-            differing = count(np.abs(a - b) > 1e-3 for a, b in pairs("range"))
+            differing = sum(int((np.abs(a - b) > 1e-3).sum()) for a, b in pairs("range"))
         return f"{differing} of {frames * 64 * 1800:,} rays"
     if name == "camera":
-        differing = count(np.abs(a.astype(int) - b).max(axis=2) > 2 for a, b in pairs("rgb"))
+        differing = sum(int((np.abs(a.astype(int) - b).max(axis=2) > 2).sum()) for a, b in pairs("rgb"))
         return f"{differing} of {frames * 640 * 480:,} pixels"
     error = sum(np.sum(np.abs(a - b) ** 2) for a, b in pairs("h"))
     nmse = 10 * np.log10(max(error / sum(np.sum(np.abs(b) ** 2) for _, b in pairs("h")), EQUAL))
@@ -164,9 +157,8 @@ def difference(ours: Arrays, theirs: Arrays, name: str, frames: int) -> str:
 
 def _numbered(found: Arrays, frame: str) -> Iterator[tuple[int, int]]:
     """Pair and id of each path of a frame."""
-    pair = np.repeat(
-        np.arange(len(found[f"{frame}/offsets"]) - 1), np.diff(found[f"{frame}/offsets"])
-    ).tolist()
+    offsets = found[f"{frame}/offsets"]
+    pair = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets)).tolist()
     yield from zip(pair, found[f"{frame}/id"].tolist(), strict=True)
 
 
@@ -180,13 +172,13 @@ def main() -> None:
     parser.add_argument("--of", nargs="+", choices=[*CHANNELS, *SENSORS], default=[*CHANNELS, *SENSORS])
     parser.add_argument("--markdown", type=Path, help="where the figures go as a table")
     parser.add_argument("--compute", type=Path, help=argparse.SUPPRESS)
-    told = parser.parse_args()
-    if told.compute:
-        compute(told.compute, told.of, told.frames)
+    options = parser.parse_args()
+    if options.compute:
+        compute(options.compute, options.of, options.frames)
         return
-    if told.frames < 2:
+    if options.frames < 2:
         parser.error(
-            f"--frames {told.frames}: give 2 at least, since the first one compiles and does not count"
+            f"--frames {options.frames}: give 2 at least, since the first one compiles and does not count"
         )
     if not cuda_devices():
         raise SystemExit(
@@ -195,12 +187,12 @@ def main() -> None:
         )
     rounds: dict[str, list[Arrays]] = {"cpu": [], "gpu": []}
     with TemporaryDirectory() as folder:
-        for number in range(told.rounds):
+        for number in range(options.rounds):
             for device, results in rounds.items():
-                print(f"round {number + 1} of {told.rounds}, {device}")
+                print(f"round {number + 1} of {options.rounds}, {device}")
                 file = Path(folder) / f"{device}.npz"
                 hidden = {"CUDA_VISIBLE_DEVICES": ""} if device == "cpu" else {}
-                own = [sys.executable, __file__, "--frames", str(told.frames), "--of", *told.of]
+                own = [sys.executable, __file__, "--frames", str(options.frames), "--of", *options.of]
                 subprocess.run([*own, "--compute", file], env=os.environ | hidden, check=True)
                 with np.load(file) as found:
                     results.append(dict(found))
@@ -208,14 +200,14 @@ def main() -> None:
         "| what is computed | CPU ms | GPU ms | CPU ÷ GPU | difference |",
         "| --- | ---: | ---: | ---: | --- |",
     ]
-    for name in told.of:
+    for name in options.of:
         cpu, gpu = (medians(rounds[device], name) for device in ("cpu", "gpu"))
-        differing = difference(rounds["gpu"][0], rounds["cpu"][0], name, told.frames)
+        differing = difference(rounds["gpu"][0], rounds["cpu"][0], name, options.frames)
         lines.append(f"| {name} | {cpu:.1f} | {gpu:.1f} | {cpu / gpu:.2f} | {differing} |")
     table = re.sub(r"(?<![\w-])-(?=\d)", "−", "\n".join(lines)) + "\n"
     print(table)
-    if told.markdown:
-        told.markdown.write_text(table, "utf-8")
+    if options.markdown:
+        options.markdown.write_text(table, "utf-8")
 
 
 if __name__ == "__main__":

@@ -90,6 +90,17 @@ def bare(service: LidarSensors, repeats: int) -> float:
     return float(np.median(times))
 
 
+def asset_files(scene: str, folder: Path) -> dict[str, Path]:
+    """Files of a scene of sionna-rt and of a car, by asset name; what is made goes below a folder."""
+    assets = {}
+    for name, content in {**scenery_assets(f"sionna:{scene}"), **object_assets(["car"])}.items():
+        assets[name] = content if isinstance(content, Path) else folder / name
+        if isinstance(content, bytes):
+            assets[name].parent.mkdir(exist_ok=True)
+            assets[name].write_bytes(content)
+    return assets
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -98,12 +109,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100)
     told = parser.parse_args()
     with TemporaryDirectory() as folder:
-        assets = {}
-        for name, content in {**scenery_assets(f"sionna:{told.scene}"), **object_assets(["car"])}.items():
-            assets[name] = content if isinstance(content, Path) else Path(folder) / name
-            if isinstance(content, bytes):
-                assets[name].parent.mkdir(exist_ok=True)
-                assets[name].write_bytes(content)
+        assets = asset_files(told.scene, Path(folder))
         service = LidarSensors(LidarSettings(bodies_per_asset=told.objects), RunInfo(name="lidar"))
         prepared = service.prepare(Preparation(demand={"lidar": frozenset()}, assets=assets))
         print(prepared.notes[0])

@@ -141,10 +141,14 @@ def test_the_carrier_is_seen_by_its_own_lidar(service: LidarSensors) -> None:
     np.testing.assert_allclose(scan.range[own], 1.0, atol=1e-4)
 
 
-def test_a_lidar_on_the_roof_itself_is_accepted(service: LidarSensors) -> None:
+@pytest.mark.parametrize("elevation_rad", [0.0, 0.01])
+def test_a_lidar_on_the_roof_itself_is_accepted(service: LidarSensors, elevation_rad: float) -> None:
     """At no height above it, whichever way the height rounds."""
-    # Of rays in the plane of the roof itself Embree says that they pass the edges, OptiX that they hit them.
-    device = LidarDevice(name="lidar", parent="me", position=(0, 0, 1.75), elevation_min=0.01, beams=2)
+    if elevation_rad == 0 and service.variant.startswith("cuda"):
+        pytest.skip("rays in the roof's own plane pass its edges in Embree, and hit them in OptiX")
+    device = LidarDevice(
+        name="lidar", parent="me", position=(0, 0, 1.75), elevation_min=elevation_rad, beams=2
+    )
     lidar = observed(service, scene_of({"me": a_car(0, 0, 0.3)}, device))
     assert "me" not in lidar.object_names
 

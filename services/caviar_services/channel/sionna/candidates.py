@@ -26,6 +26,7 @@ from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,
     SCATTERED,
+    Bounce,
     Launch,
     LaunchOptions,
 )
@@ -161,11 +162,12 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
     before, chain = np.zeros(1, np.int64), np.zeros(1, np.int64)
     for d, begins in enumerate(_runs(launch)):
         lengths = np.diff(np.append(begins, launch.rays))
-        on = _column(launch.bounces[d].kind, begins) != 0
+        met = _columns(launch.bounces[d], begins)
+        on = met[0] != 0
         heads = begins[on]
         if not len(heads):
             break
-        kind, plane, token, tokens = _tokens(launch, d, heads, scene)
+        kind, plane, token, tokens = _tokens(launch, heads, met[:, on], scene)
         # One integer for the chain before and the interaction that follows it.
         key = chain[np.searchsorted(before, heads, side="right") - 1] * tokens + token
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
@@ -221,23 +223,29 @@ def _differs(column: Any, previous: Any) -> Any:
     return column != dr.gather(type(column), column, previous)
 
 
-def _column(column: Any, rays: Int64Array) -> Int64Array:
-    """What a column of the ray tracer's has for some rays."""
+def _columns(bounce: Bounce, rays: Int64Array) -> Int64Array:
+    """Kind, shape and primitive that some rays met at an interaction, Shape ``[3, N]``."""
+    return _gathered((bounce.kind, bounce.shape, bounce.primitive), rays)
+
+
+def _gathered(columns: Sequence[Any], rays: Int64Array) -> Int64Array:
+    """What C columns of the ray tracer's have for N rays, Shape ``[C, N]``."""
     import drjit as dr
     import mitsuba as mi
 
     # Two more, since to Dr.Jit an array of one element is another kernel.
     index = mi.UInt(aligned_indices(np.append(rays, (0, 0))))
-    values: Int64Array = dr.gather(type(column), column, index).numpy()[: len(rays)].astype(np.int64)
-    return values
+    found = [dr.gather(type(column), column, index) for column in columns]
+    dr.eval(found)  # all in one kernel
+    return np.array([values.numpy()[: len(rays)] for values in found], np.int64)
 
 
 def _tokens(
-    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+    launch: Launch, ray: Int64Array, met: Int64Array, scene: SionnaScene
 ) -> tuple[Int64Array, Int64Array, Int64Array, int]:
     """Kind, plane, and what tells interactions of these rays apart: the plane of a reflection, the edge of a
     diffraction, else the kind alone; and how many of these there can be."""
-    kind, plane, token = _met_at(launch, d, ray, scene)
+    kind, plane, token = _identified(launch, ray, met, scene)
     first_edge = _first_edge(scene)
     bent = np.flatnonzero(token >= first_edge)
     edges = 0
@@ -253,22 +261,22 @@ def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array
     signature = np.full(chains.planes.shape, -1, np.int64)
     for d in range(len(launch.bounces)):
         used = chains.depth > d
-        signature[used, d] = _met_at(launch, d, chains.ray[used], scene)[2]
+        ray = chains.ray[used]
+        signature[used, d] = _identified(launch, ray, _columns(launch.bounces[d], ray), scene)[2]
     return signature
 
 
-def _met_at(
-    launch: Launch, d: int, ray: Int64Array, scene: SionnaScene
+def _identified(
+    launch: Launch, ray: Int64Array, met: Int64Array, scene: SionnaScene
 ) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Kind and plane of an interaction of rays, and a number that tells it apart in all launches: the
+    """Kind and plane of what rays met (`_columns`), and a number that tells it apart in all launches: the
     plane, or one for each kind, or one for each edge."""
-    bounce = launch.bounces[d]
-    kind, shape, primitive = (_column(of, ray) for of in (bounce.kind, bounce.shape, bounce.primitive))
+    kind, shape, primitive = met
     plane = scene.surface_of[scene.triangle_numbers(shape, primitive)]
     token = np.where(kind == REFLECTED, plane, _first_edge(scene) - 16 + kind)
     bent = kind == DIFFRACTED
     if bent.any():
-        token[bent] = _first_edge(scene) + _column(launch.wedges.local_edge, ray[bent])
+        token[bent] = _first_edge(scene) + _gathered([launch.wedges.local_edge], ray[bent])[0]
     return kind, plane, token
 
 

@@ -384,10 +384,10 @@ class SionnaScene(NumberedTriangles):
         turning = None
         if scene.angular_velocity is not None and scene.angular_velocity.any():
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
-        vertices = self.moving_vertices
-        begin = len(vertices) - sum(len(self._pool.meshes[asset].vertices) for asset, _ in self._bodies)
+        vertices, meshes = self.moving_vertices, self._pool.meshes
+        begin = len(vertices) - sum(len(meshes[asset].vertices) for asset, _ in self._bodies)
         for number, body in enumerate(self._bodies, start=self.first_body_piece):
-            mesh = self._pool.meshes[body[0]]
+            mesh = meshes[body[0]]
             rows = slice(begin, begin + len(mesh.vertices))
             begin = rows.stop
             i = standing.get(body)
