@@ -210,8 +210,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             notes += tuple(f"foliage {brief}" for brief in self.foliage.briefs)
         self._names, self._outside = scene.names, scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
-        if scene.far_note:
-            notes += (scene.far_note,)
+        notes += scene.notes
         if scene.detail_effect is not None:
             notes += (scene.detail_effect.note,)
             self._detail = scene.detail_effect.brief

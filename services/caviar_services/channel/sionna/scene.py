@@ -53,13 +53,12 @@ from caviar_services.channel.sionna.scene_loading import (
     bounds,
     by_material,
     counting_centre,
-    file_meshes,
-    file_vertices,
+    file_pieces,
     floats,
     itu_materials,
-    loaded,
     mi_mesh,
     near_middle,
+    new_scene,
     object_materials,
     set_materials,
     with_detail,
@@ -130,18 +129,19 @@ class SionnaScene(NumberedTriangles):
             if bodied
         ]
         description = find_scenery(assets)
-        files = {} if description is None else file_vertices(description)  # says what is wrong with a file
-        self._scene = loaded(description)
+        pieces, self.notes = file_pieces(description)
+        """Warnings for the user about the scenery."""
+        self._scene = new_scene(piece.material for piece in pieces.values())
         self._objects, self._foliage = settings.objects, settings.foliage
-        meshes = file_meshes(self._scene, files)
-        self.foliage_meshes = {name: meshes.pop(name) for name in list(meshes) if self._foliage.of(name)}
+        leaves = [name for name in pieces if self._foliage.of(name)]
+        self.foliage_meshes = {name: pieces.pop(name).mesh for name in leaves}
         """Pieces of scenery that are foliage, by name; no shape has them."""
-        self._scenery = frozenset(meshes)
+        self._scenery = frozenset(pieces)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         own = own_materials(assets)
         made = self._made = self._with_materials_of_meshes(made, set(own.values()))
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
-        full = by_material(self._scene, meshes, changed)
+        full = by_material(pieces, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = bounds(shapes)
@@ -157,7 +157,8 @@ class SionnaScene(NumberedTriangles):
         self._moving = self._body_shapes()
         self._shapes = [*shapes, *self._moving]
         # The note names the piece that is so far from the others that the ray tracer is coarse there.
-        centre, self.far_note = counting_centre(shapes)
+        centre, far_note = counting_centre(shapes)
+        self.notes += (far_note,) if far_note else ()
         super().__init__(
             self._shapes,
             self._replace_shapes(centre),
