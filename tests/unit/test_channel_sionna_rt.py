@@ -16,6 +16,7 @@ from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.stability.lab import frame_of
+from caviar_services.mesh.shapes import ply, unit_box
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
 
@@ -144,9 +145,19 @@ class TestPreparing:
             '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)'
         )
 
-    def test_bodies_outside_the_range_of_their_material_are_named(self) -> None:
-        with pytest.raises(ScenarioError, match=r"'body_material' \(ITU metal\).*another body_material"):
-            prepared(frequency=140e9)
+    def test_bodies_outside_the_range_of_their_material_are_named_where_an_object_has_it(
+        self, tmp_path: Path
+    ) -> None:
+        """Before the first frame where a mesh of the run is of it, else with the first such object."""
+        named = r"'body_material' \(ITU metal\).*another body_material"
+        (tmp_path / "car.ply").write_bytes(ply(unit_box()))
+        with pytest.raises(ScenarioError, match=named):
+            prepared({"objects/car.ply": tmp_path / "car.ply"}, frequency=140e9)
+        boxes = prepared(frequency=140e9, object_materials={"van": "glass"})
+        step(boxes, ())
+        with pytest.raises(ScenarioError, match=named):
+            step(boxes, ("a",))
+        step(prepared(frequency=140e9, object_materials={"car": "glass"}), ("a",))
 
     def test_without_bodies_their_material_is_not_needed(self) -> None:
         prepared(frequency=140e9, bodies=0)

@@ -100,7 +100,7 @@ def test_faces_may_have_numbers_beside_their_corners(
 def test_polygons_that_are_not_convex_are_cut_within_their_border(
     tmp_path: Path, first: int, sense: int
 ) -> None:
-    """An L-shaped roof of 3 m² on a slope: triangles cover it once, all in its sense, from any first corner."""
+    """An L-shaped roof of 3 m² on a slope: triangles cover it once, all in its sense."""
     outline = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], np.float64)
     corners = np.column_stack([outline.sum(1), outline])[::sense]  # the header says z, x, y
     rows = "\n".join(" ".join(map(str, corner)) for corner in np.roll(corners, first, axis=0))

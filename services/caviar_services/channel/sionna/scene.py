@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.errors import PayloadError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
@@ -40,6 +40,7 @@ from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
+    ItuMaterial,
     MaterialPolicy,
     ObjectMaterials,
     OutsideUse,
@@ -122,12 +123,8 @@ class SionnaScene(NumberedTriangles):
         self.bodies_version = 0
         """Counts how often bodies were made anew, for meshes that came while the run goes on."""
         self._rt_objects: list[tuple[Shape, Any]] = []
-        bodied = any(pool.values())
-        skins = self._skins = [
-            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
-            for frequency in settings.frequencies_hz
-            if bodied
-        ]
+        own = own_materials(assets)
+        skins = self._skins = self._skin_materials(pool, settings, own)
         description = find_scenery(assets)
         pieces, self.notes = file_pieces(description)
         """Warnings for the user about the scenery."""
@@ -138,7 +135,6 @@ class SionnaScene(NumberedTriangles):
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(pieces)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
-        own = own_materials(assets)
         made = self._made = self._with_materials_of_meshes(made, set(own.values()))
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
         full = by_material(pieces, changed)
@@ -174,6 +170,31 @@ class SionnaScene(NumberedTriangles):
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._set_carriers()
 
+    def _skin_materials(
+        self, pool: Mapping[str, int], settings: SceneSettings, own: Mapping[str, str]
+    ) -> list[ItuMaterial]:
+        """The material of bodies without one of their own, on each carrier; none without bodies."""
+        self._skin_error: ScenarioError | None = None
+        """Why no object may have `body_material`; None: objects may."""
+        policy = settings.materials
+        if not any(pool.values()):
+            return []
+        try:
+            return [
+                itu_material(_SKIN_NAME, settings.body_material, frequency, policy, _OTHER_SKIN)
+                for frequency in settings.frequencies_hz
+            ]
+        except ScenarioError as error:
+            # Meshes of objects are of it for sure where none names a material; of boxes, and of objects
+            # with a material of their own, nothing may be made of it.
+            if not settings.objects.by_key and any(mesh and mesh not in own for mesh in pool):
+                raise
+            self._skin_error, policy = error, replace(policy, outside="nearest")
+        return [
+            itu_material(_SKIN_NAME, settings.body_material, frequency, policy)
+            for frequency in settings.frequencies_hz
+        ]
+
     def _set_carriers(self) -> None:
         """Note what materials have on each carrier, and which are used where they are not defined."""
         settings, skins = self._settings, self._skins
@@ -189,8 +210,9 @@ class SionnaScene(NumberedTriangles):
             found = itu_materials(self._scene, frequency, settings.materials)
             used = [(material.name, itu, constants) for material, itu, constants in found]
             tuned = [(material, constants) for material, _, constants in found]
-            if skins:
+            if skins and self._skin_error is None:
                 used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
+            if skins:
                 tuned.append((self._skin, skins[carrier].constants))
             used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
             tuned += [(of.radio, of.constants[carrier]) for of in made.values()]
@@ -350,9 +372,14 @@ class SionnaScene(NumberedTriangles):
 
         Raises:
             PayloadError: The pool is too small, or an object has the name of a piece of scenery.
+            ScenarioError: An object is of `body_material`, which is not defined at a carrier.
         """
         solid = self._solid(scene, without_body)
-        return self.place_bodies(scene, {i: self._pool.kind(scene, i) for i in solid})
+        kinds = {i: self._pool.kind(scene, i) for i in solid}
+        of_skin = {kind for kind, _ in self._pool.of_material[""]}
+        if self._skin_error is not None and of_skin.intersection(kinds.values()):
+            raise self._skin_error
+        return self.place_bodies(scene, kinds)
 
     def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
         """Objects of a scene that waves meet, by their index."""
