@@ -291,3 +291,40 @@ class TestFrames:
         assert (enough.counts["paths"], enough.counts["path_limit_reached"]) == (4, 0)
         result = step(prepared(scenery(tmp_path, "brick"), max_paths=1), (), *ends)
         assert (result.counts["paths"], result.counts["path_limit_reached"]) == (2, 2)
+
+    @pytest.mark.parametrize("below", ["concrete", "metal"])
+    def test_the_upper_of_two_sheets_a_millimetre_apart_is_met(self, tmp_path: Path, below: str) -> None:
+        """Whichever stands first in the file; two in one plane are warned of by name."""
+        above = {"concrete": "metal", "metal": "concrete"}[below]
+        ends = (
+            AntennaDevice(name="r", role="rx", position=(10.0, 0, 5)),
+            AntennaDevice(name="t", role="tx", position=(0.0, 0, 5)),
+        )
+        heard = []
+        for sheets in ({below: 0.0, above: 0.001}, {above: 0.001, below: 0.0}, {above: 0.001}):
+            channel = step(prepared(sheets_of(tmp_path, sheets)), (), *ends).products["channel"]
+            assert isinstance(channel, Channel)
+            heard.append(channel.a)
+        np.testing.assert_array_equal(heard[0], heard[2])
+        np.testing.assert_array_equal(heard[1], heard[2])
+        made = model()
+        assets = sheets_of(tmp_path, {below: 0.0, above: 0.0})
+        notes = made.prepare(Preparation(demand={}, assets=assets)).notes
+        assert any(f"{below!r}" in note and f"{above!r}" in note and "one plane" in note for note in notes)
+
+
+def sheets_of(folder: Path, heights: dict[str, float]) -> dict[str, Path]:
+    """A floor of each material at its height [m]."""
+    (folder / "floor.ply").write_text(PLY)
+    file = folder / "sheets.xml"
+    file.write_text(
+        '<scene version="2.1.0">'
+        + "".join(
+            f'<bsdf type="diffuse" id="itu_{m}"/><shape type="ply" id="{m}"><string name="filename" '
+            f'value="floor.ply"/><ref id="itu_{m}" name="bsdf"/><transform name="to_world"><translate '
+            f'z="{z}"/></transform></shape>'
+            for m, z in heights.items()
+        )
+        + "</scene>"
+    )
+    return {"scenery/sheets.xml": file, "scenery/floor.ply": folder / "floor.ply"}

@@ -37,7 +37,7 @@ from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
 from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, scene_of
-from caviar_services.channel.sionna.settings import SionnaSettings, contributing
+from caviar_services.channel.sionna.settings import SionnaSettings, contributing, transmits
 from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
@@ -232,6 +232,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         moving = meshes or any(device.on for device in self.run.devices)
         self._enumerates = s.enumerates(moving)
         switched = self._make_finder()
+        if self._launched.refraction:
+            frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
+            surfaces = self._scene.used_surfaces().materials
+            through = {
+                surface.name for surface in surfaces if transmits(surface, self._launched, frequencies)
+            }
+            notes += self._scene.closed_walls(through)
         return (*notes, *self._finder.notes, *switched, *self._warm_up())
 
     def _make_finder(self, before: PathFinder | None = None) -> tuple[str, ...]:

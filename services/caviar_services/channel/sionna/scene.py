@@ -15,7 +15,7 @@ adaptive ladder mostly do.
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -64,6 +64,7 @@ from caviar_services.channel.sionna.scene_loading import (
     set_materials,
     with_detail,
 )
+from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
 from caviar_services.mesh.shapes import Mesh, placed, unit_box
@@ -163,6 +164,7 @@ class SionnaScene(NumberedTriangles):
             centre,
             len(self._moving),
         )
+        self.notes += coinciding_materials(shapes, self.plane_of[: self._first_moving])
         self.edges: SceneEdges | None = None
         """None where nothing is diffracted."""
         if settings.edges:
@@ -266,6 +268,15 @@ class SionnaScene(NumberedTriangles):
             ),
             has_edges=self.edges is not None and len(self.edges) > 0,
         )
+
+    def closed_walls(self, transparent: Collection[str]) -> tuple[str, ...]:
+        """Warnings of closed thin walls, each face of which is a slab.
+
+        Args:
+            transparent: Names of the materials (`used_surfaces`) that waves go through.
+        """
+        ids = {shape.id for shape in self._at_rest if _material_name(shape) in transparent}
+        return closed_walls(self._at_rest, self.part_of[: self._first_moving], ids)
 
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:

@@ -327,7 +327,7 @@ def contributing(
         if not any(material.scattering_coefficient > 0 for material in surfaces.materials):
             off["scattering"] = "no material has a scattering_coefficient above 0"
         if options.refraction and not any(
-            _transmits(material, options, frequencies_hz) for material in surfaces.materials
+            transmits(material, options, frequencies_hz) for material in surfaces.materials
         ):
             levels = ", ".join(_strongest(material, frequencies_hz) for material in surfaces.materials)
             off["refraction"] = f"no ray is ever sent through a material ({levels} at most)"
@@ -346,8 +346,14 @@ def contributing(
     return left, notes
 
 
-def _transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
-    """Whether a ray can be sent through on any carrier at any incidence."""
+def transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
+    """Whether a ray can be sent through a surface on any carrier at any incidence.
+
+    Args:
+        material: Of the surface.
+        options: What is traced.
+        frequencies_hz: Of the carriers [Hz].
+    """
     rough = material.scattering_coefficient**2
     returned = options.reflection * (1 - rough) + options.scattering * rough
     for constants, frequency in zip(material.constants, frequencies_hz, strict=True):
