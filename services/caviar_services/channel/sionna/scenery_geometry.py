@@ -58,7 +58,7 @@ def coinciding_materials(shapes: Sequence[Shape], plane: Int64Array) -> tuple[st
             continue
         normal = normals[largest] / length
         height = (triangles - a[largest]) @ normal
-        sides = (1.0, -1.0)
+        sides: tuple[float, ...] = (1.0, -1.0)
         if abs(normal[2]) > _LYING:  # grounds and roofs are met from above
             sides = (1.0,) if normal[2] > 0 else (-1.0,)
         for side in sides:

@@ -98,7 +98,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     reflection: bool = True
     """Whether specular reflections count."""
     refraction: bool = False
-    """Whether waves pass through walls."""
+    """Whether waves pass through walls: each face is a slab of its material's thickness, so that a wall is to
+    be one face, not a closed box."""
     diffraction: bool = False
     """Whether edges diffract."""
     free_edges: bool = False
