@@ -147,3 +147,11 @@ def test_a_material_that_cannot_be_made_is_named_with_its_line_and_cause(
         file_pieces(described(tmp_path, materials + shape_of("wall", "c")))
     assert "Traceback" not in str(caught.value)
     assert "At string" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["wall-material", "itu_concrete"])
+def test_a_radio_material_keeps_its_properties_whatever_its_id(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("mitsuba").set_variant(choose_variant())
+    rough = '<float name="scattering_coefficient" value="0.3"/>'
+    pieces, _ = file_pieces(described(tmp_path, CONCRETE.format(name, rough) + shape_of("wall", name)))
+    assert float(pieces["wall"].material.scattering_coefficient[0]) == pytest.approx(0.3)
