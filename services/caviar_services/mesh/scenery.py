@@ -86,7 +86,7 @@ def world_mesh(shape: SceneryShape) -> Mesh:
     Raises:
         AssetError: The file is no mesh, or a vertex is not finite; names the shape.
     """
-    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file}")
+    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
     return Mesh(vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3], faces.astype(np.int32))
 
 
