@@ -29,6 +29,7 @@ from caviar_services.airsim.bridge import OVER, Bridge, Snapshot
 from caviar_services.airsim.calls import Offer, StateCalls
 from caviar_services.airsim.motion_calls import Habits, MotionCalls
 from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
+from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 LOOK_S = 0.1
@@ -54,7 +55,7 @@ class AirSimSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     it had been paused before."""
     origin_m: tuple[float, float, float] | None = None
     """Origin of AirSim's axes; unset: where the first vehicle is in the first frame."""
-    geo_origin: tuple[float, float, float] = (47.641468, -122.140165, 122.0)
+    geo_origin: tuple[float, float, float] = GEO_ORIGIN
     """Latitude [°], longitude [°] and altitude [m] there; the default is AirSim's."""
     sensors: dict[str, str] = msgspec.field(default_factory=dict)
     """Device by a further name that scripts use for it: ``sensors = { front_center = "uav/gimbal" }``."""

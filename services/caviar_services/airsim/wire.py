@@ -19,6 +19,8 @@ from caviar_services.airsim.rpc import CallError
 
 EARTH_RADIUS_M = 6_378_137.0
 """[m] of the sphere on which geographic positions lie: the equator of WGS 84."""
+GEO_ORIGIN = (47.641468, -122.140165, 122.0)
+"""Latitude [°], longitude [°] and altitude [m] of the origin, as AirSim's settings have it by default."""
 FAR = 1e6
 """[m, m/s] beyond which a number is taken for a mistake."""
 LEVEL = (1.0, 0.0, 0.0, 0.0)

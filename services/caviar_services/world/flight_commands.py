@@ -26,9 +26,7 @@ def motion_of(agent: str, command: MotionCommand) -> Motion:
     """
     _check_numbers(agent, command)
     if isinstance(command, WaypointCommand):
-        return Motion(
-            target=command.position, speed=command.speed, at_once=command.at_once, yaw=command.yaw
-        )
+        return Motion(target=command.position, speed=command.speed, at_once=command.at_once, yaw=command.yaw)
     if isinstance(command, VelocityCommand):
         return Motion(velocity=command.velocity, yaw=command.yaw, yaw_rate=command.yaw_rate)
     raise PayloadError(
