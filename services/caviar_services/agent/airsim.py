@@ -29,6 +29,7 @@ from caviar_services.airsim.bridge import OVER, Bridge, Snapshot
 from caviar_services.airsim.calls import Offer, StateCalls
 from caviar_services.airsim.motion_calls import Habits, MotionCalls
 from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
+from caviar_services.airsim.sensor_calls import SensorCalls
 from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
@@ -137,9 +138,9 @@ class AirSimAgent(Agent[AirSimSettings]):
             settings.vehicles, settings.origin_m, settings.geo_origin, paused=settings.start == "paused"
         )
         in_sensor_axes = settings.lidar_frame == "sensor"
-        state = StateCalls(self._bridge, settings.sensors, lidar_in_sensor_axes=in_sensor_axes)
+        sensors = SensorCalls(self._bridge, settings.sensors, lidar_in_sensor_axes=in_sensor_axes)
         motion = MotionCalls(self._bridge, settings.habits)
-        offer = Offer({**state.offered(), **motion.offered()})
+        offer = Offer({**StateCalls(self._bridge).offered(), **sensors.offered(), **motion.offered()})
         self._server = RpcServer(offer.handle, *address_of(settings.listen))
         await self._server.start()
 

@@ -1,8 +1,8 @@
 """Agent ``mavlink``: a ground station or a companion computer flies an object of the world, over MAVLink.
 
-Towards its peer the agent is a vehicle (https://mavlink.io/en/messages/common.html): it sends its
-state, takes off and lands, and obeys set-points as in offboard flight. Modes have the numbers of PX4. Beams are
-those of ``los-beam``. What the peer sends is recorded, but not repeatable: equal seeds give equal digests only where
+Towards its peer the agent is a vehicle (https://mavlink.io/en/messages/common.html): it sends its state, and
+takes off, lands and obeys set-points as in offboard flight. Modes have the numbers of PX4. Beams are those of
+``los-beam``. What the peer sends is recorded, but not repeatable: equal seeds give equal digests only where
 the peer sends the same in the same frames.
 """
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array
-from caviar_protocol.space.coordinates import Pose, Vector
+from caviar_protocol.space.coordinates import Pose, Vector, unrotated
 from caviar_protocol.space.engine_axes import NED, Motion
 from caviar_services.airsim.rpc import CallError
 
@@ -185,12 +185,13 @@ class NedFrame:
             angular_velocity: [rad/s], in ENU.
             acceleration: [m/s²], in ENU.
         """
-        # Angular velocities of AirSim are in body axes; of what turns about the vertical alone both are one.
         motion = NED.motion_from_enu(Motion(velocity, angular_velocity))
+        # Angular velocities of AirSim are in body axes.
+        there = NED.from_enu(Pose(self._from_origin(pose.position), pose.orientation))
         return {
             **self.pose(pose),
             "linear_velocity": vector_map(motion.velocity),
-            "angular_velocity": vector_map(motion.angular_velocity),
+            "angular_velocity": vector_map(unrotated(there.orientation, motion.angular_velocity)),
             "linear_acceleration": vector_map(self.velocity(acceleration)),
             "angular_acceleration": vector_map((0.0, 0.0, 0.0)),
         }
