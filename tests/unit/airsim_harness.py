@@ -88,6 +88,7 @@ class Flight:
         bodies: What is flown; each is the vehicle of its name.
         cars: Positions of cars in frame 0, by name.
         drives: Their velocity [m/s].
+        walls: Triangles of the scenery.
         products: Further fields of each snapshot.
     """
 
@@ -97,11 +98,15 @@ class Flight:
         cars: Mapping[str, Vector] | None = None,
         paused: bool = False,
         drives: Vector = (0.0, 0.0, 0.0),
+        walls: np.ndarray | None = None,
         **products: Any,
     ) -> None:
         self.bodies = bodies or (Body(),)
         self.bridge = Bridge({body.name: body.name for body in self.bodies}, paused=paused)
-        sensors = SensorCalls(self.bridge, {"front_center": "uav/front"})
+        further = {"front_center": "uav/front"}
+        sensors = SensorCalls(
+            self.bridge, further, load_scenery=lambda: np.zeros((0, 3, 3)) if walls is None else walls
+        )
         motion = MotionCalls(self.bridge, Habits())
         self.offer = Offer({**StateCalls(self.bridge).offered(), **sensors.offered(), **motion.offered()})
         self.cars, self.drives, self.products = cars or {}, drives, products

@@ -16,6 +16,7 @@ from caviar_protocol.topics import Lidar, LidarScan, VelocityCommand, WaypointCo
 from caviar_services.airsim.calls import WITHOUT_EFFECT
 from caviar_services.airsim.rpc import CallError
 from caviar_services.airsim.sensor_calls import NAVIGATION, atmosphere
+from caviar_services.airsim.wire import NedFrame
 
 
 def do(work: Awaitable[Any]) -> Any:
@@ -225,6 +226,41 @@ def test_a_camera_is_found_by_airsims_names_and_numbers_and_says_how_it_sees() -
     # What is 10 m ahead, 5 m to the right and 2 m below lands at half the width; 4 × 3 pixels.
     x, y, _, w = np.array(found[0]["proj_mat"]["matrix"]) @ [10.0, 5.0, 2.0, 1.0]
     assert (x / -w, y / w) == pytest.approx((0.5, 2.0 / 10.0 * 4 / 3))
+
+
+def test_a_line_of_sight_ends_at_a_wall_of_the_scenery() -> None:
+    """A wall 10 m north of the start, 4 m wide and 6 m high."""
+    x, y, _ = START
+    corners = np.array(
+        [[x - 2, y + 10, 0.0], [x + 2, y + 10, 0.0], [x + 2, y + 10, 6.0], [x - 2, y + 10, 6.0]]
+    )
+    ned = NedFrame(START)
+    places = {
+        "behind": (x, y + 20, 3.0),
+        "above": (x, y + 20, 20.0),
+        "before": (x + 1, y + 9, 3.0),
+        "beside": (x + 9, y + 20, 3.0),
+    }
+
+    async def ask() -> tuple[dict[str, bool], bool, Any]:
+        flight = Flight(walls=corners[[[0, 1, 2], [0, 2, 3]]])
+        await flight.step()
+        seen = {
+            name: await flight.call("simTestLineOfSightToPoint", ned.geo_point(place))
+            for name, place in places.items()
+        }
+        ends = [ned.geo_point(places[name]) for name in ("above", "behind")]
+        return (
+            seen,
+            await flight.call("simTestLineOfSightBetweenPoints", *ends),
+            await flight.call("simGetWorldExtents"),
+        )
+
+    seen, beyond, (low, high) = do(ask())
+    assert seen == {"behind": False, "above": True, "before": True, "beside": True}
+    assert beyond is True
+    assert ned.from_geo_point(low, "low") == pytest.approx(corners.min(axis=0), abs=1e-6)
+    assert ned.from_geo_point(high, "high") == pytest.approx(corners.max(axis=0), abs=1e-6)
 
 
 def test_what_is_without_effect_or_not_offered_is_named_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -14,8 +14,10 @@ from collections.abc import Coroutine, Iterable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
+from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
@@ -32,6 +34,7 @@ from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
 from caviar_services.airsim.sensor_calls import SensorCalls
 from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.world.scenery import scenery_assets, scenery_triangles
 
 LOOK_S = 0.1
 """[s] between looks for orders of the broker while a client holds the world."""
@@ -138,11 +141,25 @@ class AirSimAgent(Agent[AirSimSettings]):
             settings.vehicles, settings.origin_m, settings.geo_origin, paused=settings.start == "paused"
         )
         in_sensor_axes = settings.lidar_frame == "sensor"
-        sensors = SensorCalls(self._bridge, settings.sensors, lidar_in_sensor_axes=in_sensor_axes)
+        sensors = SensorCalls(
+            self._bridge,
+            settings.sensors,
+            lidar_in_sensor_axes=in_sensor_axes,
+            load_scenery=self._load_scenery,
+        )
         motion = MotionCalls(self._bridge, settings.habits)
         offer = Offer({**StateCalls(self._bridge).offered(), **sensors.offered(), **motion.offered()})
         self._server = RpcServer(offer.handle, *address_of(settings.listen))
         await self._server.start()
+
+    def _load_scenery(self) -> Float64Array:
+        """Triangles of the scenery of all worlds [m], Shape ``[T, 3, 3]``."""
+        services = self.run.scenario.get("services")
+        found = [np.zeros((0, 3, 3))]
+        for spec in services.values() if isinstance(services, dict) else ():
+            if scenery := (spec.get("settings") or {}).get("scenery"):
+                found.append(scenery_triangles(scenery_assets(scenery)))
+        return np.concatenate(found)
 
     def other_actuators(self) -> tuple[str, ...]:
         """The motion of each vehicle."""

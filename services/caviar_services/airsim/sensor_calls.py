@@ -8,9 +8,12 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Pose, Vector, unrotated
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import CameraDevice, LidarDevice, LidarScan
@@ -126,6 +129,29 @@ NAVIGATION: Mapping[str, Callable[[Motion], Map]] = {
 """Call by what it answers; every vehicle has one of each, whatever the name."""
 
 
+def is_blocked(triangles: Float64Array, start: Vector, end: Vector) -> bool:
+    """Whether a triangle lies between two points (Möller and Trumbore, 1997).
+
+    Args:
+        triangles: Corners [m], Shape ``[T, 3, 3]``.
+        start, end: [m]
+
+    Example:
+        >>> wall = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
+        >>> [is_blocked(wall, (0.0, 0.0, 0.0), (x, 0.0, 0.0)) for x in (4.0, 9.0)]
+        [False, True]
+    """
+    way = np.subtract(end, start)
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal, offset = np.cross(way, second), start - triangles[:, 0]
+    across = np.cross(offset, first)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of triangles along the way
+        scale = 1.0 / (first * normal).sum(axis=1)
+        u, v = (offset * normal).sum(axis=1) * scale, across @ way * scale
+        t = (second * across).sum(axis=1) * scale
+        return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any())
+
+
 class SensorCalls:
     """Calls of cameras, LIDARs, and sensors of motion.
 
@@ -133,12 +159,19 @@ class SensorCalls:
         bridge: Of the run.
         sensors: Devices by further names that clients use for them.
         lidar_in_sensor_axes: Whether points are in axes of the sensor, and not of the vehicle's start.
+        load_scenery: Gives the triangles of the scenery [m], Shape ``[T, 3, 3]``; called once, when a call
+            needs them.
     """
 
     def __init__(
-        self, bridge: Bridge, sensors: Mapping[str, str], *, lidar_in_sensor_axes: bool = False
+        self,
+        bridge: Bridge,
+        sensors: Mapping[str, str],
+        *,
+        lidar_in_sensor_axes: bool = False,
+        load_scenery: Callable[[], Float64Array] = lambda: np.zeros((0, 3, 3)),
     ) -> None:
-        self._bridge, self._sensors = bridge, sensors
+        self._bridge, self._sensors, self._load_scenery = bridge, sensors, load_scenery
         self._lidar_in_sensor_axes = lidar_in_sensor_axes
 
     def offered(self) -> dict[str, Call]:
@@ -149,8 +182,36 @@ class SensorCalls:
             "simGetCameraInfo": self.camera_info,
             "getLidarData": self.lidar,
             "simGetGroundTruthEnvironment": self.environment,
+            "simTestLineOfSightToPoint": self.sees,
+            "simTestLineOfSightBetweenPoints": self.is_clear,
+            "simGetWorldExtents": self.extents,
             **{name: partial(self._measured, answer) for name, answer in NAVIGATION.items()},
         }
+
+    @cached_property
+    def _scenery(self) -> Float64Array:
+        return self._load_scenery()
+
+    async def sees(self, point: object, vehicle_name: object = "") -> bool:
+        """Whether no scenery stands between a vehicle and a ``GeoPoint``."""
+        _, flown = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
+        end = (await self._bridge.ned()).from_geo_point(point, "point")
+        return not await asyncio.to_thread(lambda: is_blocked(self._scenery, flown.position, end))
+
+    async def is_clear(self, point1: object, point2: object) -> bool:
+        """Whether no scenery stands between two ``GeoPoint``."""
+        ned = await self._bridge.ned()
+        start, end = ned.from_geo_point(point1, "point1"), ned.from_geo_point(point2, "point2")
+        return not await asyncio.to_thread(lambda: is_blocked(self._scenery, start, end))
+
+    async def extents(self) -> list[Map]:
+        """The least and the greatest ``GeoPoint`` of the scenery."""
+        ned = await self._bridge.ned()
+        corners = (await asyncio.to_thread(lambda: self._scenery)).reshape(-1, 3)
+        if not len(corners):
+            raise CallError("the run has no scenery, and so no extents")
+        low, high = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        return [ned.geo_point((low[0], low[1], low[2])), ned.geo_point((high[0], high[1], high[2]))]
 
     async def _measured(
         self, answer: Callable[[Motion], Map], sensor_name: object = "", vehicle_name: object = ""

@@ -213,6 +213,21 @@ class NedFrame:
             "altitude": altitude + up,
         }
 
+    def from_geo_point(self, point: object, name: str) -> Vector:
+        """The position in ENU [m] of AirSim's ``GeoPoint``.
+
+        Raises:
+            CallError: It is none.
+        """
+        parts = table(point, name)
+        latitude, longitude, altitude = (
+            number(parts.get(key), f"{name}.{key}") for key in ("latitude", "longitude", "altitude")
+        )
+        at, along, above = self.geo_origin
+        east = math.radians(longitude - along) * EARTH_RADIUS_M * math.cos(math.radians(at))
+        north = math.radians(latitude - at) * EARTH_RADIUS_M
+        return self._to_origin((east, north, altitude - above))
+
     def _from_origin(self, position: Vector) -> Vector:
         (x, y, z), (a, b, c) = position, self.origin
         return (x - a, y - b, z - c)
