@@ -10,14 +10,13 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import threading
-from collections.abc import Coroutine, Iterable, Iterator, Sequence
+from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
-from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
@@ -34,7 +33,7 @@ from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
 from caviar_services.airsim.sensor_calls import SensorCalls
 from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
-from caviar_services.world.scenery import scenery_assets, scenery_triangles
+from caviar_services.world.scenery import scenery_triangles
 
 LOOK_S = 0.1
 """[s] between looks for orders of the broker while a client holds the world."""
@@ -86,6 +85,7 @@ class AirSimAgent(Agent[AirSimSettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = AirSimSettings
+    uses_scenery: ClassVar[bool] = True
     inputs: ClassVar[tuple[Input, ...]] = (
         *Agent.inputs,
         *(Input(topic=topic, required=False) for topic in ("lidar", "camera", "depth", "segmentation")),
@@ -119,6 +119,7 @@ class AirSimAgent(Agent[AirSimSettings]):
     def __init__(self, settings: AirSimSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self._loop: _LoopThread | None = None
+        self._assets: Mapping[str, Path] = {}
         self._ends = False
 
     def prepare(self, preparation: Preparation) -> Prepared:
@@ -127,6 +128,7 @@ class AirSimAgent(Agent[AirSimSettings]):
         Raises:
             SetupError: The address is in use.
         """
+        self._assets = preparation.assets
         self._loop = _LoopThread()
         self._loop.run(self._listen(), CLOSE_S)
         host = self._server.host
@@ -145,21 +147,12 @@ class AirSimAgent(Agent[AirSimSettings]):
             self._bridge,
             settings.sensors,
             lidar_in_sensor_axes=in_sensor_axes,
-            load_scenery=self._load_scenery,
+            load_scenery=lambda: scenery_triangles(self._assets),
         )
         motion = MotionCalls(self._bridge, settings.habits)
         offer = Offer({**StateCalls(self._bridge).offered(), **sensors.offered(), **motion.offered()})
         self._server = RpcServer(offer.handle, *address_of(settings.listen))
         await self._server.start()
-
-    def _load_scenery(self) -> Float64Array:
-        """Triangles of the scenery of all worlds [m], Shape ``[T, 3, 3]``."""
-        services = self.run.scenario.get("services")
-        found = [np.zeros((0, 3, 3))]
-        for spec in services.values() if isinstance(services, dict) else ():
-            if scenery := (spec.get("settings") or {}).get("scenery"):
-                found.append(scenery_triangles(scenery_assets(scenery)))
-        return np.concatenate(found)
 
     def other_actuators(self) -> tuple[str, ...]:
         """The motion of each vehicle."""
