@@ -27,7 +27,6 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -40,6 +39,7 @@ from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
+    ItuMaterial,
     MaterialPolicy,
     ObjectMaterials,
     OutsideUse,
@@ -108,7 +108,7 @@ class SionnaScene(NumberedTriangles):
 
     Args:
         assets: Files of the run by name: scene description, its meshes, and meshes of objects.
-        pool: How many bodies there are of each asset; an empty asset is the box.
+        pool: How many bodies of each asset there are at first; an empty asset is the box, 0 forbids any.
         settings: Materials, edges and detail.
 
     Raises:
@@ -121,14 +121,10 @@ class SionnaScene(NumberedTriangles):
 
         self._settings = settings
         self.bodies_version = 0
-        """Counts how often bodies were made anew, for meshes that came while the run goes on."""
+        """Counts how often bodies were made anew while the run goes on."""
         self._rt_objects: list[tuple[Shape, Any]] = []
-        bodied = any(pool.values())
-        skins = self._skins = [
-            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
-            for frequency in settings.frequencies_hz
-            if bodied
-        ]
+        # Bodies that no object may have need no material that is defined at the carriers.
+        skins = self._skins = self._body_skins() if any(pool.values()) else []
         description = find_scenery(assets)
         files = {} if description is None else file_vertices(description)  # says what is wrong with a file
         self._scene = loaded(description)
@@ -172,6 +168,14 @@ class SionnaScene(NumberedTriangles):
             self.edges = SceneEdges(self, self.unit_meshes, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._set_carriers()
+
+    def _body_skins(self) -> list[ItuMaterial]:
+        """Material of bodies without one of their own, on each carrier."""
+        settings = self._settings
+        return [
+            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
+            for frequency in settings.frequencies_hz
+        ]
 
     def _set_carriers(self) -> None:
         """Note what materials have on each carrier, and which are used where they are not defined."""
@@ -296,7 +300,7 @@ class SionnaScene(NumberedTriangles):
         self._pool.use_meshes(meshes)
 
     def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
-        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+        """Make bodies where there are too few for the objects of a scene.
 
         Then `bodies_version` is another, and what was made of the bodies before is of no use.
 
@@ -304,12 +308,11 @@ class SionnaScene(NumberedTriangles):
             scene: The scene of a frame.
             without_body: Classes of objects that waves pass through.
         """
-        if not self._pool.awaits_meshes and not any(map(is_mesh_name, scene.assets)):
-            return
         if self._pool.awaits_meshes:  # before bodies are: where a material is refused, nothing has changed
             self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
         if not self._pool.make_room(scene, self._solid(scene, without_body)):
             return
+        self._skins = self._skins or self._body_skins()
         self._moving = self._body_shapes()
         self._shapes = [*self._at_rest, *self._moving]
         version, ids = self.version, self._replace_shapes(self.centre)
