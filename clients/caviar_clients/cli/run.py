@@ -136,8 +136,8 @@ class EmbeddedLauncher:
         now = time.monotonic()
         if now - self._reported_at >= REPORT_S:
             self._reported_at = now
-            frames = self._run.statistics.frames
-            self._pending.append({"event": "frame", "episode": frame.episode, "frames": frames, "misses": 0})
+            done = {"frames": self._run.statistics.frames, "misses": self._run.statistics.misses}
+            self._pending.append({"event": "frame", "episode": frame.episode, **done})
 
 
 def with_recording_checked(
@@ -175,12 +175,6 @@ def with_recording_checked(
         f"{len(recording)} frames, digest {digest}; the run has {outcome['frames']}, {outcome['digest']}"
     )
     return {**outcome, "error": f"{differs}: {figures}"}
-
-
-QUIET = frozenset({"stale", "note", "lag"})
-"""Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"warning", "lost", "away", "back", "restarted", "refused", "disk"})
-"""Kinds of notices that are shown every time, since what they ask of the user is always new."""
 
 
 class RunOutcome(NamedTuple):
