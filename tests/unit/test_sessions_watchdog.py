@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+from msgspec.structs import replace as replace_field
 
 from caviar_broker.core.plan import briefings, plan_run
 from caviar_clients.session import watchdog
-from caviar_clients.session.checks import check_implementations
+from caviar_clients.session.checks import check_implementations, checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun, EmbeddedSession
 from caviar_protocol.messages import Grant, Input
 from caviar_protocol.scenario import Scenario, parse_scenario

@@ -166,8 +166,10 @@ class RunPlan:
         return self.checkpoint_frames > 0 and not self.ephemeral
 
     def is_warm_up(self, service: ServicePlan, episode: int, frame: int) -> bool:
-        """Whether a service compiles and fills caches in a frame, which waits for it without a miss: the run's
-        first one, under ``wait``."""
+        """Whether a service still compiles in a frame, which waits for it without a miss.
+
+        It is the run's first one, under ``wait``.
+        """
         return service.waits_for_answer and frame == 0 and episode == self.first_episode
 
     def t_ns(self, frame: int) -> int:

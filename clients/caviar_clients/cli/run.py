@@ -199,6 +199,7 @@ def run_scenario(
     http: str = "",
     pace: str | None = None,
     airsim: str = "",
+    settings: Sequence[str] = (),
 ) -> RunOutcome:
     """Run a scenario to its end, with progress and summary on the screen.
 
@@ -213,13 +214,14 @@ def run_scenario(
         keys: Keys directory; None: a run without keys.
         http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
         airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
 
     Raises:
         ScenarioError: A key or value of the scenario is wrong.
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace, airsim)
+    scenario = checked_scenario(path, frames, seed, pace, airsim, settings)
     if bind:
         check_bind(bind, keys=keys is not None)
     require_extras(scenario)
@@ -255,6 +257,7 @@ def run_scenario(
             http,
             pace=pace,
             airsim=airsim,
+            settings=settings,
         )
     return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
 
