@@ -154,6 +154,8 @@ class Launcher:
         if self._broker is None:
             self._start_broker()
         while not self._finished:
+            if not self._over and not self.directory.exists():
+                self.stop("its directory was deleted")
             for key, _ in self._selector.select(LOOK_S):
                 if self._selector.get_map().get(key.fd) is not key:
                     # An earlier event of this batch, the broker's end, replaced all services, and one of

@@ -62,6 +62,7 @@ class EmbeddedLauncher:
         self._pending: deque[dict[str, Any]] = deque()
         self._reported_at = 0.0
         self._log_error = ""
+        self._deleted = False
         self._stopping = ""
         self._run = EmbeddedRun(scenario, directory, self._notice, self._frame, self._waiting)
 
@@ -75,6 +76,8 @@ class EmbeddedLauncher:
         """Run, and yield what happens, in the words of the broker's events; the last one is ``finished``."""
         with closing(self._run.steps()) as steps:
             for _ in steps:
+                if self._deleted:
+                    self.stop("its directory was deleted")
                 while self._pending:
                     event = self._pending.popleft()
                     if event["event"] == "notice":
@@ -136,6 +139,7 @@ class EmbeddedLauncher:
         now = time.monotonic()
         if now - self._reported_at >= REPORT_S:
             self._reported_at = now
+            self._deleted = not self._directory.exists()
             done = {"frames": self._run.statistics.frames, "misses": self._run.statistics.misses}
             self._pending.append({"event": "frame", "episode": frame.episode, **done})
 
@@ -334,6 +338,8 @@ def _follow(
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
         return RunOutcome(directory, 130 if interrupted.came else 1, outcome["error"])
+    if not directory.exists():
+        raise RunError(f"{directory} was deleted while the run went on, which ended it")
     # Before anything is read of the recording for the summary: figures of another run would mislead.
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None

@@ -360,12 +360,12 @@ def _lacks(recording: Recording, topic: str, name: str) -> str:
         return str(error)
     if isinstance(payload, Link) and getattr(payload, name) is None:
         return f"{arrays.place} has no {name}: the run had no packets; give its link some, and run again"
-    if isinstance(payload, Lidar) and name in _OF_HITS and payload.scans:
-        if not any(len(scan.ray) for scan in payload.scans) and payload.scans[0].grid is not None:
-            return (
-                f"{arrays.place} was recorded without {name}: its scans have the grid alone; write lidar into "
-                "`record` below [run] of the scenario, and run again"
-            )
+    scans = payload.scans if isinstance(payload, Lidar) and name in _OF_HITS else ()
+    if scans and scans[0].grid is not None and not any(len(scan.ray) for scan in scans):
+        return (
+            f"{arrays.place} was recorded without {name}: its scans have the grid alone; write lidar into "
+            "`record` below [run] of the scenario, and run again"
+        )
     return ""
 
 

@@ -1,4 +1,4 @@
-"""What a scenario may say and its author hardly means: 28 Hz is refused, a base station below the ground warned of."""
+"""Values that the author of a scenario hardly means: a carrier of 28 Hz, a base station below the ground."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def implausible_values(scenario: Scenario) -> list[str]:
 
 
 LEAST_HZ = 1e6
-"""Frequency below which a carrier is written in another unit: no device of a scenario is as large as its wave."""
+"""Frequency below which a carrier is written in another unit: its wave is longer than any scene."""
 
 
 def refuse_carriers(scenario: Scenario) -> None:

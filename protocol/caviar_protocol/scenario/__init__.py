@@ -84,7 +84,8 @@ def find_scenario(scenario: Path | str) -> Path:
     for own in (path, path.with_suffix(".toml")):
         if own.is_file() and own.resolve() != shipped:
             raise ScenarioError(
-                f"{path} is a scenario that ships, and {own} is a file here: write {own.resolve()} or {shipped}"
+                f"{path} is a scenario that ships, and {own} is a file here: write {own.resolve()} or "
+                f"{shipped}"
             )
     return shipped
 
