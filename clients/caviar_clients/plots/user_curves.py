@@ -117,7 +117,8 @@ def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
     """
     # One pass over the frames: the recording's arrays would decode each link anew for every column.
     source = link_source(recording)
-    time, rows = [], []
+    time: list[float] = []
+    rows = []
     episode, base, last = 0, 0, 0
     begins: list[int] = []
     for frame in recording.frames():
