@@ -228,10 +228,12 @@ def channel() -> SionnaChannel:
 class TestFrames:
     """What a frame may and may not hold."""
 
-    def test_more_objects_than_bodies_name_the_setting(self, channel: SionnaChannel) -> None:
-        text = r"^services\.channel\.settings\.bodies: object 'c' .*the pool has 2; write a larger number$"
+    @pytest.mark.parametrize("settings", [{"bodies": 0}, {"follow": 2}], ids=["none", "followed"])
+    def test_objects_without_bodies_name_the_setting_where_none_are_made(self, settings: Any) -> None:
+        """Where bodies are forbidden, and where what is followed is known by the bodies that there are."""
+        text = r"^services\.channel\.settings\.bodies: object '.' .*the pool has \d; write a larger number$"
         with pytest.raises(PayloadError, match=text):
-            step(channel, ("a", "b", "c"))
+            step(prepared(**settings), ("a", "b", "c"))
 
     def test_an_asset_that_is_not_there_is_named(self, channel: SionnaChannel) -> None:
         with pytest.raises(PayloadError, match=r"the mesh 'objects/tank\.ply', which the run does not have"):

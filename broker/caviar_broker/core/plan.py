@@ -165,6 +165,13 @@ class RunPlan:
         """Whether services save their state."""
         return self.checkpoint_frames > 0 and not self.ephemeral
 
+    def is_warm_up(self, service: ServicePlan, episode: int, frame: int) -> bool:
+        """Whether a service still compiles in a frame, which waits for it without a miss.
+
+        It is the run's first one, under ``wait``.
+        """
+        return service.waits_for_answer and frame == 0 and episode == self.first_episode
+
     def t_ns(self, frame: int) -> int:
         """Simulated time of a frame of any episode [ns]; one past the last comes a period later."""
         if not self.instants_ns:

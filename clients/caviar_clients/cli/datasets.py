@@ -15,8 +15,11 @@ from rich.text import Text
 
 from caviar_clients.cli.shared import (
     FiguresFile,
+    Record,
+    Set,
     complete_scenario,
     counted,
+    keys_set,
     print_line,
     progress_bar,
     require_installed,
@@ -78,6 +81,8 @@ def generate_command(
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")
     ] = None,
+    set_: Set = None,
+    record: Record = None,
     workers: Annotated[int, typer.Option(min=0, help="processes that play; 0: one for each core")] = 0,
     scheduler: Annotated[
         str, typer.Option(help="address of a Dask scheduler, tcp://HOST:8786, instead of own processes")
@@ -93,16 +98,16 @@ def generate_command(
     from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
     from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
     from caviar_clients.session.checks import checked_scenario
-    from caviar_protocol.scenario import find_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
+    settings = keys_set(set_, record)
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
-        loaded = apply_preset(preset, checked_scenario(find_scenario(scene or preset.scenario)))
+        loaded = apply_preset(preset, checked_scenario(scene or preset.scenario, settings=settings))
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
-        loaded = checked_scenario(find_scenario(scenario))
+        loaded = checked_scenario(scenario, settings=settings)
     for extra in dict.fromkeys(more or ()):
         require_known("--with", extra, ("camera",))
         loaded = with_cameras(loaded)

@@ -188,7 +188,7 @@ def check_frames() -> Check:
 
 def _two_frames(folder: Path) -> tuple[Finished, float]:
     """How two embedded frames of `smoke` end, and their mean |y|."""
-    outcome = EmbeddedRun(checked_scenario(Path("smoke"), frames=2), folder).run()
+    outcome = EmbeddedRun(checked_scenario(shipped_scenarios()["smoke"], frames=2), folder).run()
     figures = recorded_figures(folder)
     return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 

@@ -8,7 +8,7 @@ import selectors
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,7 @@ class Launcher:
         resume: Whether the run in the directory is resumed, whatever path, frames, seed and pace are.
         force: Whether it is, though code, libraries or files have changed.
         airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
     """
 
     scenario: Scenario
@@ -77,6 +78,7 @@ class Launcher:
     force: bool = False
     pace: str | None = None
     airsim: str = ""
+    settings: Sequence[str] = ()
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
     refused: bool = False
@@ -152,6 +154,8 @@ class Launcher:
         if self._broker is None:
             self._start_broker()
         while not self._finished:
+            if not self._over and not self.directory.exists():
+                self.stop("its directory was deleted")
             for key, _ in self._selector.select(LOOK_S):
                 if self._selector.get_map().get(key.fd) is not key:
                     # An earlier event of this batch, the broker's end, replaced all services, and one of
@@ -206,6 +210,7 @@ class Launcher:
             arguments += ["--pace", self.pace]
         if self.airsim:
             arguments += ["--airsim", self.airsim]
+        arguments += [f"--set={text}" for text in self.settings]
         return arguments
 
     def _start_broker(self) -> None:

@@ -24,12 +24,14 @@ from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
     AirSim,
     Embedded,
+    Episodes,
     FiguresFile,
     Force,
     Frames,
     Http,
     Keys,
     Pace,
+    Record,
     Restarted,
     Resume,
     RunDirectory,
@@ -37,7 +39,9 @@ from caviar_clients.cli.shared import (
     ScenarioOrNone,
     ScenarioOrRun,
     Seed,
+    Set,
     SummaryFile,
+    keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
@@ -93,7 +97,10 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
+    episodes: Episodes = None,
     seed: Seed = None,
+    set_: Set = None,
+    record: Record = None,
     json: SummaryFile = None,
     out: RunsFolder = Path("runs"),
     bind: Annotated[
@@ -111,12 +118,15 @@ def run(
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import resume_run, run_scenario
 
-    source = _started_anew(resume, scenario, frames, seed, embedded or None, pace, airsim or None)
+    keys_given = keys_set(set_, record, episodes)
+    source = _started_anew(
+        resume, scenario, frames, seed, embedded or None, pace, airsim or None, keys_given or None
+    )
     if resume is not None:
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
         ended = run_scenario(
-            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim, keys_given
         )
     raise typer.Exit(ended.status)
 

@@ -64,6 +64,8 @@ class Child:
     def last_line(self) -> str:
         """The last line that the process printed, or what it died of in a library; empty if it printed
         nothing."""
+        if not self.log.exists():  # the run's directory was deleted
+            return ""
         with self.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             lines = file.read().decode(errors="replace").strip().splitlines()

@@ -49,8 +49,9 @@ def _caption(summary: Mapping[str, Any]) -> str:
             f"{summary['frames']}; its digest is that of these"
         )
     late, pace = summary["deadlines"], summary["pace"]
-    if late["decisions"]:
-        parts.append(_missed(sum(s["misses"] for s in summary["services"].values()), late))
+    misses = sum(s["misses"] for s in summary["services"].values())
+    if misses or late["decisions"]:
+        parts.append(_missed(misses, late))
     if pace["slips"]:
         parts.append(
             f"{counted(pace['slips'], 'frame')} slipped behind real time, "
@@ -80,6 +81,8 @@ def _missed(misses: int, late: Mapping[str, Any]) -> str:
     seen = late["decisions"]
     when = f"{late['p99_ms']:.2f} ms late (p99), {late['worst_ms']:.2f} ms at worst"
     # A late answer that arrives before the broker looks at the clock is a miss without a decision.
+    if not seen:
+        return counted(misses, "missed deadline")
     if misses <= seen:
         return f"{counted(seen, 'missed deadline')}, decided {when}"
     return (

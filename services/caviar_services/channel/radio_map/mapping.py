@@ -408,6 +408,7 @@ def radio_map(
         scattering=s.scattering,
     )
     # One carrier at a time: materials of the scene have those constants that it is tuned to.
+    rt.make_room(scene, frozenset(s.without_body))
     rt.place(scene, frozenset(s.without_body))
     rt.tune(carrier)
     gain, interference, chosen, rays = [], [], [], []

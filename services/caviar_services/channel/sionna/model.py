@@ -276,12 +276,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self.run.progress("meshes loaded", 0.0)
 
     def _make_room(self, scene: Scene) -> None:
-        """Make bodies for objects whose meshes came while the run goes on, where there are too few."""
-        self._scene.make_room(scene, frozenset(self.settings.without_body))
+        """Make bodies where there are too few for the objects of a scene."""
+        if self.settings.follow is None:  # what is followed is known by the bodies that there are
+            self._scene.make_room(scene, frozenset(self.settings.without_body))
         # Also where another model that shares the scene has made them.
         if self._scene.bodies_version != self._bodies_version:
             # Kernels may have to be compiled for them, which the first trace does.
-            self.run.progress("making bodies of new meshes", COMPILE_GRACE_S)
+            self.run.progress("making more bodies", COMPILE_GRACE_S)
             self._bodies_version = self._scene.bodies_version
             self._make_finder(self._finder)
             self._names, self._outside = self._scene.names, self._scene.outside

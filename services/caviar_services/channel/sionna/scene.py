@@ -27,7 +27,6 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -109,7 +108,7 @@ class SionnaScene(NumberedTriangles):
 
     Args:
         assets: Files of the run by name: scene description, its meshes, and meshes of objects.
-        pool: How many bodies there are of each asset; an empty asset is the box.
+        pool: How many bodies of each asset there are at first; an empty asset is the box, 0 forbids any.
         settings: Materials, edges and detail.
 
     Raises:
@@ -122,7 +121,7 @@ class SionnaScene(NumberedTriangles):
 
         self._settings = settings
         self.bodies_version = 0
-        """Counts how often bodies were made anew, for meshes that came while the run goes on."""
+        """Counts how often bodies were made anew while the run goes on."""
         self._rt_objects: list[tuple[Shape, Any]] = []
         own = own_materials(assets)
         skins = self._skins = self._skin_materials(pool, settings, own)
@@ -330,7 +329,7 @@ class SionnaScene(NumberedTriangles):
         self._pool.use_meshes(meshes)
 
     def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
-        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+        """Make bodies where there are too few for the objects of a scene.
 
         Then `bodies_version` is another, and what was made of the bodies before is of no use.
 
@@ -338,12 +337,11 @@ class SionnaScene(NumberedTriangles):
             scene: The scene of a frame.
             without_body: Classes of objects that waves pass through.
         """
-        if not self._pool.awaits_meshes and not any(map(is_mesh_name, scene.assets)):
-            return
         if self._pool.awaits_meshes:  # before bodies are: where a material is refused, nothing has changed
             self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
         if not self._pool.make_room(scene, self._solid(scene, without_body)):
             return
+        self._skins = self._skins or self._skin_materials({"": 1}, self._settings, {})
         self._moving = self._body_shapes()
         self._shapes = [*self._at_rest, *self._moving]
         version, ids = self.version, self._replace_shapes(self.centre)

@@ -52,7 +52,7 @@ _SAMPLES = 100_000
 # Rays of a launch of scenery, before the first frame.
 _SCENERY_SAMPLES = 10_000_000
 
-BodyCount = Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)]
+BodyCount = Annotated[int, quantity("1", "bodies of one mesh for moving objects, at first", ge=0, le=4096)]
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
@@ -147,7 +147,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     bodies: BodyCount = 32
     pool: dict[str, BodyCount] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
-    ``box`` for objects without a mesh."""
+    ``box`` for objects without a mesh. A frame with more objects has more bodies made, which takes seconds;
+    0 and ``follow`` refuse it."""
     without_body: tuple[str, ...] = ()
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
