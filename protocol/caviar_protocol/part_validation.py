@@ -80,7 +80,8 @@ class PartCheck:
         return ""
 
     def _shapes(self, channel: Channel) -> dict[str, dict[Indices, tuple[int | None, ...]]]:
-        axes = channel.carriers, channel.tx, channel.rx
+        used = None if channel.used is None else channel.used.tobytes()
+        axes = channel.carriers, channel.tx, channel.rx, used
         if self._expected[0] != axes:
             nt, nr = ([self._size(name) for name in names] for names in (channel.tx, channel.rx))
             found: dict[str, dict[Indices, tuple[int | None, ...]]] = {part: {} for part in _BINS}
@@ -91,7 +92,8 @@ class PartCheck:
                         continue
                     for t, transmitting in enumerate(nt):
                         for r, receiving in enumerate(nr):
-                            found[part][c, t, r] = (*bins, receiving, transmitting)
+                            if channel.uses(c, t, r):
+                                found[part][c, t, r] = (*bins, receiving, transmitting)
             self._expected = axes, found
         return self._expected[1]
 

@@ -112,7 +112,7 @@ def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:
     for c in range(len(channel.carriers)):
         for t, tx in enumerate(channel.tx):
             for r, rx in enumerate(channel.rx):
-                if tx != rx:
+                if tx != rx and channel.uses(c, t, r):
                     yield c, t, r
 
 

@@ -167,6 +167,8 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     array: AntennaArray | None = None
     """Antennas: the elements; absent: one isotropic element."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power", ge=-200, le=200)] = 0.0
+    carriers: tuple[str, ...] = ()
+    """Antennas: names of the carriers that they send and receive on; empty: all of the run."""
     # lidar
     beams: Annotated[int, quantity("1", "beams of a lidar, one above the other", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
@@ -361,6 +363,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
                 role=spec.role,
                 array=_published(spec.array or AntennaArray()),
                 power_dbm=spec.power_dbm,
+                carriers=spec.carriers,
             )
         case "lidar":
             return LidarDevice(
