@@ -1491,7 +1491,8 @@ class Mounts {
     };
     if (kind == "antenna") {
       found.set("role", spec["role"]).set("array", array(spec["array"])).set("power_dbm", spec["power_dbm"]);
-      found.set("carriers", spec.has("carriers") ? spec["carriers"] : Value::list());
+      const Value& carriers = spec["carriers"];  // nil from a broker of an earlier version
+      found.set("carriers", carriers.kind() == Value::Kind::list ? carriers : Value::list());
     } else if (kind == "lidar") {
       found.set("beams", spec["beams"]).set("azimuth_steps", spec["azimuth_steps"]);
       found.set("elevation_min", angle("elevation_deg", 0)).set("elevation_max", angle("elevation_deg", 1));

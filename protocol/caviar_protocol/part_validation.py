@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.scenario.schema import DeviceSpec, carries
+from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.topics import (
     Carrier,
     Channel,
@@ -101,7 +101,7 @@ class PartCheck:
         """Elements of a device's array by the scenario."""
         if name not in self._sizes:
             self._sizes[name] = next(
-                (_elements(spec) for spec in self._devices if _is_made_by(spec, name)), None
+                (_elements(spec) for spec in self._devices if is_made_by(spec, name)), None
             )
         return self._sizes[name]
 
@@ -152,14 +152,6 @@ def _has_shape(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool
 def _pair_name(place: Indices, channel: Channel) -> str:
     c, t, r = place
     return f"{channel.tx[t]} → {channel.rx[r]} on {channel.carriers[c].name!r}"
-
-
-def _is_made_by(spec: DeviceSpec, name: str) -> bool:
-    """Whether a device of a scene is one that the scenario says is made by ``spec``."""
-    if not spec.on:
-        return name == spec.name
-    ending = f"/{spec.name}"
-    return name.endswith(ending) and carries(spec, name.removesuffix(ending))
 
 
 def _elements(spec: DeviceSpec) -> int:

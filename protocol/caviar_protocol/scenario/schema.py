@@ -274,6 +274,23 @@ def carries(spec: DeviceSpec, name: str) -> bool:
     return name == spec.on or owned_by((spec.on,), name)
 
 
+def is_made_by(spec: DeviceSpec, name: str) -> bool:
+    """Whether a device of a scene is one that the scenario says is made by ``spec``.
+
+    Args:
+        spec: The device of the scenario.
+        name: Name of the device in the scene.
+
+    Example:
+        >>> is_made_by(DeviceSpec(name="rx", kind="antenna", on="car.*"), "car.17/rx")
+        True
+    """
+    if not spec.on:
+        return name == spec.name
+    ending = f"/{spec.name}"
+    return name.endswith(ending) and carries(spec, name.removesuffix(ending))
+
+
 def fixed_device(spec: DeviceSpec) -> Device:
     """The device of a scenario that stands in the world, without ``on``.
 

@@ -281,8 +281,8 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
         BoolArray | None,
         array("|b1", "C", "T", "R", unit="1", doc="both ends use the carrier; absent: all pairs use all"),
     ] = None
-    """Whether both ends of a pair use a carrier; absent: all use all. On a carrier that it does not use a pair
-    is no user and has no matrix, response and taps, and ``a`` is 0; with none that it uses it has no paths."""
+    """Whether both ends of a pair use a carrier; absent: all use all. On a carrier that it does not use a
+    pair is no user and has no matrix, response and taps, and ``a`` is 0; one that uses none has no paths."""
 
     def uses(self, carrier: int, tx: int, rx: int) -> bool:
         """Whether both ends of a pair use a carrier.

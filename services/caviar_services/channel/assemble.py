@@ -49,7 +49,6 @@ from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, st
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 
-
 Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 
 

@@ -271,7 +271,8 @@ def transmitters_of(scene: Scene, where: str, carrier: str) -> list[AntennaDevic
             )
     if not found:
         raise RunError(
-            f'{where} has no transmitter on carrier {carrier!r}; give a device of [[devices]] the role "tx", or choose another frame'
+            f"{where} has no transmitter on carrier {carrier!r}; give a device of [[devices]] the role "
+            '"tx", or choose another frame or carrier'
         )
     return found
 
