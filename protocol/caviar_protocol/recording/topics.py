@@ -194,8 +194,7 @@ class ChannelArrays(UserArrays[Channel]):
             if is_made_by(spec, name):
                 return spec.array or AntennaArray()
         raise RecordingError(
-            f"{self.place}: the array of {name!r} is not in the run's scenario; "
-            "pass it to caviar.beam_gains"
+            f"{self.place}: the array of {name!r} is not in the run's scenario; pass it to caviar.beam_gains"
         )
 
     def _first_taps(self, channel: Channel) -> Rows:
