@@ -25,9 +25,11 @@ from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.topics import Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 from caviar_protocol.topics.scene import (
+    BESIDE_ROAD_PREFIX,
     LEFT_GEOFENCE_PREFIX,
     MESH_REFUSED_PREFIX,
     OUTSIDE_GEOFENCE_PREFIX,
+    SIMULATOR_SAYS_PREFIX,
     WITHOUT_OBJECT_PREFIX,
 )
 
@@ -52,6 +54,9 @@ _EVER: Mapping[str, str] = {
     LEFT_GEOFENCE_PREFIX: "{rest!r} of {source} left its geofence {times}, first in {first}",
     OUTSIDE_GEOFENCE_PREFIX: "{rest!r} of {source} was commanded to places outside of its geofence in "
     "{frames}, first in {first}, and kept within",
+    SIMULATOR_SAYS_PREFIX: "the simulator of {source} warned {times}, first in {first}: {rest}",
+    BESIDE_ROAD_PREFIX: "{rest!r} of {source} is one rigid box, and too long for its bend in {frames}, first "
+    "in {first}: its rear is beside the road or track",
     MESH_REFUSED_PREFIX: "mesh {rest!r} of {source} was refused in {first}; its objects were boxes",
 }
 

@@ -218,3 +218,8 @@ LEFT_GEOFENCE_PREFIX = "left-geofence/"
 OUTSIDE_GEOFENCE_PREFIX = "commanded-outside-geofence/"
 """Before the name of an object in the counts of a world's report: a place outside of its geofence was
 commanded."""
+SIMULATOR_SAYS_PREFIX = "simulator-says/"
+"""Before a kind of warning in the counts of a world's report: what the simulator behind it printed."""
+BESIDE_ROAD_PREFIX = "beside-road/"
+"""Before the name of a vehicle in the counts of a world's report: it is one rigid box, and too long for the
+bend that it is in."""
