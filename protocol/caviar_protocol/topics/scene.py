@@ -111,6 +111,16 @@ class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag=
     array: AntennaArray = AntennaArray()
     """Its elements."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power; unused by a receiver")] = 0.0
+    carriers: tuple[str, ...] = ()
+    """Names of the carriers that it sends and receives on; empty: all of the run."""
+
+    def uses(self, carrier: str) -> bool:
+        """Whether it sends or receives on a carrier.
+
+        Args:
+            carrier: Name of the carrier.
+        """
+        return not self.carriers or carrier in self.carriers
 
 
 class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="lidar"):
