@@ -89,7 +89,7 @@ def test_settings_that_do_not_fit_are_refused_by_name() -> None:
 
 
 def test_a_setting_is_written_as_agent_setting_and_value() -> None:
-    asked = ["evaluate", "none.onnx", "--on", "geometric", "--set", "ucb=3"]
+    asked = ["policy", "evaluate", "none.onnx", "--on", "geometric", "--set", "ucb=3"]
     ended = CliRunner().invoke(app, asked)
     assert ended.exit_code != 0
     assert "write agent, setting and value" in str(ended.exception)

@@ -30,13 +30,17 @@ def reference() -> ModuleType:
 
 def test_every_command_has_a_page_with_its_options(reference: ModuleType) -> None:
     pages = dict(reference.commands.pages())
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    commands = {
+        name: command
+        for name, command in typer.main.get_command(app).commands.items()  # type: ignore[attr-defined]
+        if not command.hidden
+    }
     assert set(pages) == {"index.md", *(f"{name}.md" for name in commands)}
     for name, command in commands.items():
         for parameter in command.params:
             for option in parameter.opts if parameter.param_type_name == "option" else ():
                 assert f"`{option}`" in pages[f"{name}.md"]
-    assert "| `--frames` INTEGER ≥ 1 ≤ 10000 | `12` |" in pages["tradeoff.md"]
+    assert "| `--frames` INTEGER ≥ 1 ≤ 10000 | `12` |" in pages["measure.md"]
 
 
 def test_every_key_of_a_scenario_stands_on_a_page(reference: ModuleType) -> None:

@@ -1,4 +1,4 @@
-"""``caviar train``, ``caviar export-policy``, ``caviar evaluate`` and ``caviar swap``: trained policies."""
+"""``caviar policy``: policies are trained, exported, evaluated, and swapped in a running run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def train_command(
             results = train_experiment(loaded, out, jobs or cores(), report)
     except KeyboardInterrupt:
         print_line(
-            console, f"stopped; caviar train {experiment} --out {out} goes on: {_steps_of(loaded, out)}"
+            console,
+            f"stopped; caviar policy train {experiment} --out {out} goes on: {_steps_of(loaded, out)}",
         )
         raise
     console.print(_results_table(loaded, folder, results))
@@ -306,7 +307,7 @@ def swap_command(
     from caviar_broker.policies import awaited_outcome, offer_policy
     from caviar_clients.cli.remote import RUNS, newest_run
 
-    directory = run if run is not None else newest_run(RUNS, f"caviar swap {policy} --run RUN")
+    directory = run if run is not None else newest_run(RUNS, f"caviar policy swap {policy} --run RUN")
     try:
         content = policy.read_bytes()
     except OSError as error:
@@ -320,6 +321,6 @@ def swap_command(
     if found["state"] == "offered":
         raise RunError(
             f"agent {name!r} has not decided a frame with {policy} within {wait:g} s, and will as soon "
-            f"as it can: caviar why {directory} says what the run waits for"
+            f"as it can: caviar status {directory} says what the run waits for"
         )
     typer.echo(f"{name} serves {policy} (SHA-256 {digest[:12]}…) from frame {found['frame']} on")
