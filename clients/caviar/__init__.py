@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import caviar_clients.envs as _registered  # noqa: F401
+from caviar_protocol.space.beams import beam_gains, best_pairs
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.reader import Dataset
     from caviar_protocol.recording import Recording
     from caviar_protocol.scenario import Scenario
 
-__all__ = ["dataset", "load_scenario", "open", "run"]
+__all__ = ["beam_gains", "best_pairs", "dataset", "load_scenario", "open", "run"]
 
 
 def load_scenario(scenario: str | Path) -> Scenario:

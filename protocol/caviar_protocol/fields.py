@@ -311,6 +311,8 @@ SINCE: dict[str, str] = {
     "Link.throughput": "1.5",
     "Link.blocks": "1.5",
     "Link.block_errors": "1.5",
+    "AntennaDevice.carriers": "1.6",
+    "Channel.used": "1.6",
     "PathCommand": "1.6",
     "AttitudeCommand": "1.6",
     "DriveCommand": "1.6",

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol.fields import Version, required_knowledge
+from caviar_protocol.fields import SINCE, Version, parse_version, required_knowledge
 from caviar_protocol.messages import Asset, GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec, instants_ns
 from caviar_protocol.scenario.conversion import Source
@@ -233,7 +233,13 @@ def _features(scenario: Scenario, world: str) -> tuple[Feature, ...]:
     """What the devices of a world, or of all for the empty name, need a service to know."""
     found = []
     for index, device in enumerate(scenario.devices):
-        if device.array is not None and (not world or world_of(scenario, index) == world):
+        if world and world_of(scenario, index) != world:
+            continue
+        if device.carriers:
+            text = f"carriers of device {device.name!r}"
+            since = parse_version(SINCE["AntennaDevice.carriers"])
+            found.append(Feature(f"devices[{index}].carriers", text, since))
+        if device.array is not None:
             for field, value, since in required_knowledge(device.array):
                 shown = repr(value) if isinstance(value, str) else f"{len(value)} of them"
                 text = f"{field} ({shown}) of device {device.name!r}"

@@ -210,7 +210,7 @@ def evaluate_command(
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:
     """Hold a policy against los-beam, random, the optimum and other agents, LOS and NLOS apart."""
-    from caviar_clients.learning.evaluate import BASELINES, KINDS, evaluate
+    from caviar_clients.learning.evaluate import BASELINES, evaluate
 
     rivals: dict[str, dict[str, Any]] = {name: {} for name in (BASELINES if against is None else against)}
     rivals |= _settings_of(settings or [])
@@ -230,31 +230,40 @@ def evaluate_command(
             json,
             {
                 "frames": dict(made.frames),
-                "abs_y": {m: {k: vars(means[k]) for k in KINDS} for m, means in made.found.items()},
+                "abs_y": {m: {k: vars(mean) for k, mean in means.items()} for m, means in made.found.items()},
                 "spectral_efficiency": {m: vars(mean) for m, mean in made.efficiency.items()},
                 "pilots": dict(made.pilots),
             },
         )
 
 
-def _evaluation_tables(made: Evaluation) -> tuple[Table, Table]:
-    """|y|, and what pilots cost: two tables, as 80 columns hold no more."""
+def _evaluation_tables(made: Evaluation) -> Iterator[Table]:
+    """|y| by frames, by station where there are several, and what pilots cost: 80 columns hold no more."""
     from caviar_clients.learning.evaluate import KINDS
 
-    exponent = _common_exponent([means[kind].mean for means in made.found.values() for kind in KINDS])
-    unit = f" in 10{str(exponent).translate(_RAISED)}" if exponent else ""
-    gains = Table(title=f"mean |y|{unit}, by frames", title_justify="left")
-    gains.add_column("", overflow="fold")
-    for kind in KINDS:
-        gains.add_column(f"{kind} ({made.frames[kind]:,})", justify="right", no_wrap=True)
+    yield _gains(made, KINDS, "frames")
+    # Of each a table: |y| of carriers is orders of magnitude apart.
+    for station in (kind for kind in made.frames if kind not in KINDS):
+        yield _gains(made, (station,), "station")
     costs = Table(title="pilots, and the spectral efficiency that they leave", title_justify="left")
     costs.add_column("", overflow="fold")
     costs.add_column("pilots a frame", justify="right", no_wrap=True)
     costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
-    for method, means in made.found.items():
-        gains.add_row(method, *(_short(means[kind], exponent) for kind in KINDS))
+    for method in made.found:
         costs.add_row(method, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
-    return gains, costs
+    yield costs
+
+
+def _gains(made: Evaluation, kinds: Sequence[str], by: str) -> Table:
+    exponent = _common_exponent([means[kind].mean for means in made.found.values() for kind in kinds])
+    unit = f" in 10{str(exponent).translate(_RAISED)}" if exponent else ""
+    gains = Table(title=f"mean |y|{unit}, by {by}", title_justify="left")
+    gains.add_column("", overflow="fold")
+    for kind in kinds:
+        gains.add_column(f"{kind} ({made.frames[kind]:,})", justify="right", no_wrap=True)
+    for method, means in made.found.items():
+        gains.add_row(method, *(_short(means[kind], exponent) for kind in kinds))
+    return gains
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -25,7 +25,14 @@ from rich.text import Text
 from caviar_broker.journal_format import NO_BROKER, JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.shared import counted, print_line, scaled
-from caviar_clients.cli.summary import RunSummary, SourceSummary, resume_hint, summarise
+from caviar_clients.cli.summary import (
+    LinkFigures,
+    RunSummary,
+    SourceSummary,
+    StationSummary,
+    resume_hint,
+    summarise,
+)
 from caviar_clients.cli.summary_table import (
     SHOWN_DAMAGE,
     decided_lines,
@@ -130,14 +137,18 @@ def _facts(summary: RunSummary) -> Table:
         f"{summary.simulated_s:g} s simulated",
     )
     link = summary.link
-    if link is not None and link.mean_abs_y is not None:
-        table.add_row(
-            "mean |y|",
-            f"{link.mean_abs_y:.4g}, best {link.mean_abs_y_best:.4g}, straight line "
-            f"{link.mean_abs_y_baseline:.4g} (over users with a path)",
-        )
-    if link is not None and link.mean_bit_rate is not None:
-        table.add_row("mean SNR", link_quality(link.mean_snr_db, link.mean_snr_best_db, link.mean_bit_rate))
+    parts: Sequence[LinkFigures] = [] if link is None else link.stations or [link]
+    for of in parts:
+        place = f"{of.tx} on {of.carrier}: " if isinstance(of, StationSummary) else ""
+        if of.mean_abs_y is not None:
+            table.add_row(
+                "mean |y|",
+                f"{escape(place)}{of.mean_abs_y:.4g}, best {of.mean_abs_y_best:.4g}, straight line "
+                f"{of.mean_abs_y_baseline:.4g} (over users with a path)",
+            )
+        if of.mean_bit_rate is not None:
+            quality = link_quality(of.mean_snr_db, of.mean_snr_best_db, of.mean_bit_rate)
+            table.add_row("mean SNR", f"{escape(place)}{quality}")
     if link is not None and link.packets is not None:
         table.add_row("packets", packet_line(link.packets).removeprefix("packets: "))
     if link is not None:

@@ -56,15 +56,20 @@ def _caption(summary: Mapping[str, Any]) -> str:
             f"{counted(pace['slips'], 'frame')} slipped behind real time, "
             f"by {pace['worst_slip_ms']:.1f} ms at worst, {pace['lag_ms']:.1f} ms in all; none was skipped"
         )
-    if summary["mean_abs_y"] is not None:
-        share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0
-        parts.append(
-            f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best "
-            f"({share:.1%}), straight line {summary['mean_abs_y_baseline']:.3g}"
-        )
-    if summary["mean_bit_rate"] is not None:
-        quality = link_quality(summary["mean_snr_db"], summary["mean_snr_best_db"], summary["mean_bit_rate"])
-        parts.append(f"mean SNR {quality}")
+    # A mean over carriers says nothing of any of them: each has lines of its own.
+    for figures in summary.get("stations") or [summary]:
+        of = f"{figures['tx']} on {figures['carrier']}: " if "tx" in figures else ""
+        if figures["mean_abs_y"] is not None:
+            share = figures["mean_abs_y"] / figures["mean_abs_y_best"] if figures["mean_abs_y_best"] else 0.0
+            parts.append(
+                f"{of}mean |y| {figures['mean_abs_y']:.3g} of {figures['mean_abs_y_best']:.3g} at best "
+                f"({share:.1%}), straight line {figures['mean_abs_y_baseline']:.3g}"
+            )
+        if figures["mean_bit_rate"] is not None:
+            numbers = figures["mean_snr_db"], figures["mean_snr_best_db"], figures["mean_bit_rate"]
+            parts.append(f"{of}mean SNR {link_quality(*numbers)}")
+        if of:
+            parts.append(f"{of}{figures['no_path_share']:.1%} of {figures['users']:,} users without a path")
     if summary.get("packets") is not None:
         parts.append(packet_line(msgspec.convert(summary["packets"], PacketSummary)))
     if summary["outage"] is not None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.learning.contest import Contest, Player, PolicyPlayer, episodes_of, made_player
+from caviar_clients.learning.contest import Contest, Played, Player, PolicyPlayer, episodes_of, made_player
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
@@ -93,7 +93,8 @@ class Evaluation:
     policy: str
     scenario: str
     found: Mapping[str, Mapping[str, Interval]]
-    """|y| by method, then by kind of frame (`KINDS`)."""
+    """|y| by method, then by kind of frame (`KINDS`); with several transmitters or carriers also by station,
+    as ``lamp on mm``."""
     frames: Mapping[str, int]
     """Users and frames of each kind."""
     efficiency: Mapping[str, Interval]
@@ -148,25 +149,26 @@ def evaluate(
     for name, settings in (against or {}).items():
         if name not in players:
             players[name] = made_player(known, name, settings, served, agent)
-    means: dict[tuple[str, str], list[float]] = {(m, k): [] for m in players for k in KINDS}
+    episodes_played: dict[str, list[Played]] = {method: [] for method in players}
     efficiency: dict[str, list[float]] = {method: [] for method in players}
     pilots: dict[str, list[float]] = {method: [] for method in players}
-    counts = dict.fromkeys(KINDS, 0)
     with Contest(known, players, served, agent) as contest:
         for done, seed in enumerate(episodes_of(seeds, episodes), 1):
             for method, played in contest.play(seed).items():
                 efficiency[method].append(_mean(played.net_efficiency))
                 pilots[method].append(played.pilots)
-                for kind in KINDS:
-                    mine = played.of(kind)
-                    means[method, kind].append(_mean(played.abs_y[mine]))
-                    counts[kind] += int(mine.sum()) if method == "policy" else 0
+                episodes_played[method].append(played)
             progress(done)
+    stations = sorted({name for played in episodes_played["policy"] for name in played.station})
+    kinds = (*KINDS, *(stations if len(stations) > 1 else ()))
     return Evaluation(
         policy=file.name,
         scenario=known.run.name,
-        found={m: {k: mean_of(means[m, k]) for k in KINDS} for m in players},
-        frames=counts,
+        found={
+            m: {k: mean_of([_mean(p.abs_y[p.of(k)]) for p in played]) for k in kinds}
+            for m, played in episodes_played.items()
+        },
+        frames={k: sum(int(p.of(k).sum()) for p in episodes_played["policy"]) for k in kinds},
         efficiency={method: mean_of(values) for method, values in efficiency.items()},
         pilots={method: float(np.mean(values)) for method, values in pilots.items()},
     )

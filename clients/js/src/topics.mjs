@@ -58,6 +58,7 @@ const device = tagged({
     role: string({ values: ["tx", "rx", "both"] }),
     array: optional(antennaArray, NO_ARRAY),
     power_dbm: optional(float, 0),
+    carriers: optional(names, []),
   }),
   lidar: new Struct({
     ...mounted,
@@ -180,6 +181,7 @@ export const TOPICS = {
       ),
       error_bound_db: optional(array("<f8", "T", "R")),
       error_reference: optional(text, ""),
+      used: optional(array("|b1", "C", "T", "R")),
     },
     checkOffsets,
   ),

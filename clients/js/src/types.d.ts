@@ -195,6 +195,7 @@ export interface AntennaDevice extends Mounted {
   role: "tx" | "rx" | "both";
   array: AntennaArray;
   power_dbm: number;
+  carriers: string[];
 }
 export interface LidarDevice extends Mounted {
   type: "lidar";
@@ -266,6 +267,7 @@ export interface Channel {
   taps: (ChannelEntry & { first: number })[];
   error_bound_db?: NumericArray;
   error_reference: string;
+  used?: NumericArray;
 }
 
 interface Sensed {

@@ -219,8 +219,9 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """Result per user; a user is one (TX, RX, carrier): carriers in the order of the channel, then
-    TX, then RX by name. A device that both transmits and receives is no user of itself.
+    """Result per user; a user is one (TX, RX, carrier) of which both devices use the carrier: carriers in the
+    order of the channel, then TX, then RX by name. A device that both transmits and receives is no user of
+    itself.
 
     ``y`` is the equivalent channel w* H f of a beam pair (paper, eq. 1) with beams of unit norm
     and without transmit power. Beam ``k`` of a panel of one polarization, with N = rows·columns elements, is
