@@ -44,7 +44,7 @@ def test_the_network_learns_from_a_dataset_and_ranks_beams(tmp_path: Path) -> No
     """On two flights of `geometric` in place of a hundred episodes of a street, which take minutes."""
     pytest.importorskip("torch", reason="needs PyTorch")
     (generate,) = re.findall(r"caviar dataset generate .*(?= #)", README)
-    assert generate.split() == "caviar dataset generate s008 --out data/s008 --episodes 100".split()
+    assert generate.strip() == "caviar dataset generate s008 --out data/s008 --episodes 100"
     shorter = generate.replace("s008 --out", "geometric --workers 1 --scenes 40 --out").replace("100", "5")
     run_as_printed(shorter.split(), tmp_path)
     (learn,) = blocks("python")

@@ -245,12 +245,18 @@ def _evaluation_tables(made: Evaluation) -> Iterator[Table]:
     # Of each a table: |y| of carriers is orders of magnitude apart.
     for station in (kind for kind in made.frames if kind not in KINDS):
         yield _gains(made, (station,), "station")
-    costs = Table(title="pilots, and the spectral efficiency that they leave", title_justify="left")
+    costs = Table(
+        title="mean |y|² in dB, pilots, and the spectral efficiency that they leave", title_justify="left"
+    )
     costs.add_column("", overflow="fold")
+    costs.add_column("over random", justify="right", no_wrap=True)
+    costs.add_column("below optimum", justify="right", no_wrap=True)
     costs.add_column("pilots a frame", justify="right", no_wrap=True)
     costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
     for method in made.found:
-        costs.add_row(method, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
+        gain = _decibels(made.power[method], made.power["random"])
+        loss = _decibels(made.power["optimum"], made.power[method])
+        costs.add_row(method, gain, loss, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
     yield costs
 
 
@@ -264,6 +270,10 @@ def _gains(made: Evaluation, kinds: Sequence[str], by: str) -> Table:
     for method, means in made.found.items():
         gains.add_row(method, *(_short(means[kind], exponent) for kind in kinds))
     return gains
+
+
+def _decibels(power: float, reference: float) -> str:
+    return f"{10 * math.log10(power / reference):.1f} dB" if power > 0 and reference > 0 else ""
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
