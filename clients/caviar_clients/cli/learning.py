@@ -245,12 +245,11 @@ def _evaluation_tables(made: Evaluation) -> Iterator[Table]:
     # Of each a table: |y| of carriers is orders of magnitude apart.
     for station in (kind for kind in made.frames if kind not in KINDS):
         yield _gains(made, (station,), "station")
-    costs = Table(
-        title="mean |y|² in dB, pilots, and the spectral efficiency that they leave", title_justify="left"
-    )
+    title = "mean |y|² over random and below the optimum, pilots, and what these leave"
+    costs = Table(title=title, title_justify="left")
     costs.add_column("", overflow="fold")
-    costs.add_column("over random", justify="right", no_wrap=True)
-    costs.add_column("below optimum", justify="right", no_wrap=True)
+    costs.add_column("gain dB", justify="right", no_wrap=True)
+    costs.add_column("loss dB", justify="right", no_wrap=True)
     costs.add_column("pilots a frame", justify="right", no_wrap=True)
     costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
     for method in made.found:
@@ -273,7 +272,7 @@ def _gains(made: Evaluation, kinds: Sequence[str], by: str) -> Table:
 
 
 def _decibels(power: float, reference: float) -> str:
-    return f"{10 * math.log10(power / reference):.1f} dB" if power > 0 and reference > 0 else ""
+    return f"{10 * math.log10(power / reference):.1f}" if power > 0 and reference > 0 else ""
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
