@@ -121,7 +121,7 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
 
 
 def dataset(path: str | Path) -> Dataset:
-    """Open a dataset that ``caviar generate`` wrote.
+    """Open a dataset that ``caviar dataset generate`` wrote.
 
     Args:
         path: Folder of the dataset, or its address (``s3://bucket/s008``).

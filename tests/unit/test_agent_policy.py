@@ -260,7 +260,17 @@ def test_evaluation_beside_the_baselines(tmp_path: Path) -> None:
 
 def test_the_command_prints_and_writes_the_figures(tmp_path: Path) -> None:
     file = made(tmp_path, Straight())
-    asked = ["evaluate", str(file), "--on", "geometric", "--seeds", "2", "--json", str(tmp_path / "f.json")]
+    asked = [
+        "policy",
+        "evaluate",
+        str(file),
+        "--on",
+        "geometric",
+        "--seeds",
+        "2",
+        "--json",
+        str(tmp_path / "f.json"),
+    ]
     ended = CliRunner().invoke(app, asked)
     assert ended.exit_code == 0, ended.output
     assert "optimum" in ended.output
@@ -275,7 +285,17 @@ def test_the_command_prints_and_writes_the_figures(tmp_path: Path) -> None:
 
 def test_the_agents_to_compare_with_can_be_named_and_set(tmp_path: Path) -> None:
     file = made(tmp_path, Straight())
-    asked = ["evaluate", str(file), "--on", "geometric", "--seeds", "1", "--json", str(tmp_path / "f.json")]
+    asked = [
+        "policy",
+        "evaluate",
+        str(file),
+        "--on",
+        "geometric",
+        "--seeds",
+        "1",
+        "--json",
+        str(tmp_path / "f.json"),
+    ]
     more = ["--against", "ucb", "--set", "ucb.discount=0.9", "--set", "last-sweep.period=250"]
     ended = CliRunner().invoke(app, [*asked, *more])
     assert ended.exit_code == 0, ended.output

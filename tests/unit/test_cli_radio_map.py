@@ -1,4 +1,4 @@
-"""`caviar map`: what is asked for, what is drawn, and what the arrays say."""
+"""`caviar plot map`: what is asked for, what is drawn, and what the arrays say."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options, words
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["caviar", "map", "smoke", *options])
+    monkeypatch.setattr(sys, "argv", ["caviar", "plot", "map", "smoke", *options])
     with pytest.raises(SystemExit) as ended:
         command.main()
     assert ended.value.code == 1

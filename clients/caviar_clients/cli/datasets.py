@@ -1,4 +1,4 @@
-"""``caviar generate``, ``caviar look`` and ``caviar tables``: datasets of episodes."""
+"""``caviar dataset``: datasets of episodes are generated, looked at, verified, and tabulated."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def generate_command(
         loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
-    require_installed(f"caviar generate {scenario}", ("datasets", *extras_of(loaded)))
+    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(loaded)))
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
     if overwrite:
         _remove(out)
@@ -163,7 +163,7 @@ def tables_command(
 
     require_known("--format", form, ("csv", "parquet"))
     if form == "parquet":
-        require_installed("caviar tables --format parquet", ["datasets"])
+        require_installed("caviar dataset tables --format parquet", ["datasets"])
     if out is not None:
         check_out(out)
     check_level(dataset)
@@ -180,7 +180,7 @@ def look_command(
     ] = None,
 ) -> None:
     """Write a page of a dataset: what it is, maps, histograms, samples, and how it was generated."""
-    require_installed("caviar look", ["plot"])
+    require_installed("caviar dataset look", ["plot"])
     from caviar_clients.datasets.look.page import write_page
     from caviar_clients.datasets.reader import check_level
 

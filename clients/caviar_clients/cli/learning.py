@@ -1,4 +1,4 @@
-"""``caviar train``, ``caviar export-policy``, ``caviar evaluate`` and ``caviar swap``: trained policies."""
+"""``caviar policy``: policies are trained, exported, evaluated, and swapped in a running run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def train_command(
             results = train_experiment(loaded, out, jobs or cores(), report)
     except KeyboardInterrupt:
         print_line(
-            console, f"stopped; caviar train {experiment} --out {out} goes on: {_steps_of(loaded, out)}"
+            console,
+            f"stopped; caviar policy train {experiment} --out {out} goes on: {_steps_of(loaded, out)}",
         )
         raise
     console.print(_results_table(loaded, folder, results))
@@ -244,12 +245,17 @@ def _evaluation_tables(made: Evaluation) -> Iterator[Table]:
     # Of each a table: |y| of carriers is orders of magnitude apart.
     for station in (kind for kind in made.frames if kind not in KINDS):
         yield _gains(made, (station,), "station")
-    costs = Table(title="pilots, and the spectral efficiency that they leave", title_justify="left")
+    title = "mean |y|² over random and below the optimum, pilots, and what these leave"
+    costs = Table(title=title, title_justify="left")
     costs.add_column("", overflow="fold")
+    costs.add_column("gain dB", justify="right", no_wrap=True)
+    costs.add_column("loss dB", justify="right", no_wrap=True)
     costs.add_column("pilots a frame", justify="right", no_wrap=True)
     costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
     for method in made.found:
-        costs.add_row(method, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
+        gain = _decibels(made.power[method], made.power["random"])
+        loss = _decibels(made.power["optimum"], made.power[method])
+        costs.add_row(method, gain, loss, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
     yield costs
 
 
@@ -263,6 +269,10 @@ def _gains(made: Evaluation, kinds: Sequence[str], by: str) -> Table:
     for method, means in made.found.items():
         gains.add_row(method, *(_short(means[kind], exponent) for kind in kinds))
     return gains
+
+
+def _decibels(power: float, reference: float) -> str:
+    return f"{10 * math.log10(power / reference):.1f}" if power > 0 and reference > 0 else ""
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -315,7 +325,7 @@ def swap_command(
     from caviar_broker.policies import awaited_outcome, offer_policy
     from caviar_clients.cli.remote import RUNS, newest_run
 
-    directory = run if run is not None else newest_run(RUNS, f"caviar swap {policy} --run RUN")
+    directory = run if run is not None else newest_run(RUNS, f"caviar policy swap {policy} --run RUN")
     try:
         content = policy.read_bytes()
     except OSError as error:
@@ -329,6 +339,6 @@ def swap_command(
     if found["state"] == "offered":
         raise RunError(
             f"agent {name!r} has not decided a frame with {policy} within {wait:g} s, and will as soon "
-            f"as it can: caviar why {directory} says what the run waits for"
+            f"as it can: caviar status {directory} says what the run waits for"
         )
     typer.echo(f"{name} serves {policy} (SHA-256 {digest[:12]}…) from frame {found['frame']} on")

@@ -1,4 +1,4 @@
-"""``caviar map``: best server, gain, received power and SINR over a surface, as PNG and NumPy archive."""
+"""``caviar plot map``: best server, gain, received power and SINR over a surface: PNG, NumPy archive."""
 
 from __future__ import annotations
 

@@ -36,6 +36,7 @@ from caviar_clients.cli.summary import (
 from caviar_clients.cli.summary_table import (
     SHOWN_DAMAGE,
     decided_lines,
+    gain_line,
     link_quality,
     outage_lines,
     packet_line,
@@ -143,16 +144,18 @@ def _facts(summary: RunSummary) -> Table:
         if of.mean_abs_y is not None:
             table.add_row(
                 "mean |y|",
-                f"{escape(place)}{of.mean_abs_y:.4g}, best {of.mean_abs_y_best:.4g}, straight line "
-                f"{of.mean_abs_y_baseline:.4g} (over users with a path)",
+                f"{escape(place)}{of.mean_abs_y:.4g}, best {of.mean_abs_y_best:.4g}, LOS beam "
+                f"{of.mean_abs_y_baseline:.4g} (over links with a path)",
             )
+            gains = gain_line(of.loss_to_best_db, of.gain_over_random_db)
+            table.add_row("", f"{escape(place)}{gains}")
         if of.mean_bit_rate is not None:
             quality = link_quality(of.mean_snr_db, of.mean_snr_best_db, of.mean_bit_rate)
             table.add_row("mean SNR", f"{escape(place)}{quality}")
     if link is not None and link.packets is not None:
         table.add_row("packets", packet_line(link.packets).removeprefix("packets: "))
     if link is not None:
-        table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'user')} over all frames")
+        table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'link')} over all frames")
     for line in [] if summary.outage is None else outage_lines(summary.outage):
         table.add_row("no path", escape(line))
     for line in decided_lines(summary.decided):

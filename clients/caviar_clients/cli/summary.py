@@ -16,13 +16,13 @@ import msgspec
 import numpy as np
 
 from caviar_clients.cli.shared import counted
-from caviar_protocol.arrays import BoolArray, quantity
+from caviar_protocol.arrays import BoolArray, Float64Array, quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Report, Status
 from caviar_protocol.policies import REFUSED
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.topics import Link
+from caviar_protocol.topics import Channel, Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 from caviar_protocol.topics.scene import (
     BESIDE_ROAD_PREFIX,
@@ -122,6 +122,12 @@ class LinkFigures(msgspec.Struct, kw_only=True):
     """None where no user ever had a path."""
     mean_abs_y_best: float | None
     mean_abs_y_baseline: float | None
+    loss_to_best_db: Annotated[
+        float | None, quantity("dB", "mean |y|² of the best pairs over that of the chosen")
+    ]
+    """None where no user had a path, or none was served."""
+    gain_over_random_db: Annotated[float | None, quantity("dB", "mean |y|² over that of a random pair")]
+    """None likewise, and where H was not recorded."""
     mean_snr_db: Annotated[float | None, quantity("dB", "mean of the linear SNR of the chosen pairs")]
     """None where no user had a path, or none was served."""
     mean_snr_best_db: Annotated[float | None, quantity("dB", "the same of the best pairs")]
@@ -345,16 +351,19 @@ class _UserTotals:
 
     def __init__(self) -> None:
         self.users = self.served = 0
-        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate; sums, so that a run of any length fits.
-        self._sums = np.zeros(6)
+        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate, |y|² chosen, best, random; sums, so that a
+        # run of any length fits.
+        self._sums = np.zeros(9)
 
-    def add(self, link: Link, which: BoolArray | slice = slice(None)) -> None:
-        """Add a frame's users, or some of them."""
+    def add(self, link: Link, random: Float64Array, which: BoolArray | slice = slice(None)) -> None:
+        """Add a frame's users, or some of them; ``random`` is the mean |y|² of all pairs of each."""
         with_path = link.has_path[which]
         self.users += len(with_path)
         self.served += int(with_path.sum())
         best = link.top_abs_y[:, :1].sum(axis=1)  # the column lacks where there is no user
-        figures = (link.abs_y, best, link.baseline_abs_y, link.snr, link.snr_best, link.bit_rate)
+        amplitudes = (link.abs_y, best, link.baseline_abs_y)
+        powers = (link.abs_y**2, best**2, random)
+        figures = (*amplitudes, link.snr, link.snr_best, link.bit_rate, *powers)
         self._sums += [values[which][with_path].sum() for values in figures]
 
     def means(self) -> dict[str, Any]:
@@ -362,11 +371,13 @@ class _UserTotals:
         means: list[float | None] = [None] * len(self._sums)
         if self.served:
             means = (self._sums / self.served).tolist()
-        abs_y, best, baseline, snr, snr_best, bit_rate = means
+        abs_y, best, baseline, snr, snr_best, bit_rate, power, power_best, power_random = means
         return {
             "mean_abs_y": abs_y,
             "mean_abs_y_best": best,
             "mean_abs_y_baseline": baseline,
+            "loss_to_best_db": _db(power_best / power) if power and power_best else None,
+            "gain_over_random_db": _db(power / power_random) if power and power_random else None,
             "mean_snr_db": _db(snr),
             "mean_snr_best_db": _db(snr_best),
             "mean_bit_rate": bit_rate,
@@ -382,12 +393,13 @@ class _LinkTotals:
         self.all, self._packets = _UserTotals(), PacketTotals()
         self._stations: dict[tuple[str, str], _UserTotals] = defaultdict(_UserTotals)
 
-    def add(self, link: Link) -> None:
+    def add(self, link: Link, channels: Sequence[Channel]) -> None:
         self._packets.add(link)
-        self.all.add(link)
+        random = _random_power(link, channels)
+        self.all.add(link, random)
         of_user = list(zip(link.tx, link.carrier, strict=True))
         for station in dict.fromkeys(of_user):
-            self._stations[station].add(link, np.array([user == station for user in of_user]))
+            self._stations[station].add(link, random, np.array([user == station for user in of_user]))
 
     def summary(self) -> LinkSummary | None:
         if not self.all.users:
@@ -403,19 +415,43 @@ class _LinkTotals:
         )
 
 
+def _random_power(link: Link, channels: Sequence[Channel]) -> Float64Array:
+    """Mean |y|² over all beam pairs of each user; NaN where its H is not recorded.
+
+    The codebooks are orthonormal bases, so the sum over all pairs is the squared Frobenius norm of H.
+    """
+    mean = {
+        (channel.tx[matrix.tx], channel.rx[matrix.rx], channel.carriers[matrix.carrier].name): np.vdot(
+            matrix.h, matrix.h
+        ).real
+        / matrix.h.size
+        for channel in channels
+        for matrix in channel.h
+    }
+    users = zip(link.tx, link.rx, link.carrier, strict=True)
+    return np.array([mean.get(user, math.nan) for user in users], np.float64)
+
+
 def _db(ratio: float | None) -> float | None:
-    return 10 * math.log10(ratio) if ratio else None  # 0 is no path at all, and no number of decibels
+    # 0 is no path at all, and no number of decibels; what is not a number is not known.
+    return 10 * math.log10(ratio) if ratio and not math.isnan(ratio) else None
 
 
 def _measure(
     frame: RecordedFrame, sources: dict[tuple[str, str], SourceSummary], totals: _LinkTotals
 ) -> None:
+    links: list[Link] = []
+    channels: list[Channel] = []
     for product in frame.products:
         entry = product.provenance
         if entry.status in (Status.FRESH, Status.LATE):
             sources[entry.topic, entry.source].bytes += product.size
-        if entry.topic == "link" and entry.status is Status.FRESH:
-            totals.add(cast(Link, product.payload))
+        if entry.status is Status.FRESH and entry.topic == "link":
+            links.append(cast(Link, product.payload))
+        elif entry.status is Status.FRESH and entry.topic == "channel":
+            channels.append(cast(Channel, product.payload))
+    for link in links:
+        totals.add(link, channels)
 
 
 def _episodes_planned(scenario: dict[str, Any]) -> int:

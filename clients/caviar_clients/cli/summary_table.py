@@ -64,18 +64,19 @@ def _caption(summary: Mapping[str, Any]) -> str:
             share = figures["mean_abs_y"] / figures["mean_abs_y_best"] if figures["mean_abs_y_best"] else 0.0
             parts.append(
                 f"{of}mean |y| {figures['mean_abs_y']:.3g} of {figures['mean_abs_y_best']:.3g} at best "
-                f"({share:.1%}), straight line {figures['mean_abs_y_baseline']:.3g}"
+                f"({share:.1%}), LOS beam {figures['mean_abs_y_baseline']:.3g}"
             )
+            parts.append(of + gain_line(figures["loss_to_best_db"], figures["gain_over_random_db"]))
         if figures["mean_bit_rate"] is not None:
             numbers = figures["mean_snr_db"], figures["mean_snr_best_db"], figures["mean_bit_rate"]
             parts.append(f"{of}mean SNR {link_quality(*numbers)}")
         if of:
-            parts.append(f"{of}{figures['no_path_share']:.1%} of {figures['users']:,} users without a path")
+            parts.append(f"{of}{figures['no_path_share']:.1%} of {figures['users']:,} links without a path")
     if summary.get("packets") is not None:
         parts.append(packet_line(msgspec.convert(summary["packets"], PacketSummary)))
     if summary["outage"] is not None:
         causes, *inside = outage_lines(msgspec.convert(summary["outage"], OutageSummary))
-        parts += [f"{summary['no_path_share']:.1%} of users without a path: {causes}", *inside]
+        parts += [f"{summary['no_path_share']:.1%} of links without a path: {causes}", *inside]
     parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
     parts += [f"warning: {warning}" for warning in summary["warnings"]]
     return "\n".join(parts)
@@ -122,16 +123,27 @@ def outage_lines(outage: OutageSummary) -> list[str]:
     return lines
 
 
+def gain_line(loss_db: float | None, gain_db: float | None) -> str:
+    """Put the loss to the best pair and the gain over a random one [dB] into words.
+
+    Example:
+        >>> gain_line(0.04, 17.25), gain_line(3.0, None)
+        ('beams 0.0 dB below the best pair, 17.2 dB above a random one', 'beams 3.0 dB below the best pair')
+    """
+    loss = "served no link" if loss_db is None else f"{loss_db:.1f} dB below the best pair"
+    return f"beams {loss}" + ("" if gain_db is None else f", {gain_db:.1f} dB above a random one")
+
+
 def link_quality(snr_db: float | None, snr_best_db: float | None, bit_rate: float) -> str:
-    """Put the SNR [dB] of the chosen and of the best beams, and a user's bit rate [bit/s], into words.
+    """Put the SNR [dB] of the chosen and of the best beams, and a link's bit rate [bit/s], into words.
 
     Example:
         >>> link_quality(12.34, 15.0, 2.5e8)
-        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a user'
+        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a link'
     """
     snr, best = ("none" if value is None else f"{value:.1f} dB" for value in (snr_db, snr_best_db))
     rate, unit = scaled(bit_rate, ("bit/s", "kbit/s", "Mbit/s", "Gbit/s"))
-    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a user"
+    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a link"
 
 
 def packet_line(found: PacketSummary) -> str:

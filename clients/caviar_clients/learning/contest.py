@@ -63,7 +63,7 @@ class PolicyPlayer:
     ) -> None:
         card = model.card
         if card is None:
-            raise ScenarioError(f"{called} has no card; export it with caviar export-policy")
+            raise ScenarioError(f"{called} has no card; export it with caviar policy export")
         self._model, self._users = model, Users(scenario, users)
         sizes = tuple((place.tx.size, place.rx.size) for place in self._users.places)
         if sizes != card.codebooks:

@@ -97,6 +97,8 @@ class Evaluation:
     as ``lamp on mm``."""
     frames: Mapping[str, int]
     """Users and frames of each kind."""
+    power: Mapping[str, float]
+    """Mean |y|² by method."""
     efficiency: Mapping[str, Interval]
     """Spectral efficiency [bit/s/Hz] that pilots leave, by method."""
     pilots: Mapping[str, float]
@@ -169,6 +171,10 @@ def evaluate(
             for m, played in episodes_played.items()
         },
         frames={k: sum(int(p.of(k).sum()) for p in episodes_played["policy"]) for k in kinds},
+        power={
+            m: _mean(np.concatenate([p.abs_y.reshape(-1) ** 2 for p in played]))
+            for m, played in episodes_played.items()
+        },
         efficiency={method: mean_of(values) for method, values in efficiency.items()},
         pilots={method: float(np.mean(values)) for method, values in pilots.items()},
     )

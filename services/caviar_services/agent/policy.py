@@ -161,7 +161,7 @@ class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     sha256: Digest = ""
     """SHA-256 of the file; another file is refused. Empty: of the one that is there."""
     earlier: tuple[Digest, ...] = ()
-    """SHA-256 of the policies that the agent was given since (``caviar swap``). Written by the broker."""
+    """SHA-256 of the policies that the agent was given since (``caviar policy swap``), by the broker."""
 
 
 class Served(NamedTuple):
@@ -236,7 +236,7 @@ class PolicyAgent(Agent[PolicySettings]):
         if not observe:
             raise ScenarioError(
                 f"{called} has no card that says what it observes; write "
-                f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
+                f"observe = {list(model.inputs)!r} beside it, or export it with caviar policy export",
                 key=key,
             )
         sizes = tuple((place.tx.size, place.rx.size) for place in self._places.places)
