@@ -61,7 +61,8 @@ def run(
 ) -> Path:
     """Run a scenario to its end, as ``caviar run`` does.
 
-    Call it from the main thread: for the time of the run it handles Ctrl-C, which ends the run in order.
+    In the main thread it handles Ctrl-C for the time of the run, which ends in order. In another one, as of
+    ``asyncio.to_thread``, Ctrl-C is the program's, and the run goes on.
 
     Args:
         scenario: Name of a scenario that ships, or a TOML file.

@@ -6,7 +6,6 @@ import json
 import os
 import selectors
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from caviar_clients.cli.processes import Child, end, wait
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import PrivateFolder, file_system_of, open_to_append
+from caviar_protocol.host import PYTHON
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
@@ -214,7 +214,7 @@ class Launcher:
         return arguments
 
     def _start_broker(self) -> None:
-        command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
+        command = [*PYTHON, "-m", "caviar_broker", *self._broker_arguments()]
         command += ["--http", self.http] if self.http else []
         command += [*self._key.options(), "--control", "--supervised", *self._local]
         with open_to_append(self._log) as log:
@@ -242,7 +242,7 @@ class Launcher:
 
     def _start(self, name: str) -> None:
         spec, path = self._local[name], RunDirectory(self.directory).log(name)
-        command = [sys.executable, "-m", "caviar_services", name]
+        command = [*PYTHON, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]

@@ -227,11 +227,12 @@ def replay_run(
     from caviar_clients.cli.run import run_scenario
     from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
     from caviar_clients.replay.recorded import RecordedRun
-    from caviar_clients.session.checks import check_implementations
+    from caviar_clients.session.checks import check_implementations, names_class
     from caviar_services.registry import find_modules_in
 
-    find_modules_in(Path.cwd())  # of classes that --replace names as module:Class
     found = RecordedRun(Recording(run))
+    if any(map(names_class, found.scenario.services.values())) or any(":" in text for text in replace):
+        find_modules_in(Path.cwd())
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)
     check_implementations(plan.scenario)

@@ -71,11 +71,15 @@ def module_folders(scenario: Scenario) -> tuple[Path, ...]:
         The scenario's folder and the current one; empty where neither a service nor a rung of a service's
         settings is named so.
     """
-    named = (name for spec in scenario.services.values() for name in (spec.use, *_used_by(spec.settings)))
-    if not any(":" in name for name in named):
+    if not any(map(names_class, scenario.services.values())):
         return ()
     beside = (Path(scenario.source.file).resolve().parent,) if scenario.source.file else ()
     return (*beside, Path.cwd())
+
+
+def names_class(spec: ServiceSpec) -> bool:
+    """Whether a service, or a rung of its settings, is named ``module:Class``: a run imports the module."""
+    return any(":" in name for name in (spec.use, *_used_by(spec.settings)))
 
 
 def _used_by(settings: object) -> Iterator[str]:

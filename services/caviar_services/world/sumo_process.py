@@ -67,8 +67,8 @@ class Simulation:
         self.close()
         if self.api.isLoaded():
             raise SetupError(
-                "libsumo already runs a simulation in this process and has room for one; "
-                "run this world as a process of its own: caviar service NAME"
+                "libsumo already runs a simulation in this process and has room for one; run this world as a "
+                "process of its own (caviar service NAME), and workers of Dask with --nthreads 1"
             )
         printed: list[str] = []
         try:
