@@ -249,7 +249,7 @@ def _amplitudes(
     """
     tx, rx = np.divmod(table.pair, max(len(receivers), 1))
     sent = antenna_fields(transmitters, tx, geometry.departure)
-    taken = antenna_fields(receivers, rx, geometry.arrival)
+    taken = antenna_fields(receivers, rx, geometry.arrival, arrival=True)
     phase = carrier_phase(carriers, geometry.tau)
     a: Complex128Array = np.einsum("pi,cpij,pj->cp", taken, table.transfer, sent) * phase
     for t, transmitter in enumerate(transmitters):
