@@ -23,6 +23,7 @@ from caviar_protocol.host import PYTHON
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
+from caviar_services.registry import load
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -244,6 +245,8 @@ class Launcher:
         spec, path = self._local[name], RunDirectory(self.directory).log(name)
         command = [*PYTHON, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+        if wanted := load(spec.role, spec.use).inputs_with(spec.settings):
+            command += ["--inputs", *(".".join((i.topic, *i.parts)) for i in wanted)]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]
         child = Child.start(name, command, path, {**self._threads, **self._key.environment()})

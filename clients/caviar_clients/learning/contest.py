@@ -64,7 +64,7 @@ class PolicyPlayer:
         card = model.card
         if card is None:
             raise ScenarioError(f"{called} has no card; export it with caviar policy export")
-        self._model, self._users = model, Users(scenario, users)
+        self._model, self._users = model, Users(scenario, users, transmitters=card.transmitters)
         sizes = tuple((place.tx.size, place.rx.size) for place in self._users.places)
         if sizes != card.codebooks:
             raise ScenarioError(
@@ -183,6 +183,7 @@ class Contest:
         players: By name.
         users: Receivers that count, as names with ``*`` and ``?``.
         agent: Of the scenario, whose place they take; None: the only one.
+        transmitters: Whose users count, likewise.
 
     Raises:
         ScenarioError: The scenario has no such agent, or no link, or several.
@@ -203,8 +204,9 @@ class Contest:
         players: Mapping[str, Player],
         users: Sequence[str] = ("*",),
         agent: str | None = None,
+        transmitters: Sequence[str] = ("*",),
     ) -> None:
-        self._scenario, self._users = scenario, Users(scenario, users)
+        self._scenario, self._users = scenario, Users(scenario, users, transmitters=transmitters)
         self._agent = agent_of(scenario, agent)
         links = [name for name, spec in scenario.services.items() if spec.role == "link"]
         if len(links) != 1:

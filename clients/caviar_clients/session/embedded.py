@@ -39,10 +39,10 @@ from caviar_protocol.geometry import MeshCheck
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import Answer, sorted_products
-from caviar_services.registry import load
+from caviar_services.registry import load, with_inputs
 from caviar_services.service import Service, StepResult
 from caviar_services.session import ServiceSession
 
@@ -205,10 +205,14 @@ class EmbeddedRun:
             progress = partial(self._progressed, name)
             return kind(name, use, cls, send, store, progress=progress, check=check, encodes=self._encodes)
 
+        def loaded(spec: ServiceSpec) -> type[Service[Any]]:
+            cls = load(spec.role, spec.use)
+            return with_inputs(cls, cls.inputs_with(spec.settings))
+
         self.seats = {name: session(OutsideSession, name, cls) for name, cls in seats.items()}
         """Services that decide outside of the run."""
         self._sessions: dict[str, ServiceSession] = {
-            name: self.seats.get(name) or session(ServiceSession, name, load(spec.role, spec.use))
+            name: self.seats.get(name) or session(ServiceSession, name, loaded(spec))
             for name, spec in scenario.services.items()
         }
         self._at_work: Work | None = None  # what a service handles just now
