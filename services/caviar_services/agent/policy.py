@@ -278,7 +278,7 @@ class PolicyAgent(Agent[PolicySettings]):
             wanted = ".".join((entry.topic, *entry.parts))
             if entry.topic not in given:
                 raise ScenarioError(
-                    f"{called} observes {', '.join(observe)}, which needs {wanted}, and the agent did not ask "
+                    f"{called} observes {', '.join(observe)}, which needs {wanted}; the agent did not ask "
                     f"for that when it joined: write observe = {list(observe)!r} beside the file, or start "
                     f"the agent with --inputs {wanted}",
                     key=key,
