@@ -682,8 +682,8 @@ SegmentationImage sensor:str! intrinsics:Intrinsics! position:Vector3! orientati
 Intrinsics fx:float! fy:float! cx:float! cy:float!
 Action commands:[BeamChoice/WaypointCommand/VelocityCommand/UserSchedule/PathCommand/AttitudeCommand/DriveCommand/SignalCommand]!
 BeamChoice#beam tx:str! rx:str! tx_beam:int>=0! rx_beam:int>=0=0 carrier:str=""
-WaypointCommand#waypoint object:str! position:Vector3! speed:float>0! at_once:bool=false
-VelocityCommand#velocity object:str! velocity:float*3!
+WaypointCommand#waypoint object:str! position:Vector3! speed:float>0! at_once:bool=false yaw:float?
+VelocityCommand#velocity object:str! velocity:float*3! yaw:float? yaw_rate:float?
 PathCommand#path object:str! points:[Vector3]! speed:float>0!
 AttitudeCommand#attitude object:str! orientation:Quaternion! thrust:float>=0!
 DriveCommand#drive object:str! speed:float>=0? lane:int>=0? route:[str]=[] stop:RoadStop?
@@ -1817,6 +1817,7 @@ struct Command {
   double speed = 0.0;    // at most [m/s]
   bool at_once = false;  // be there in this frame, at rest
   Vector3 velocity{};    // [m/s]
+  Value yaw, yaw_rate;   // waypoint, velocity [rad, rad/s]; none: along the course
   Value fields;          // all of them, and those of other kinds: path, attitude, drive, signal
 };
 
@@ -1838,6 +1839,7 @@ inline std::vector<Command> commands_of(const Value& action, const std::string& 
     command.object = value["object"].text(), command.position = value["position"].numbers<3>();
     command.speed = value["speed"].number(), command.at_once = value["at_once"].boolean();
     command.velocity = value["velocity"].numbers<3>();
+    command.yaw = value["yaw"], command.yaw_rate = value["yaw_rate"];
     found.push_back(std::move(command));
   }
   return found;

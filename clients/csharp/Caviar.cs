@@ -426,8 +426,8 @@ LidarDevice:lidar name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4
 CameraDevice:camera name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] width:i1..8192=640 height:i1..8192=480 field_of_view:f<0=1.5707963267948966
 Intrinsics fx:f fy:f cx:f cy:f
 BeamChoice:beam tx:s rx:s tx_beam:i0 rx_beam:i0=0 carrier:s=''
-WaypointCommand:waypoint object:s position:t3(f) speed:f<0 at_once:b=false
-VelocityCommand:velocity object:s velocity:t3(f)
+WaypointCommand:waypoint object:s position:t3(f) speed:f<0 at_once:b=false yaw:f=?
+VelocityCommand:velocity object:s velocity:t3(f) yaw:f=? yaw_rate:f=?
 UserSchedule:schedule tx:s rx:s
 PathCommand:path object:s points:l(t3(f)) speed:f<0
 AttitudeCommand:attitude object:s orientation:t4(f) thrust:f0

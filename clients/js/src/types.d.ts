@@ -85,11 +85,17 @@ export interface WaypointCommand {
   position: Vector3;
   speed: number;
   at_once?: boolean;
+  /** Since 1.6: heading to turn to and to keep [rad]; left out: along the course. */
+  yaw?: number;
 }
 export interface VelocityCommand {
   type: "velocity";
   object: string;
   velocity: Vector3;
+  /** Since 1.6: heading to turn to and to keep [rad]; left out: along the course. */
+  yaw?: number;
+  /** Since 1.6: with which the heading turns [rad/s], where `yaw` is left out. */
+  yaw_rate?: number;
 }
 export interface UserSchedule {
   type: "schedule";
