@@ -147,6 +147,9 @@ def export_command(
     on: Annotated[str, typer.Option("--on", help="scenario that it was trained on, by name or file")],
     users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
     steps: Annotated[int, typer.Option(min=0, help="of training, for the card")] = 0,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="the model is from you: to read it runs what is pickled in it")
+    ] = False,
 ) -> None:
     """Write a trained model as an ONNX policy, with its card, for the agent `policy`."""
     from caviar_clients.envs.base import BeamSelectionEnv
@@ -162,6 +165,11 @@ def export_command(
         ) from error
     if not model.is_file():
         raise ScenarioError(f"{model}: there is no such file; give the zip file that model.save() wrote")
+    if not trust:
+        raise ScenarioError(
+            f"{model} is a model of Stable-Baselines3, and to read one runs the code that is pickled in it; "
+            "give --trust if you know who wrote it"
+        )
     try:
         trained = getattr(stable_baselines3, algorithm.upper()).load(model, device="cpu")
     except Exception as error:  # whatever a file that is no model makes it raise
@@ -178,7 +186,8 @@ def export_command(
         warnings.simplefilter("ignore")
         env = BeamSelectionEnv(on, observe=tuple(spaces), users=users)
     wanted, found = trained.action_space, env.action_space
-    if wanted != found or trained.observation_space != env.observation_space:
+    # Bounds are looked at by `export_policy`, which says what they come from.
+    if wanted != found or _spaces(trained.observation_space) != _spaces(env.observation_space):
         raise ScenarioError(
             f"{model} was trained for actions {wanted} and {_spaces(trained.observation_space)}, and {on} "
             f"has {found} and {_spaces(env.observation_space)}; name scenario and users of its training"
@@ -225,6 +234,7 @@ def evaluate_command(
     for table in _evaluation_tables(made):
         console.print(table)
     if json is not None:
+        played = [seed for seed in chosen for _ in range(episodes)]
         write_json(
             json,
             {
@@ -232,6 +242,10 @@ def evaluate_command(
                 "abs_y": {m: {k: vars(means[k]) for k in KINDS} for m, means in made.found.items()},
                 "spectral_efficiency": {m: vars(mean) for m, mean in made.efficiency.items()},
                 "pilots": dict(made.pilots),
+                "episodes": [{"seed": s, "abs_y": e} for s, e in zip(played, made.episodes, strict=True)],
+                "policy_minus": {
+                    m: {k: vars(made.difference(m, k)) for k in KINDS} for m in made.found if m != "policy"
+                },
             },
         )
 

@@ -144,7 +144,7 @@ class UavPathV1Env(FlightEnv):
 
     def __init__(
         self,
-        scenario: str | Path,
+        scenario: str | Path = "uav-path",
         vehicle: str | None = None,
         reach_m: float = 5.0,
         box_m: tuple[Sequence[float], Sequence[float]] | None = None,

@@ -100,6 +100,18 @@ class Evaluation:
     """Spectral efficiency [bit/s/Hz] that pilots leave, by method."""
     pilots: Mapping[str, float]
     """Of a frame, on average, by method."""
+    episodes: tuple[Mapping[str, Mapping[str, float]], ...] = ()
+    """Mean |y| of each episode by method, then by kind of frame; NaN: it had no such frames."""
+
+    def difference(self, method: str, kind: str = "all") -> Interval:
+        """Mean |y| of the policy less that of a method in the same episodes, with the interval of the paired
+        differences.
+
+        Args:
+            method: One of `found`.
+            kind: One of `KINDS`.
+        """
+        return mean_of([played["policy"][kind] - played[method][kind] for played in self.episodes])
 
     def ratio(self, method: str, kind: str = "all") -> float:
         """Mean |y| of the policy over that of a method."""
@@ -151,16 +163,21 @@ def evaluate(
     means: dict[tuple[str, str], list[float]] = {(m, k): [] for m in players for k in KINDS}
     efficiency: dict[str, list[float]] = {method: [] for method in players}
     pilots: dict[str, list[float]] = {method: [] for method in players}
-    counts = dict.fromkeys(KINDS, 0)
-    with Contest(known, players, served, agent) as contest:
+    counts, by_episode = dict.fromkeys(KINDS, 0), list[Mapping[str, Mapping[str, float]]]()
+    transmitters = model.card.transmitters if model.card else ("*",)
+    with Contest(known, players, served, agent, transmitters) as contest:
         for done, seed in enumerate(episodes_of(seeds, episodes), 1):
+            played_episode: dict[str, dict[str, float]] = {}
             for method, played in contest.play(seed).items():
                 efficiency[method].append(_mean(played.net_efficiency))
                 pilots[method].append(played.pilots)
+                of_kind = played_episode[method] = dict[str, float]()
                 for kind in KINDS:
                     mine = played.of(kind)
-                    means[method, kind].append(_mean(played.abs_y[mine]))
+                    of_kind[kind] = _mean(played.abs_y[mine])
+                    means[method, kind].append(of_kind[kind])
                     counts[kind] += int(mine.sum()) if method == "policy" else 0
+            by_episode.append(played_episode)
             progress(done)
     return Evaluation(
         policy=file.name,
@@ -169,6 +186,7 @@ def evaluate(
         frames=counts,
         efficiency={method: mean_of(values) for method, values in efficiency.items()},
         pilots={method: float(np.mean(values)) for method, values in pilots.items()},
+        episodes=tuple(by_episode),
     )
 
 

@@ -278,9 +278,9 @@ class PolicyAgent(Agent[PolicySettings]):
             wanted = ".".join((entry.topic, *entry.parts))
             if entry.topic not in given:
                 raise ScenarioError(
-                    f"{called} observes {', '.join(observe)}, which needs {wanted}, and the agent did not ask "
-                    f"for that when it joined: write observe = {list(observe)!r} beside the file, or start "
-                    f"the agent with --inputs {wanted}",
+                    f"{called} observes {', '.join(observe)}, which needs {wanted}, and the agent did not "
+                    f"ask for that when it joined: write observe = {list(observe)!r} beside the file, or "
+                    f"start the agent with --inputs {wanted}",
                     key=key,
                 )
         _check_shapes(model, observer, called, key)
