@@ -345,9 +345,8 @@ def serve(
     if not separator:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
         return 2
-    if ":" in implementation:
-        for folder in (*modules, Path.cwd()):
-            find_modules_in(folder)
+    for folder in (*modules, *[Path.cwd()] * (":" in implementation)):
+        find_modules_in(folder)
     steady_memory()
     try:
         found = find_credentials(key, broker_key)

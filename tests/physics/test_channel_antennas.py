@@ -11,12 +11,24 @@ import numpy as np
 import pytest
 
 from caviar_protocol.multipath import subcarrier_offsets
-from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.propagation.patterns import Patterns, element_amplitude
+from caviar_services.channel.propagation.patterns import Patterns, element_amplitude, radiated_field
 from caviar_services.channel.stability.formulas import C, turn, vertical
-from caviar_services.channel.stability.lab import Array, Thing, antenna, free_space, measure, scene, sionna
+from caviar_services.channel.stability.lab import (
+    CONDUCTOR,
+    Array,
+    Lab,
+    Plate,
+    Thing,
+    antenna,
+    free_space,
+    measure,
+    scene,
+    sionna,
+    square,
+)
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo
@@ -337,3 +349,51 @@ def test_responses_over_the_band_have_all_subarrays(rung: str) -> None:
     assert response.shape == (1, 4, *h.shape)
     offset = subcarrier_offsets(carrier)
     np.testing.assert_allclose(response[0, offset == 0][0], h, rtol=1e-5, atol=1e-6 * np.abs(h).max())
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    return Lab(tmp_path_factory.mktemp("plates"))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize(
+    "array",
+    [AntennaArray(), AntennaArray(rows=2, columns=4), AntennaArray(columns=4, polarization="cross")],
+    ids=["single", "panel", "cross"],
+)
+@pytest.mark.parametrize(
+    "rung", [{}, {"candidates": "launched"}, {"rung": "spherical"}], ids=["free", "launched", "spherical"]
+)
+def test_h_is_continuous_where_a_receiver_is_carried_over_its_transmitter(
+    lab: Lab, rung: dict[str, str], array: AntennaArray, yaw: float
+) -> None:
+    # Neither vertical nor horizontal elements have an azimuth at the pole; 119 µm is where Sionna RT's ends.
+    plates = [Plate("wall", [(5, -50, -50), (5, 50, -50), (5, 50, 50), (5, -50, 50)], CONDUCTOR)]
+    plates.append(Plate("ground", square(60.0, -3.0)))
+    model = lab.traced(28e9, plates, **rung) if rung else free_space(28e9)
+    found = []
+    for metres in np.array([-1e-6, 0.0, 1e-9, 1e-6, 118.5e-6, 119.5e-6, 238e-6, 239e-6]):
+        receiver = antenna(
+            "r", "rx", (0.87 * metres, 0.5 * metres, 20.0), array, orientation=quaternion_from_euler(yaw)
+        )
+        channel = measure(model, scene([antenna("t", "tx", (0, 0, 0), array), receiver]))
+        found.append(channel.h[0].h)
+    steps = np.abs(np.diff(found, axis=0)).max(axis=(1, 2)) / np.abs(found).max()
+    assert steps[[0, 1, 2, 4, 6]].max() < 1e-3
+
+
+@pytest.mark.parametrize("polarization", ["V", "H", "+45", "RHCP"])
+def test_the_limit_at_a_pole_is_that_of_both_ends_however_the_devices_are_turned(polarization: str) -> None:
+    array = AntennaArray(polarization=polarization)
+    for angles in [(0.4, 0.0, 0.0), (0.0, np.pi / 2, 0.0), (1.0, 0.3, -0.8)]:
+        rotation = rotation_matrix(quaternion_from_euler(*angles))
+        along, beside = rotation[:, 2], rotation[:, 2] + 1e-7 * (rotation[:, 0] + 0.3 * rotation[:, 1])
+        gains = [
+            (
+                radiated_field(array, rotation, k[None], arrival=False)
+                * radiated_field(array, rotation, -k[None], arrival=True)
+            ).sum()
+            for k in (along, beside / np.linalg.norm(beside))
+        ]
+        assert gains[0] == pytest.approx(gains[1], abs=1e-6)

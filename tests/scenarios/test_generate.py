@@ -1,4 +1,4 @@
-"""``caviar generate`` with real processes: kills, other numbers of workers, a scheduler that comes back."""
+"""``caviar dataset generate`` with real processes: kills, numbers of workers, a scheduler that comes back."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
-COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
+COMMAND = (sys.executable, "-m", "caviar_clients", "dataset", "generate")
 EPISODES = 16
 
 

@@ -272,16 +272,15 @@ def test_the_folder_of_another_level_names_that_of_the_dataset(
     check_level(folder)
     check_level(tmp_path / "nothing")  # of which the catalogue says that it is not there
     for place in (name, f"{name}/episodes"):
-        words = (
-            f"{name} is a dataset: give an episode of it, as {name}/episodes/episode-000000; caviar verify"
-        )
+        words = f"{name} is a dataset: give an episode of it, as {name}/episodes/episode-000000"
         with pytest.raises(RecordingError, match=words):
             caviar.open(place)
 
 
 def test_a_folder_without_a_catalogue_is_no_dataset(tmp_path: Path) -> None:
     with pytest.raises(
-        RecordingError, match=r"is no dataset, it has no catalogue.sqlite; make one with: caviar generate"
+        RecordingError,
+        match=r"is no dataset, it has no catalogue.sqlite; make one with: caviar dataset generate",
     ):
         Dataset(tmp_path)
     (tmp_path / "catalogue.sqlite").write_text("not a database, but long enough to be taken for one" * 20)

@@ -421,7 +421,7 @@ def _progress(model: Any, seed: int, asked: int) -> Progress:
 
 def _mean_reward(model: Any) -> float | None:
     ended = model.ep_info_buffer
-    return float(np.mean([episode["r"] for episode in ended])) if ended else None
+    return float(np.mean([float(episode["r"]) for episode in ended])) if ended else None
 
 
 def _logger(events: EventFile) -> Any:

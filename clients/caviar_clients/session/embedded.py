@@ -177,6 +177,7 @@ class EmbeddedRun:
             policies=given_policies(scenario, store, directory),
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
+        self._services = {service.name: service for service in plan.services}
         self._now = 0
         self._plan, self._clock = plan, FrameClock(plan, self._now)
         self._journal = (
@@ -306,7 +307,11 @@ class EmbeddedRun:
             session.report(failure, phase, episode, frame)
         self._at_work = None
         if self._encodes and type(order.message) is m.Grant:
-            self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+            elapsed, plan = time.monotonic_ns() - began, self._services[order.service]
+            grant = order.message
+            missed = elapsed > plan.budget_ns
+            missed = missed and not self._plan.is_warm_up(plan, grant.episode, grant.frame)
+            self.statistics.latency(order.service, elapsed, missed)
 
     def _close(self, session: ServiceSession) -> None:
         self._direct, self._at_work = None, (session.name, None)

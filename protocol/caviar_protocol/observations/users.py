@@ -10,7 +10,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.scenario.schema import ServiceSpec, owned_by
-from caviar_protocol.space.scene import Pair, pairs_of
+from caviar_protocol.space.scene import Pair, pairs_of, share_carrier
 from caviar_protocol.topics import AntennaArray, Scene
 
 
@@ -84,7 +84,7 @@ class Users:
             for tx in sorted((d for d in antennas if d.role in ("tx", "both")), key=_name)
             if any(patterns_overlap(_full_name(tx), pattern) for pattern in transmitters)
             for rx in sorted((d for d in antennas if d.role in ("rx", "both")), key=_name)
-            if rx is not tx and self._may_serve(rx)
+            if rx is not tx and self._may_serve(rx) and share_carrier(tx.carriers, rx.carriers)
         ]
         if not self._groups:
             receivers, senders = (

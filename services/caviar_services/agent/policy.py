@@ -170,7 +170,7 @@ class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     sha256: Digest = ""
     """SHA-256 of the file; another file is refused. Empty: of the one that is there."""
     earlier: tuple[Digest, ...] = ()
-    """SHA-256 of the policies that the agent was given since (``caviar swap``). Written by the broker."""
+    """SHA-256 of the policies that the agent was given since (``caviar policy swap``), by the broker."""
 
 
 class Served(NamedTuple):
@@ -259,7 +259,7 @@ class PolicyAgent(Agent[PolicySettings]):
         if not observe:
             raise ScenarioError(
                 f"{called} has no card that says what it observes; write "
-                f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
+                f"observe = {list(model.inputs)!r} beside it, or export it with caviar policy export",
                 key=key,
             )
         known = KnownDevices(self.run.devices, _grids(model, called, key))
@@ -278,9 +278,9 @@ class PolicyAgent(Agent[PolicySettings]):
             wanted = ".".join((entry.topic, *entry.parts))
             if entry.topic not in given:
                 raise ScenarioError(
-                    f"{called} observes {', '.join(observe)}, which needs {wanted}, and the agent did not "
-                    f"ask for that when it joined: write observe = {list(observe)!r} beside the file, or "
-                    f"start the agent with --inputs {wanted}",
+                    f"{called} observes {', '.join(observe)}, which needs {wanted}; the agent did not ask "
+                    f"for that when it joined: write observe = {list(observe)!r} beside the file, or start "
+                    f"the agent with --inputs {wanted}",
                     key=key,
                 )
         _check_shapes(model, observer, called, key)

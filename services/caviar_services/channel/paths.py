@@ -82,23 +82,27 @@ class Antenna:
             for number, part in enumerate(subarrays(self.array))
         )
 
-    def radiated(self, directions: Float64Array) -> Field:
+    def radiated(self, directions: Float64Array, *, arrival: bool = False) -> Field:
         """Far field of an element of the first subarray.
 
         Args:
             directions: Unit vectors in world axes, Shape ``[P, 3]``.
+            arrival: Whether the antenna receives.
         """
         first = self.subarrays[0]
-        return radiated_field(first.array, first.rotation, directions, first.pattern)
+        return radiated_field(first.array, first.rotation, directions, first.pattern, arrival=arrival)
 
 
-def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array) -> Field:
+def antenna_fields(
+    antennas: Sequence[Antenna], which: Int64Array, directions: Float64Array, *, arrival: bool = False
+) -> Field:
     """Field of the antenna that each path has at one end, towards the path, Shape ``[P, 3]``.
 
     Args:
         antennas: All at this end.
         which: Index of the antenna of each path, Shape ``[P]``.
         directions: Unit vectors from the antenna towards the path, Shape ``[P, 3]``.
+        arrival: Whether the antennas receive.
 
     Example:
         >>> element = Patterns().of(AntennaArray())
@@ -108,11 +112,11 @@ def antenna_fields(antennas: Sequence[Antenna], which: Int64Array, directions: F
     """
     # With one base station, a mask over all paths would only copy them.
     if len(antennas) == 1:
-        return antennas[0].radiated(directions)
+        return antennas[0].radiated(directions, arrival=arrival)
     found: Field = np.zeros((len(which), 3))
     for index, antenna in enumerate(antennas):
         mine = which == index
-        field = antenna.radiated(directions[mine])
+        field = antenna.radiated(directions[mine], arrival=arrival)
         if np.iscomplexobj(field) and not np.iscomplexobj(found):
             found = found.astype(np.complex128)
         found[mine] = field

@@ -398,8 +398,13 @@ def subarray_amplitudes(
         phase: From `carrier_phase`, Shape ``[C, P]``.
     """
     sent, taken = (
-        np.array([radiated_field(part.array, part.rotation, along, part.pattern) for part in end.subarrays])
-        for end, along in zip(antennas, towards, strict=True)
+        np.array(
+            [
+                radiated_field(part.array, part.rotation, along, part.pattern, arrival=arrival)
+                for part in end.subarrays
+            ]
+        )
+        for end, along, arrival in zip(antennas, towards, (False, True), strict=True)
     )
     amplitudes: Complex128Array = np.einsum("rpi,cpij,tpj->rtcp", taken, transfer, sent) * phase
     return amplitudes

@@ -130,6 +130,13 @@ class ElementPaths:
             from_rx = np.where(bent, _unmapped(self._taken, last), from_rx)
         return _unmapped(self._sent, from_tx), from_rx
 
+    @property
+    def image_turn(self) -> Float64Array:
+        """Linear part of the map from a transmitter to its image at the receiver, Shape ``[P, 3, 3]``; 0 for
+        paths that bend, whose last leg begins at the bend."""
+        turn: Float64Array = self._sent[0] * (self.bend == Bend.NONE)[:, None, None]
+        return turn
+
     def lengths(self, rows: slice, transmit: Float64Array, receive: Float64Array) -> Lengths:
         """Lengths of some paths between elements.
 

@@ -169,7 +169,7 @@ class ElementTracer:
             parts = {(target.name, target.part): target for target in targets}
             number = {key: index for index, key in enumerate(parts)}
             which = np.array([number[target.name, target.part] for target in targets], np.int64)[table.pair]
-            taken = antenna_fields(list(parts.values()), which, geometry.arrival)
+            taken = antenna_fields(list(parts.values()), which, geometry.arrival, arrival=True)
             # The whole turns go first: they are millions, and only the rest is a phase.
             turns = geometry.tau * SPEED_OF_LIGHT / wavelength
             phase = np.exp(-2j * np.pi * (turns - np.round(turns)))

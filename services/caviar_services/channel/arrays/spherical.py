@@ -4,10 +4,10 @@ H[m, n] = Σ_p a_p · (s_p[m, n] / s_p) · exp(−j2πf(d_p[m, n] − d_p)/c), o
 have, with the length d and the spreading s between the elements (s = 1/d but for diffraction and scattering,
 see `element_paths`) and d_p, s_p those between the arrays' centres, which a_p belongs to.
 
-Seen from the elements of an array, a path that is near starts in different directions, and a pattern that
-slopes weights it differently. That gain is computed at three places along each side of an array, with the
-other array's centre, and is a parabola between them: to first order in the size of the arrays over the
-length of the path, the gains of both ends add up.
+Seen from the elements of an array, a path that is near starts, and arrives, in different directions, and a
+pattern that slopes weights it differently. That gain is computed at three places along each side of an array,
+with the other array's centre, and is a parabola between them: to first order in the size of the arrays over
+the length of the path, the gains of both ends add up.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ from caviar_services.channel.arrays.channel_matrices import Bins, Blocks, Locate
 from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
 from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.patterns import Field, FormulaPattern, polarized_field
+from caviar_services.channel.propagation.patterns import (
+    ElementPattern,
+    Field,
+    FormulaPattern,
+    off_pole,
+    polarized_field,
+)
 
 
 class ElementGains:
@@ -36,6 +42,7 @@ class ElementGains:
         antennas: Transmitters and receivers.
         which: Transmitter and receiver of each path, Shape ``[P]`` each.
         towards: Where straight lines along the path from both lead [m], Shape ``[P, 3]`` each.
+        turn: `ElementPaths.image_turn`, Shape ``[P, 3, 3]``.
         transfer: That of `PathTable`, times what takes its spreading out, Shape ``[P, 3, 3]``.
         wavelength: [m].
     """
@@ -45,6 +52,7 @@ class ElementGains:
         antennas: tuple[Sequence[Antenna], Sequence[Antenna]],
         which: tuple[Int64Array, Int64Array],
         towards: tuple[Float64Array, Float64Array],
+        turn: Float64Array,
         transfer: Complex128Array,
         wavelength: float,
     ) -> None:
@@ -58,20 +66,21 @@ class ElementGains:
             ]
             rows = np.flatnonzero(ends[0][which[0]] & ends[1][which[1]])
             self._place[rows] = np.arange(len(rows))
-            sent, taken = (
-                _fields(array, side, index[rows], to[rows], wavelength)
-                for array, side, index, to in zip(arrays, antennas, which, towards, strict=True)
+            tx, rx = (
+                _End.of(array, side, index[rows], to[rows], wavelength, arrival)
+                for array, side, index, to, arrival in zip(
+                    arrays, antennas, which, towards, (False, True), strict=True
+                )
             )
-            # Nodes are odd in number along each side, so the middle one is the array's centre.
-            middle_sent, middle_taken = (field[:, field.shape[1] // 2] for field in (sent, taken))
-            onward = (middle_taken[:, None] @ transfer[rows])[:, 0]
-            back = (transfer[rows] @ middle_sent[:, :, None])[:, :, 0]
+            # An element beside the centre departs elsewhere, and its image arrives elsewhere. Taken together,
+            # as near a pole both fields turn, and their product does not.
+            sent = _between(
+                rx.field(tx.nodes @ turn[rows].transpose(0, 2, 1)), transfer[rows], tx.field(-tx.nodes)
+            )
+            taken = _between(rx.field(-rx.nodes), transfer[rows], tx.field(rx.nodes @ turn[rows]))
             # Gains of both ends add up to first order; the centre is in both parts and is taken off once.
-            centre = (onward * middle_sent).sum(-1)[:, None]
-            self._parts[arrays] = (
-                (sent @ onward[:, :, None])[:, :, 0],
-                (taken @ back[:, :, None])[:, :, 0] - centre,
-            )
+            # Nodes are odd in number along each side, so the middle one is the array's centre.
+            self._parts[arrays] = (sent, taken - taken[:, [taken.shape[1] // 2]])
 
     def of(
         self, rows: slice, transmit: AntennaArray, receive: AntennaArray
@@ -92,25 +101,55 @@ class ElementGains:
         return sent[place] @ _nodes(transmit)[1].T, taken[place] @ _nodes(receive)[1].T
 
 
-def _fields(
-    array: AntennaArray,
-    antennas: Sequence[Antenna],
-    which: Int64Array,
-    towards: Float64Array,
-    wavelength: float,
-) -> Field:
-    """Fields towards paths at the nodes of an array, world axes, Shape ``[P, K, 3]``."""
-    nodes, _ = _nodes(array)
-    rotation = np.array([antenna.rotation for antenna in antennas])[which]
-    centre = np.array([antenna.position for antenna in antennas])[which]
-    away = (towards - centre)[:, None] @ rotation - wavelength * nodes
-    length = np.sqrt((away**2).sum(-1, keepdims=True))
-    local = (away / np.where(length > 0, length, 1.0)).reshape(-1, 3)
-    # Antennas of one array have the same pattern, as an array names its file.
-    pattern = next((antenna.pattern for antenna in antennas if antenna.array == array), None)
-    field = polarized_field(pattern or FormulaPattern(array.pattern), array.polarization, local)
-    world: Field = field.reshape(*away.shape) @ rotation.transpose(0, 2, 1)
-    return world
+@dataclass(frozen=True, eq=False)
+class _End:
+    """One end of P paths, whose antennas have arrays of one kind."""
+
+    array: AntennaArray
+    pattern: ElementPattern
+    rotation: Float64Array
+    """Shape ``[P, 3, 3]``."""
+    away: Float64Array
+    """From the array's centre to where the path leads [m], Shape ``[P, 3]``."""
+    nodes: Float64Array
+    """From the centre to the nodes of the array, world axes [m], Shape ``[P, K, 3]``."""
+    arrival: bool
+
+    @classmethod
+    def of(
+        cls,
+        array: AntennaArray,
+        antennas: Sequence[Antenna],
+        which: Int64Array,
+        towards: Float64Array,
+        wavelength: float,
+        arrival: bool,
+    ) -> _End:
+        rotation = np.array([antenna.rotation for antenna in antennas])[which]
+        centre = np.array([antenna.position for antenna in antennas])[which]
+        # Antennas of one array have the same pattern, as an array names its file.
+        pattern = next((antenna.pattern for antenna in antennas if antenna.array == array), None)
+        nodes = wavelength * _nodes(array)[0] @ rotation.transpose(0, 2, 1)
+        pattern = pattern or FormulaPattern(array.pattern)
+        return cls(array, pattern, rotation, towards - centre, nodes, arrival)
+
+    def field(self, moved: Float64Array) -> Field:
+        """Fields along the paths with the straight line changed by K vectors [m], Shape ``[P, K, 3]``."""
+        away = self.away[:, None] + moved
+        length = np.sqrt((away**2).sum(-1, keepdims=True))
+        direction = away / np.where(length > 0, length, 1.0)
+        rotation = np.repeat(self.rotation, away.shape[1], axis=0)
+        local = (direction @ self.rotation).reshape(-1, 3)
+        local = off_pole(local, direction.reshape(-1, 3), rotation, self.arrival)
+        field = polarized_field(self.pattern, self.array.polarization, local).reshape(*away.shape)
+        world: Field = field @ self.rotation.transpose(0, 2, 1)
+        return world
+
+
+def _between(taken: Field, transfer: Complex128Array, sent: Field) -> Complex128Array:
+    """Amplitudes of P paths with K fields at each end, Shape ``[P, K]``."""
+    amplitudes: Complex128Array = ((taken @ transfer) * sent).sum(-1)
+    return amplitudes
 
 
 @lru_cache(maxsize=256)
@@ -208,6 +247,7 @@ class SphericalWaves:
                         (split.transmit, split.receive),
                         ends,
                         towards,
+                        paths.image_turn,
                         located.transfer[carrier][split.path] * without_spreading[:, None, None],
                         wavelength,
                     ),

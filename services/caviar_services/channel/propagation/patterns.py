@@ -22,6 +22,9 @@ Field = Float64Array | Complex128Array
 # [dBi]; mean gain over the sphere up to which no note is made: files round their values.
 _TOLERANCE_DBI = 2.0
 
+# Horizontal part of a unit vector below which it is rounding: 20 pm at 20 m.
+_POLE = 1e-12
+
 
 def spherical_basis(directions: Float64Array, pole: float = 0.0) -> tuple[Float64Array, Float64Array]:
     """Unit vectors θ̂ and φ̂ of spherical coordinates.
@@ -171,6 +174,8 @@ def radiated_field(
     rotation: Float64Array,
     directions: Float64Array,
     pattern: ElementPattern | None = None,
+    *,
+    arrival: bool = False,
 ) -> Field:
     """Far field of one element, in world axes, Shape ``[P, 3]``; its squared norm is the gain.
 
@@ -179,16 +184,51 @@ def radiated_field(
         rotation: 3×3 matrix that turns the device's axes into world axes.
         directions: Unit vectors from the device outwards, in world axes, Shape ``[P, 3]``.
         pattern: Of the element; None: the one that the array names.
+        arrival: Whether the device receives, which decides the azimuth at a pole (`off_pole`).
 
     Example:
         >>> field = radiated_field(AntennaArray(pattern="dipole"), np.eye(3), np.array([[1.0, 0.0, 0.0]]))
         >>> field.round(3).tolist()  # along θ̂, which points down there
         [[0.0, 0.0, -1.225]]
     """
-    local = directions @ rotation
+    local = off_pole(directions @ rotation, directions, rotation, arrival)
     field = polarized_field(pattern or _formula(array.pattern), array.polarizations[0], local)
     world: Field = field @ rotation.T
     return world
+
+
+def off_pole(
+    local: Float64Array, directions: Float64Array, rotation: Float64Array, arrival: bool
+) -> Float64Array:
+    """Directions in device axes, those at a pole moved off it to the azimuth that both ends of a path mean.
+
+    At a pole of its axes the field of a vertical element has no azimuth, and the sign of a path depends on
+    the choice. It is the limit of a receiver that comes from +x of the world (from +y along paths that are
+    nearly parallel to x): the transmitter sees it on that side, and it sees the transmitter on the other.
+
+    Args:
+        local: Unit vectors in device axes, Shape ``[P, 3]``.
+        directions: The same in world axes, Shape ``[P, 3]``.
+        rotation: 3×3 matrix that turns the device's axes into world axes, or one each, Shape ``[P, 3, 3]``.
+        arrival: Whether the device receives.
+
+    Returns:
+        Shape ``[P, 3]``.
+
+    Example:
+        >>> up = np.array([[0.0, 0.0, 1.0]])
+        >>> [off_pole(up, up, np.eye(3), arrival).tolist() for arrival in (False, True)]
+        [[[1e-12, 0.0, 1.0]], [[-1e-12, -0.0, 1.0]]]
+    """
+    at_pole = np.hypot(local[:, 0], local[:, 1]) <= _POLE
+    if not np.count_nonzero(at_pole):
+        return local
+    side = np.where(np.abs(directions[at_pole, :1]) < 0.8, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    turned = rotation[at_pole] if rotation.ndim == 3 else rotation
+    across = (side[:, None] @ turned)[:, 0, :2] * (-1.0 if arrival else 1.0)
+    moved = local.copy()
+    moved[at_pole, :2] = _POLE * across / np.hypot(across[:, :1], across[:, 1:])
+    return moved
 
 
 def polarized_field(pattern: ElementPattern, polarization: str, local: Float64Array) -> Field:

@@ -27,8 +27,9 @@ from caviar_services.channel.propagation.utd import (
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 
-# Below this horizontal part of a direction Sionna RT sets its azimuth to 0 (100 float32 epsilons).
-_POLE = 1.2e-5
+# Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`, 100 half
+# units of the last place of float32.
+_POLE = 100 * 2.0**-24
 
 _TYPES = np.zeros(17, np.uint8)
 _TYPES[[1, 2, 4, 8]] = (
