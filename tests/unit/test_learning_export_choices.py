@@ -61,7 +61,7 @@ def test_ten_thousand_choices_are_those_of_stable_baselines3(algorithm: str, tmp
     assert len(np.unique(wanted)) > 3, "the network chooses"
 
 
-@pytest.mark.parametrize("keys", [None, ["position"]])
+@pytest.mark.parametrize("keys", [None, pytest.param(["position"], marks=pytest.mark.exhaustive)])
 def test_the_statistics_of_vec_normalize_are_part_of_the_policy(
     keys: list[str] | None, tmp_path: Path
 ) -> None:

@@ -108,7 +108,7 @@ class UavPathV1Env(FlightEnv):
     a detour costs its length.
 
     Args:
-        scenario: Scenario file, or the name of a scenario that ships.
+        scenario: Scenario file, or the name of a scenario that ships; ``uav-path`` unless given.
         vehicle: Name of the flown object; None: the only one.
         reach_m: Distance at which the goal is reached [m].
         box_m: Two corners [m] within which start and goal are drawn; None: the object's bounds.
