@@ -6,6 +6,7 @@ of 100 m to 8 µm.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,28 @@ def random_bodies(rng: np.random.Generator, count: int) -> dict[str, Body]:
             orientation=quaternion_from_euler(*rng.uniform(-np.pi, np.pi, 3) * (1, 0.4, 0.4)),
         )
     return bodies
+
+
+@pytest.mark.parametrize("away", [(5e5, 5e6, 100.0), (1e7, 1e7 / 3, 0.0)])
+def test_images_are_the_same_far_from_the_origin(service: CameraSensors, away: tuple[float, ...]) -> None:
+    near, far = (
+        seen(
+            service,
+            scene_of(
+                {
+                    name: replace(body, position=tuple(np.add(body.position, origin)))
+                    for name, body in random_bodies(np.random.default_rng(3), 24).items()
+                },
+                CameraDevice(name="eye", position=origin, width=96, height=64, field_of_view=1.4),
+            ),
+        )
+        for origin in ((0.0, 0.0, 0.0), away)
+    )
+    assert (near[1].images[0].depth > 0).mean() > 0.05
+    assert np.abs(near[1].images[0].depth - far[1].images[0].depth).max() < 1e-3
+    assert np.array_equal(near[2].images[0].object, far[2].images[0].object)
+    colours = np.abs(near[0].images[0].rgb.astype(int) - far[0].images[0].rgb)
+    assert (colours <= 2).mean() > 0.999
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -13,7 +13,12 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.materials import ItuMaterial, MaterialPolicy, itu_material
+from caviar_services.channel.sionna.materials import (
+    ItuMaterial,
+    MaterialPolicy,
+    MaterialSettings,
+    itu_material,
+)
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.stability.formulas import (
@@ -26,12 +31,17 @@ from caviar_services.channel.stability.formulas import (
 )
 from caviar_services.channel.stability.lab import (
     Array,
+    Lab,
+    Material,
     Plate,
     antenna,
     carriers,
+    link,
     measure,
+    only_reflection,
     scene,
     sionna,
+    square,
     write_scenery,
 )
 from caviar_services.service import Preparation, RunInfo
@@ -262,3 +272,21 @@ def above(model: ChannelModel[Any]) -> tuple[Array, Array]:
 
 def pair(tx: Array, rx: Array) -> Scene:
     return scene([antenna("t", "tx", tx), antenna("r", "rx", rx)])
+
+
+@pytest.mark.parametrize("candidates", ["launched", "enumerated"])
+@pytest.mark.parametrize(
+    ("permittivity", "conductivity", "thickness"), [(1e12, 0.0, 1000.0), (1.0, 1e12, 1000.0), (1e9, 1e9, 0.1)]
+)
+def test_the_greatest_constants_reflect_everything(
+    tmp_path: Path, permittivity: float, conductivity: float, thickness: float, candidates: str
+) -> None:
+    plate = Plate("ground", square(100.0), Material(permittivity, conductivity, thickness))
+    channel = link(Lab(tmp_path).traced(28e9, [plate], candidates=candidates), (0, 0, 10), (20, 0, 2))
+    gain = np.abs(channel.a[0, only_reflection(channel)] / spherical_wave(float(np.hypot(20, 12)), 28e9))
+    assert gain == pytest.approx(1.0, abs=2e-4)
+
+
+def test_constants_beyond_what_float32_can_square_are_refused() -> None:
+    with pytest.raises(msgspec.ValidationError, match="1000000000000"):
+        msgspec.convert({"conductivity_s_per_m": 1e13}, MaterialSettings)

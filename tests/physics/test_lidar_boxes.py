@@ -6,16 +6,19 @@ float32 rounds coordinates of 100 m to 8 µm.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from lidar_world import Body, expected, observed, prepared, scene_of
 
 from caviar_protocol.space.coordinates import Pose, compose, multiply, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import LidarDevice
+from caviar_services.channel.stability.lab import Plate, write_scenery
 from caviar_services.mesh.shapes import box, ply
-from caviar_services.sensors.lidar import LidarSensors, LidarSettings
+from caviar_services.sensors.lidar import GridSettings, LidarSensors, LidarSettings
 
 pytestmark = pytest.mark.channel
 
@@ -54,6 +57,38 @@ def tilted_lidar(rng: np.random.Generator, parent: str = "") -> LidarDevice:
         elevation_max=0.3,
         max_range=200.0,
     )
+
+
+@pytest.mark.parametrize("standing", [False, True])
+@pytest.mark.parametrize("away", [(5e5, 5e6, 100.0), (1e7, 1e7 / 3, 0.0)])
+def test_ranges_and_grid_are_the_same_far_from_the_origin(
+    tmp_path: Path, away: tuple[float, float, float], standing: bool
+) -> None:
+    scans = []
+    for number, origin in enumerate([(0.0, 0.0, 0.0), away]):
+        assets, high = {}, tuple(o + 60.0 for o in origin)
+        if standing:
+            corners = np.array([[45, -40, -9], [45, 40, -9], [45, 40, 9], [45, -40, 9]]) + np.array(origin)
+            folder = tmp_path / str(number)
+            assets = write_scenery(folder, [Plate("wall", corners.tolist())])
+        grid = GridSettings(
+            minimum_m=tuple(o - 60.0 for o in origin), maximum_m=high, cells=(40, 40, 40), min_height_m=-1e3
+        )
+        service = prepared(assets, LidarSettings(bodies_per_asset=32, grid=grid), frozenset({"grid"}))
+        bodies = {
+            name: replace(body, position=tuple(np.add(body.position, origin)))
+            for name, body in random_bodies(np.random.default_rng(3), 12).items()
+        }
+        lidar = tilted_lidar(np.random.default_rng(4))
+        lidar = msgspec.structs.replace(lidar, position=tuple(np.add(lidar.position, origin)))
+        scans.append(observed(service, scene_of(bodies, lidar)).scans[0])
+    near, far = scans
+    both, one, other = np.intersect1d(near.ray, far.ray, return_indices=True)
+    assert len(near.ray) == len(far.ray) == len(both) > 500
+    assert np.abs(near.range[one] - far.range[other]).max() < 1e-3
+    assert near.grid is not None
+    assert far.grid is not None
+    assert np.array_equal(near.grid.occupancy, far.grid.occupancy)
 
 
 @pytest.mark.parametrize("seed", range(6))

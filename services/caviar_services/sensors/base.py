@@ -44,6 +44,10 @@ from caviar_services.service import Frame, Preparation, Prepared, Service, StepR
 NO_HIT = -1
 """Owner of a ray that hits nothing."""
 
+# [m]; where float32 has a step of 0.1 mm. A scene that is nearer to the origin is traced where it is.
+_NEAR = 2048.0
+_CENTRE_STEP = 128.0
+
 
 class SensorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of every sensor service."""
@@ -214,15 +218,18 @@ class Sensors(Service[S]):
         if self.traced is None:
             return
         count = min(1, self._capacity[""])  # a run may allow no boxes
+        x, y, z = self.traced.centre.tolist()
         scene = Scene(
             names=("warm-up box",) * count,
             classes=("box",) * count,
             assets=("",) * count,
-            position=np.zeros((count, 3)),
+            position=np.tile(self.traced.centre, (count, 1)),
             orientation=np.array([[1.0, 0.0, 0.0, 0.0]] * count).reshape(count, 4),
             velocity=np.zeros((count, 3)),
             dimensions=np.full((count, 3), 10.0),
-            devices=self.example_devices(),
+            devices=tuple(
+                msgspec.structs.replace(device, position=(x, y, z)) for device in self.example_devices()
+            ),
         )
         self.traced.update(mi, scene)
         self.observe(mi, self.traced, scene)
@@ -319,9 +326,9 @@ class _Part:
         self._parameters.keep(list(self._keys))
         self._faces = mesh.faces
 
-    def replace(self, mi: Any, mesh: Mesh) -> None:
-        """Put another mesh in place of this one, of any size."""
-        (column,) = aligned_columns(mesh.vertices.reshape(1, -1))
+    def replace(self, mi: Any, mesh: Mesh, centre: Float64Array) -> None:
+        """Put another mesh in place of this one, of any size, counted from a centre."""
+        (column,) = aligned_columns((mesh.vertices - centre).reshape(1, -1))
         self._parameters[self._keys[0]] = mi.Float(column)
         # In most frames the same objects are there: then only vertices move.
         if not np.array_equal(mesh.faces, self._faces):
@@ -344,6 +351,9 @@ def _end_gpu_kernel(*results: Any) -> None:
 
 class TracedScene:
     """Scenery and the bodies of moving objects, for rays. Build and use it under `active_variant`.
+
+    Rays are traced in float32, so positions count from `centre`, near the scene wherever that is: the middle
+    of the scenery, or of the objects where there is none.
 
     What a ray hits has an *owner*: the number of a scenery shape, or of an object, counted after all shapes.
 
@@ -370,13 +380,16 @@ class TracedScene:
         self._scenery: _Part | None = None
         scenery, self._scenery_owner = joined(meshes), _owners(meshes)
         self.scenery_faces = len(scenery.faces)
+        self.centre: Float64Array = np.zeros(3)
+        """Where positions of rays count from [m], Shape ``[3]``; 0 for a scene near the origin."""
         if self.scenery_faces:
-            self._scenery = _Part(mi, "scenery", scenery)
+            self.centre = _centre((scenery.vertices.min(0) + scenery.vertices.max(0)) / 2)
+            self._scenery = _Part(mi, "scenery", Mesh(scenery.vertices - self.centre, scenery.faces))
         self._scenery_normals = _normals(scenery)
         # A triangle without area, within the scene, which no ray can hit: a mesh has one at least.
         place = scenery.vertices.mean(axis=0) if len(scenery.vertices) else np.zeros(3)
         self._nothing = Mesh(np.tile(place, (3, 1)), np.array([[0, 1, 2]], dtype=np.int32))
-        self._moving = _Part(mi, "bodies", self._nothing)
+        self._moving = _Part(mi, "bodies", Mesh(self._nothing.vertices - self.centre, self._nothing.faces))
         self._set_bodies([], [])
 
     def use_meshes(self, bodies: Mapping[str, Mesh]) -> None:
@@ -421,7 +434,9 @@ class TracedScene:
             for index, unit in enumerate(self._body(asset) for asset in scene.assets)
         ]
         self._set_bodies(scene.names, meshes)
-        self._moving.replace(mi, self._joined_bodies)
+        if self._scenery is None:
+            self.centre = _centre(np.median(scene.position, axis=0)) if meshes else np.zeros(3)
+        self._moving.replace(mi, self._joined_bodies, self.centre)
 
     def _set_bodies(self, names: Sequence[str], meshes: list[Mesh]) -> None:
         meshes = meshes or [self._nothing]
@@ -439,7 +454,7 @@ class TracedScene:
 
         Args:
             mi: Mitsuba, with the variant that is active.
-            ray: Rays in world coordinates, as `mitsuba.Ray3f`.
+            ray: Rays whose origins count from `centre`, as `mitsuba.Ray3f`.
 
         Returns:
             Distance [m] and face of each hit, as Dr.Jit arrays that may wait for evaluation; where nothing is
@@ -462,7 +477,7 @@ class TracedScene:
         """Whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
 
         Args:
-            ray: Rays in world coordinates, as `mitsuba.Ray3f`.
+            ray: Rays whose origins count from `centre`, as `mitsuba.Ray3f`.
             active: Which rays are traced, as `mitsuba.Bool`.
             coherent: Whether neighbouring rays take similar ways, which Embree makes use of.
         """
@@ -485,6 +500,12 @@ class TracedScene:
             return False
         around = np.array(point) + 1e-3 * np.concatenate([np.eye(3), -np.eye(3)])
         return all(contains(self._body(asset), place) for place in around / dimensions)
+
+
+def _centre(middle: Float64Array) -> Float64Array:
+    """Where to count from [m], coarse enough to be the same in float32, for a scene about a place."""
+    far: Float64Array = np.where(np.abs(middle) > _NEAR, np.round(middle / _CENTRE_STEP) * _CENTRE_STEP, 0.0)
+    return far
 
 
 def _owners(meshes: list[Mesh]) -> Int32Array:

@@ -187,7 +187,7 @@ def _first_hits(mi: Any, traced: TracedScene, view: View) -> _Hits:
     import drjit as dr
 
     world = _ray_directions(view)
-    origin = np.repeat(np.array(view.pose.position)[:, None], world.shape[1], axis=1)
+    origin = np.repeat((np.array(view.pose.position) - traced.centre)[:, None], world.shape[1], axis=1)
     # Every value is an array, never a Python number: a number becomes part of the kernel, and
     # each new one makes a kernel to compile.
     columns = [mi.Float(column) for column in aligned_columns(np.vstack([origin, world]))]

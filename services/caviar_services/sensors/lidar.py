@@ -70,7 +70,7 @@ class _Returns:
     points: Float32Array
     """In the sensors' axes [m], Shape ``[H, 3]``."""
     world: Float32Array | None
-    """In world axes [m], Shape ``[H, 3]``; None: not asked for."""
+    """In world axes, from `TracedScene.centre` [m], Shape ``[H, 3]``; None: not asked for."""
 
 
 class LidarSensors(Sensors[LidarSettings]):
@@ -143,7 +143,9 @@ class LidarSensors(Sensors[LidarSettings]):
         first = self._rays.first
         bounds = np.searchsorted(returns.ray, first)
         scans = tuple(
-            self._scan(scene, device, pose, returns, slice(*bounds[i : i + 2]), first[i], of_face)
+            self._scan(
+                scene, device, pose, returns, slice(*bounds[i : i + 2]), first[i], of_face, traced.centre
+            )
             for i, (device, pose) in enumerate(sensors)
         )
         return {"lidar": Lidar(object_names=names, scans=scans)}
@@ -157,22 +159,27 @@ class LidarSensors(Sensors[LidarSettings]):
         own: slice,
         first: np.int64,
         object_of_face: Int32Array,
+        centre: Float64Array,
     ) -> LidarScan:
         """The scan of the sensor whose returns are ``own`` and whose rays begin at ``first``."""
         grid = None
-        if self._with_grid and self.settings.grid is not None and returns.world is not None:
+        world: Float32Array | Float64Array | None = returns.world
+        if world is not None and centre.any():
+            world = world + centre
+        if self._with_grid and self.settings.grid is not None and world is not None:
             tx, rx = antenna_positions(scene, device, self.settings.grid)
-            grid = occupancy(returns.world[own], returns.distance[own], tx, rx, self.settings.grid)
+            grid = occupancy(world[own], returns.distance[own], tx, rx, self.settings.grid)
         if not self._with_points:
             own = slice(0)
-        world = returns.world if self.settings.points_world else None
+        if not self.settings.points_world:
+            world = None
         return LidarScan(
             sensor=device.name,
             position=pose.position,
             orientation=pose.orientation,
             ray=returns.ray[own] - np.int32(first),
             points=returns.points[own],
-            points_world=None if world is None else world[own],
+            points_world=None if world is None else world[own].astype(np.float32),
             range=returns.distance[own],
             object=object_of_face[returns.face[own]],
             grid=grid,
@@ -240,7 +247,9 @@ def _trace(
         return [row[0] * local[0] + row[1] * local[1] + row[2] * local[2] for row in rows]
 
     # Poses and ranges as columns by sensor, gathered by ray: one kernel for any number of sensors.
-    mounts = [mi.Float64(row) for row in aligned_doubles(_mounts(sensors)[:, several(len(sensors))])]
+    mounts = [
+        mi.Float64(row) for row in aligned_doubles(_mounts(sensors, traced.centre)[:, several(len(sensors))])
+    ]
     of_ray = [dr.gather(mi.Float64, row, rays.sensor) for row in mounts[9:]]
     direction = turned(rays.local, rays.sensor)
     ray = mi.Ray3f(mi.Point3f(*map(mi.Float, of_ray[:3])), mi.Vector3f(*map(mi.Float, direction)))
@@ -275,12 +284,17 @@ def _trace(
     )
 
 
-def _mounts(sensors: list[tuple[LidarDevice, Pose]]) -> Float64Array:
-    """Of sensors, the rotation matrix, row by row, position [m], least and greatest range [m], Shape
-    ``[14, S]``."""
+def _mounts(sensors: list[tuple[LidarDevice, Pose]], centre: Float64Array) -> Float64Array:
+    """Of sensors, the rotation matrix, row by row, position from a centre [m], least and
+    greatest range [m], Shape ``[14, S]``."""
     return np.array(
         [
-            [*rotation_matrix(pose.orientation).ravel(), *pose.position, device.min_range, device.max_range]
+            [
+                *rotation_matrix(pose.orientation).ravel(),
+                *(np.array(pose.position) - centre),
+                device.min_range,
+                device.max_range,
+            ]
             for device, pose in sensors
         ]
     ).T
@@ -384,7 +398,7 @@ def quantised(points: Float64Array, settings: GridSettings) -> Int64Array:
 
 
 def occupancy(
-    points: Float32Array,
+    points: Float32Array | Float64Array,
     distance: Float32Array,
     tx: Sequence[Vector],
     rx: Sequence[Vector],

@@ -133,7 +133,7 @@ class Painter:
         mi = self._mi
         px, py, turn = (mi.Float(column) for column in aligned_columns(np.stack([x, y, index])))
         direction = self._directions(view, px, py)
-        origin = _opaque(mi.Point3f, view.pose.position)
+        origin = _opaque(mi.Point3f, (np.array(view.pose.position) - self._traced.centre).tolist())
         distance, face = self._traced.intersect(mi, mi.Ray3f(origin, direction))
         hit = dr.isfinite(distance)
         table = [dr.gather(mi.Float, column, face, hit) for column in self._table]

@@ -177,9 +177,9 @@ constants of the nearest end of a range; or follow the power law of that range b
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What to change about a material of the scenery; what is not given stays."""
 
-    # At most 1e30: fields of constants beyond float32 are NaN, and paths by way of the surface are lost.
-    relative_permittivity: Annotated[float, quantity("1", "its real part", ge=1, le=1e30)] | None = None
-    conductivity_s_per_m: Annotated[float, quantity("S/m", "its conductivity", ge=0, le=1e30)] | None = None
+    # At most 1e12, where |R| is 1 to 1e-5: beyond it squares leave float32, and reflections are lost.
+    relative_permittivity: Annotated[float, quantity("1", "its real part", ge=1, le=1e12)] | None = None
+    conductivity_s_per_m: Annotated[float, quantity("S/m", "its conductivity", ge=0, le=1e12)] | None = None
     scattering_coefficient: (
         Annotated[float, quantity("1", "share of the reflected amplitude that is scattered", ge=0, le=1)]
         | None

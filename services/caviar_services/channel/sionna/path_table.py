@@ -27,8 +27,7 @@ from caviar_services.channel.propagation.utd import (
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 
-# Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`, 100 half
-# units of the last place of float32.
+# Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`.
 _POLE = 100 * 2.0**-24
 
 _TYPES = np.zeros(17, np.uint8)

@@ -15,6 +15,7 @@ adaptive ladder mostly do.
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -32,7 +33,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.fresnel import Media
+from caviar_services.channel.propagation.fresnel import EPSILON_0, Media
 from caviar_services.channel.sionna.body_pool import BodyPool, own_materials
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
@@ -70,6 +71,9 @@ from caviar_services.mesh.shapes import Mesh, placed, unit_box
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]
+
+# [rad]; a phase of 2e9 in a slab is NaN.
+_MOST_PHASE = 5e8
 
 _SKIN = "caviar-body"
 _NOTHING = "caviar-nothing"
@@ -223,6 +227,20 @@ class SionnaScene(NumberedTriangles):
                 for name, itu, constants in used
                 if itu.is_outside
             )
+        self._limit_thickness()
+
+    def _limit_thickness(self) -> None:
+        """Make no slab so thick that the ray tracer, in float32, has no sine of the phase in it: paths by
+        way of it would be NaN, and lost."""
+        for carrier, (frequency, _) in enumerate(self._carriers):
+            self.tune(carrier)
+            for material in {id(shape.material): shape.material for shape in self._shapes}.values():
+                permittivity, conductivity = _constants(material)
+                eta = abs(complex(permittivity, conductivity / (2 * math.pi * frequency * EPSILON_0)))
+                most = _MOST_PHASE * SPEED_OF_LIGHT / (2 * math.pi * frequency * math.sqrt(eta))
+                if float(material.thickness[0]) > most:
+                    material.thickness = most
+        self.tune(0)
 
     @property
     def mi_scene(self) -> Any:
