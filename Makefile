@@ -57,8 +57,16 @@ test-all: lint ## The same and the long forms: the documentation, a million fuzz
 	  (cd deploy && docker-compose build --quiet) || echo "the images of deploy/ were not built"; fi
 	@$(BIN)/pytest --all --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder --durations=20 $(TESTS)
 
-docs: setup ## Render the documentation; build/docs/index.html opens without a server
-	@$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --jobs=auto -c docs . build/docs
+# The environment of the tests has what documentation needs; where there is none, one without PyTorch is made.
+DOCS     := $(if $(wildcard $(STAMP)),$(BIN),.venvs/docs/bin)
+
+.venvs/docs/bin/sphinx-build: pyproject.toml
+	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(or $(PYTHON),python3)) -m venv .venvs/docs
+	@.venvs/docs/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
+
+docs: $(DOCS)/sphinx-build ## Render the documentation; build/docs/index.html opens without a server
+	@$(DOCS)/sphinx-build --quiet --fail-on-warning --keep-going --jobs=auto -c docs . build/docs
 	@echo "build/docs/index.html"
 
 doctor: setup ## What this machine has, and what mends what it lacks

@@ -56,7 +56,7 @@ maximum_signature_line_length = 88
 
 # --- HTML ---
 html_theme = "furo"
-html_title = "CAVIAR"
+html_title = f"CAVIAR {release}"
 html_static_path = ["_static"]
 html_css_files = ["caviar.css"]
 html_copy_source = False

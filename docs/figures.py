@@ -10,9 +10,9 @@ and a single figure, by table, row and column, within a sentence::
 
     about <!-- figure: keyframes | siso-rt 1e5 d3, keyframes every 2 | NMSE dB -->−7.4<!-- end --> dB
 
-``python docs/figures.py measure [NAME …]`` runs the commands that tables come from, and takes
-these over: in a short form of minutes, or in the long one with ``--full``. ``python docs/figures.py record
-NAME FILE`` takes over a single table from the Markdown that a command wrote (``caviar stability --markdown``,
+``python docs/figures.py measure [NAME …]`` runs the commands that tables come from, and takes these over: in
+a short form of minutes, or in the long one with ``--full``. ``python docs/figures.py record NAME FILE`` takes
+over a single table from the Markdown that a command wrote (``caviar measure stability --markdown``,
 ``tests/bench``), and ``python docs/figures.py render`` writes into all pages what the file says. A test
 compares pages and file.
 """
@@ -39,7 +39,7 @@ FOLDERS = ("docs", "protocol", "broker", "services", "clients", "deploy", "examp
 CODE = ("protocol/*.py", "broker/*.py", "services/*.py", "clients/*.py", "deploy/*.toml", "tests/bench/*.py")
 """What figures depend on."""
 
-_BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar tradeoff street-canyon"
+_BENCH, _CAVIAR = "python tests/bench/bench_enumerated.py", "caviar measure tradeoff street-canyon"
 _BASE = "'siso-rt enumerated d3'"
 _STATED = "python tests/bench/bench_stated_errors.py"
 _BROKER = "python tests/bench/bench_broker.py --services 2 4 8 --kinds bare broker --transport tcp ipc"
@@ -156,8 +156,8 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         {"quadrotor-frames": ""},
     ),
     "stability": Measurement(
-        "caviar stability --markdown {out}/stability.md",
-        "caviar stability --markdown {out}/stability.md",
+        "caviar measure stability --markdown {out}/stability.md",
+        "caviar measure stability --markdown {out}/stability.md",
         "stability.md",
         {"stability": ""},
     ),

@@ -32,7 +32,7 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.codec import encode_message
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import RunError
-from caviar_protocol.host import host_identity, steady_memory
+from caviar_protocol.host import PYTHON, host_identity, steady_memory
 from caviar_protocol.keys import BROKER, BROKER_KEY_VARIABLE, KEY_VARIABLE, Pair, credentials, write_pair
 from caviar_protocol.messages import Input, Role
 
@@ -159,7 +159,7 @@ def _clients(
     topology: Topology, services: int, payload: int, endpoint: str, keys: Path | None
 ) -> Iterator[None]:
     """The clients as processes; none of them outlives the block."""
-    command = [sys.executable, "-m", CLIENT, topology, str(services)]
+    command = [*PYTHON, "-m", CLIENT, topology, str(services)]
     # Keys that the caller has for another broker are none of this one's.
     environment = {k: v for k, v in os.environ.items() if k not in (KEY_VARIABLE, BROKER_KEY_VARIABLE)}
     if keys is not None:

@@ -218,7 +218,7 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, .
     if arguments.scenario is None or arguments.directory is None:
         raise RunError("give a scenario and a --directory, or --resume with the directory of a run")
     scenario = with_overrides(
-        load_scenario(arguments.scenario), arguments.frames, arguments.seed, arguments.pace
+        load_scenario(arguments.scenario, arguments.set), arguments.frames, arguments.seed, arguments.pace
     )
     scenario = with_airsim(scenario, arguments.airsim)
     directory = _made(arguments.directory)
@@ -302,6 +302,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--frames", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--pace", default=None, help="instead of the scenario's: free, realtime or a factor")
+    found.add_argument("--set", action="append", default=[], help="KEY=VALUE, instead of the scenario's")
     found.add_argument("--airsim", default="", help="HOST:PORT: scripts for AirSim fly the objects")
     found.add_argument(
         "--restarted", action="store_true", help="started again whenever its status is not 0: 0 after SIGTERM"

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import caviar_clients.envs as _registered  # noqa: F401
+from caviar_protocol.space.beams import beam_gains, best_pairs
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.reader import Dataset
     from caviar_protocol.recording import Recording
     from caviar_protocol.scenario import Scenario
 
-__all__ = ["dataset", "load_scenario", "open", "run"]
+__all__ = ["beam_gains", "best_pairs", "dataset", "load_scenario", "open", "run"]
 
 
 def load_scenario(scenario: str | Path) -> Scenario:
@@ -60,7 +61,8 @@ def run(
 ) -> Path:
     """Run a scenario to its end, as ``caviar run`` does.
 
-    Call it from the main thread: for the time of the run it handles Ctrl-C, which ends the run in order.
+    In the main thread it handles Ctrl-C for the time of the run, which ends in order. In another one, as of
+    ``asyncio.to_thread``, Ctrl-C is the program's, and the run goes on.
 
     Args:
         scenario: Name of a scenario that ships, or a TOML file.
@@ -120,7 +122,7 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
 
 
 def dataset(path: str | Path) -> Dataset:
-    """Open a dataset that ``caviar generate`` wrote.
+    """Open a dataset that ``caviar dataset generate`` wrote.
 
     Args:
         path: Folder of the dataset, or its address (``s3://bucket/s008``).

@@ -1,6 +1,10 @@
 """The `caviar` command, and ``python -m caviar_clients``."""
 
-from __future__ import annotations
+import sys
+
+# Before any other import: `python -m` finds the current folder before the standard library.
+if __name__ == "__main__" and not sys.flags.safe_path:
+    del sys.path[0]
 
 import os
 import signal

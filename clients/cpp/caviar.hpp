@@ -639,6 +639,7 @@ Scene names:[str]! classes:[str]! assets:[str]! position:<f8[N,3]! orientation:<
   angular_velocity:<f8[N,3]?
 AntennaDevice#antenna name:str! parent:str="" position:Vector3=[0.0,0.0,0.0]
   orientation:Quaternion=[1.0,0.0,0.0,0.0] role:tx|rx|both! array:AntennaArray=@ power_dbm:float=0.0
+  carriers:[str]=[]
 LidarDevice#lidar name:str! parent:str="" position:Vector3=[0.0,0.0,0.0]
   orientation:Quaternion=[1.0,0.0,0.0,0.0] beams:int>=1<=1024=64 azimuth_steps:int>=1<=36000=1800
   elevation_min:float=-0.4363323129985824 elevation_max:float=0.05235987755982989
@@ -655,6 +656,7 @@ Channel rung:str! options:ChannelOptions=@ expected_error_db:float? carriers:[Ca
   aod:<f8[P,2]! aoa:<f8[P,2]! doppler:<f8[C,P]! interactions:|u1[P,D]! points:<f8[P,D,3]!
   objects:<i4[P,D]! h:[ChannelMatrix]=[] dropped:int>=0=0 hf:[ChannelResponse]=[]
   taps:[ChannelTaps]=[] error_bound_db:<f8[T,R]? error_reference:str=""
+  used:|b1[C,T,R]?
 Carrier name:str! frequency_hz:float>0! bandwidth_hz:float>0=100000000.0 subcarriers:int>=0<=65536=0
   subcarrier_spacing_hz:float>=0=0.0 taps:int>=0<=65536=0 slots:int>=1<=65536=1
   slot_duration_s:float>=0=0.0
@@ -680,8 +682,8 @@ SegmentationImage sensor:str! intrinsics:Intrinsics! position:Vector3! orientati
 Intrinsics fx:float! fy:float! cx:float! cy:float!
 Action commands:[BeamChoice/WaypointCommand/VelocityCommand/UserSchedule/PathCommand/AttitudeCommand/DriveCommand/SignalCommand]!
 BeamChoice#beam tx:str! rx:str! tx_beam:int>=0! rx_beam:int>=0=0 carrier:str=""
-WaypointCommand#waypoint object:str! position:Vector3! speed:float>0! at_once:bool=false
-VelocityCommand#velocity object:str! velocity:float*3!
+WaypointCommand#waypoint object:str! position:Vector3! speed:float>0! at_once:bool=false yaw:float?
+VelocityCommand#velocity object:str! velocity:float*3! yaw:float? yaw_rate:float?
 PathCommand#path object:str! points:[Vector3]! speed:float>0!
 AttitudeCommand#attitude object:str! orientation:Quaternion! thrust:float>=0!
 DriveCommand#drive object:str! speed:float>=0? lane:int>=0? route:[str]=[] stop:RoadStop?
@@ -1489,6 +1491,8 @@ class Mounts {
     };
     if (kind == "antenna") {
       found.set("role", spec["role"]).set("array", array(spec["array"])).set("power_dbm", spec["power_dbm"]);
+      const Value& carriers = spec["carriers"];  // nil from a broker of an earlier version
+      found.set("carriers", carriers.kind() == Value::Kind::list ? carriers : Value::list());
     } else if (kind == "lidar") {
       found.set("beams", spec["beams"]).set("azimuth_steps", spec["azimuth_steps"]);
       found.set("elevation_min", angle("elevation_deg", 0)).set("elevation_max", angle("elevation_deg", 1));
@@ -1813,6 +1817,7 @@ struct Command {
   double speed = 0.0;    // at most [m/s]
   bool at_once = false;  // be there in this frame, at rest
   Vector3 velocity{};    // [m/s]
+  Value yaw, yaw_rate;   // waypoint, velocity [rad, rad/s]; none: along the course
   Value fields;          // all of them, and those of other kinds: path, attitude, drive, signal
 };
 
@@ -1834,6 +1839,7 @@ inline std::vector<Command> commands_of(const Value& action, const std::string& 
     command.object = value["object"].text(), command.position = value["position"].numbers<3>();
     command.speed = value["speed"].number(), command.at_once = value["at_once"].boolean();
     command.velocity = value["velocity"].numbers<3>();
+    command.yaw = value["yaw"], command.yaw_rate = value["yaw_rate"];
     found.push_back(std::move(command));
   }
   return found;

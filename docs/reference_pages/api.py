@@ -22,8 +22,9 @@ PACKAGES = ("caviar", "caviar_protocol", "caviar_broker", "caviar_services", "ca
 """Import packages; those that are not installed are left out."""
 
 _HEAD = """\
-Every public module, from its docstrings; a page for each package. Tutorials and how-to guides name what a
-user needs; [CONTRIBUTING](../../../CONTRIBUTING.md) says where contributors begin.
+Programs and notebooks begin with [caviar](caviar.rst): `run`, `open`, `dataset`. Agents, worlds, channels and
+sensors of your own subclass the bases of [caviar_services](caviar_services.rst). The other pages have every
+public module, from its docstrings; [CONTRIBUTING](../../../CONTRIBUTING.md) says where contributors begin.
 """
 
 

@@ -21,10 +21,9 @@ def pages() -> Iterator[tuple[str, str]]:
     root: Any = typer.main.get_command(app)
     context = root.context_class(root, info_name="caviar")
     groups: dict[str, list[tuple[str, str]]] = {}
-    for name in root.list_commands(context):
+    for name in root.list_commands(context):  # without the hidden ones, which are former names
         command = root.get_command(context, name)
-        group = getattr(command, "rich_help_panel", None) or "Commands"
-        groups.setdefault(group, []).append((name, command.get_short_help_str(400)))
+        groups.setdefault(command.rich_help_panel, []).append((name, command.get_short_help_str(400)))
         yield f"{name}.md", "\n".join(_command(command, context, f"caviar {name}", 1))
     lines = ["# Commands", "", "What `caviar COMMAND -h` prints of every command.", ""]
     for group, found in groups.items():

@@ -71,7 +71,7 @@ def _keys(cls: type[msgspec.Struct], inner: Structs) -> Iterator[str]:
     if not found:
         yield from ("It has no settings.", "")
         return
-    yield from table(("key", "type", "unit", "default", "meaning"), found)
+    yield from table(("key", "meaning", "type", "unit", "default"), found)
     inner |= {struct.__name__: struct for struct in structs_below([cls]) if struct is not cls}
 
 
@@ -80,7 +80,8 @@ def _key(name: str, kind: str, unit: str, default: str, _: str, meaning: str) ->
     # Numbers of five digits and more with commas, as in prose.
     kind = re.sub(r"\b(\d{5,})(?:\.0)?\b", lambda number: f"{int(number[1]):,}", kind)
     plain = default in ("required", "left out", "all defaults")
-    return f"`{name}`", kind, "" if unit == "1" else unit, default if plain else f"`{default}`", meaning
+    sentence = meaning[:1].upper() + meaning[1:] + ("" if meaning.endswith((".", ":")) else ".")
+    return f"`{name}`", sentence, kind, "" if unit == "1" else unit, default if plain else f"`{default}`"
 
 
 def _nested(inner: Structs) -> Iterator[str]:

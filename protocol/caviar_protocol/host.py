@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -133,6 +134,22 @@ class SignOfLife:
         # A file that cannot be written is no reason to end a run: the health check says so.
         with contextlib.suppress(OSError):
             self._path.touch()
+
+
+PYTHON = (sys.executable, "-P")
+"""This interpreter, for ``-m`` and ``-c``: without ``-P`` both find the current folder before the standard
+library, and a file ``signal.py`` there in its place."""
+
+
+@contextlib.contextmanager
+def safe_path() -> Iterator[None]:
+    """A block in which `multiprocessing` starts processes as with ``-P``, for which it has no option."""
+    before = os.environ.get("PYTHONSAFEPATH", "")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        os.environ["PYTHONSAFEPATH"] = before  # empty is not set
 
 
 DISTRIBUTION = "caviar-sim"

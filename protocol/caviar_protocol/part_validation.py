@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 from caviar_protocol.arrays import Payload
-from caviar_protocol.scenario.schema import DeviceSpec, carries
+from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.topics import (
     Carrier,
     Channel,
@@ -80,7 +80,8 @@ class PartCheck:
         return ""
 
     def _shapes(self, channel: Channel) -> dict[str, dict[Indices, tuple[int | None, ...]]]:
-        axes = channel.carriers, channel.tx, channel.rx
+        used = None if channel.used is None else channel.used.tobytes()
+        axes = channel.carriers, channel.tx, channel.rx, used
         if self._expected[0] != axes:
             nt, nr = ([self._size(name) for name in names] for names in (channel.tx, channel.rx))
             found: dict[str, dict[Indices, tuple[int | None, ...]]] = {part: {} for part in _BINS}
@@ -91,7 +92,8 @@ class PartCheck:
                         continue
                     for t, transmitting in enumerate(nt):
                         for r, receiving in enumerate(nr):
-                            found[part][c, t, r] = (*bins, receiving, transmitting)
+                            if channel.uses(c, t, r):
+                                found[part][c, t, r] = (*bins, receiving, transmitting)
             self._expected = axes, found
         return self._expected[1]
 
@@ -99,7 +101,7 @@ class PartCheck:
         """Elements of a device's array by the scenario."""
         if name not in self._sizes:
             self._sizes[name] = next(
-                (_elements(spec) for spec in self._devices if _is_made_by(spec, name)), None
+                (_elements(spec) for spec in self._devices if is_made_by(spec, name)), None
             )
         return self._sizes[name]
 
@@ -150,14 +152,6 @@ def _has_shape(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool
 def _pair_name(place: Indices, channel: Channel) -> str:
     c, t, r = place
     return f"{channel.tx[t]} → {channel.rx[r]} on {channel.carriers[c].name!r}"
-
-
-def _is_made_by(spec: DeviceSpec, name: str) -> bool:
-    """Whether a device of a scene is one that the scenario says is made by ``spec``."""
-    if not spec.on:
-        return name == spec.name
-    ending = f"/{spec.name}"
-    return name.endswith(ending) and carries(spec, name.removesuffix(ending))
 
 
 def _elements(spec: DeviceSpec) -> int:

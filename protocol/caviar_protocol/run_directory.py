@@ -113,8 +113,8 @@ def runs_below(folder: str | Path) -> str:
         first = min((dataset / "episodes").glob("episode-*"), default=None)
         if first is not None and (dataset / "catalogue.sqlite").is_file():
             return (
-                f"; {dataset} is a dataset: give an episode of it, as {first}; caviar verify {dataset} and "
-                f"caviar look {dataset} look at all"
+                f"; {dataset} is a dataset: give an episode of it, as {first}; caviar dataset verify "
+                f"{dataset} and caviar dataset look {dataset} look at all"
             )
     try:
         newest = newest_run(folder)

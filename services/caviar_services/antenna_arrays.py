@@ -14,7 +14,7 @@ it points to: a receiver combines with ``w = c_k``, a transmitter precodes with 
 one index means one direction at both ends. With eq. (1) of the paper, ``y = w* H f``, a single path of
 amplitude a that lies on both grids gives ``|y| = sqrt(Nr·Nt)·|a|``. The codebook of an array with several
 subarrays is that of each of them, block by block: a beam has the elements of one panel and one
-polarization. The link's sweep (`link.beam_sweep.sweep`) is a Fourier transform and forms no codebook;
+polarization. |y| of all pairs (`space.beams.beam_gains`) is a Fourier transform, without a codebook;
 `tests/unit/test_link_beam_sweep_search.py` holds the two against each other.
 """
 

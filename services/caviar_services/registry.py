@@ -16,7 +16,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -26,7 +26,7 @@ from typing import Any, get_args
 import msgspec
 
 from caviar_protocol.errors import DeclarationError, suggestion
-from caviar_protocol.messages import Role
+from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
 from caviar_services.service import NoSettings, Service
 
@@ -92,6 +92,22 @@ def registered() -> dict[str, str]:
             )
         found[point.name] = point.value
     return found
+
+
+def with_inputs(cls: type[Service[Any]], inputs: Sequence[Input]) -> type[Service[Any]]:
+    """The class with further inputs (`Service.inputs_with`); itself where there are none.
+
+    Args:
+        cls: An implementation.
+        inputs: What it consumes beside its own.
+
+    Example:
+        >>> grids = (Input(topic="lidar", parts=("grid",)),)
+        >>> [entry.topic for entry in with_inputs(load("agent", "policy"), grids).inputs]
+        ['scene', 'link', 'lidar']
+    """
+    more = {"inputs": (*cls.inputs, *inputs), "__module__": cls.__module__}
+    return type(cls.__name__, (cls,), more) if inputs else cls
 
 
 def load(role: str, name: str) -> type[Service[Any]]:

@@ -29,7 +29,7 @@ from caviar_protocol.errors import CaviarError, ProtocolError, RunError
 from caviar_protocol.host import host_identity, steady_memory
 from caviar_protocol.keys import Credentials
 from caviar_protocol.keys import credentials as find_credentials
-from caviar_protocol.messages import RUN_COMPLETE, STOPPED_BY
+from caviar_protocol.messages import RUN_COMPLETE, STOPPED_BY, Input
 from caviar_services.connection import (
     Connection,
     Disconnected,
@@ -39,7 +39,7 @@ from caviar_services.connection import (
     UnansweredError,
     describe,
 )
-from caviar_services.registry import find_modules_in, load
+from caviar_services.registry import find_modules_in, load, with_inputs
 from caviar_services.service import Service
 from caviar_services.session import ServiceSession
 
@@ -320,6 +320,7 @@ def serve(
     *,
     restarted: bool = False,
     modules: Sequence[Path] = (),
+    inputs: Sequence[Input] = (),
 ) -> int:
     """Run one service in this process.
 
@@ -333,6 +334,7 @@ def serve(
         broker_key: File with the public key of the broker; None: that of the environment, if any.
         restarted: Whether a supervisor starts this process again whenever its status is not 0.
         modules: Folders in which the module is looked for, too.
+        inputs: What the implementation consumes by its settings (`Service.inputs_with`).
 
     Returns:
         The exit status of the process; what is wrong is written to standard error.
@@ -343,14 +345,13 @@ def serve(
     if not separator:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
         return 2
-    if ":" in implementation:
-        for folder in (*modules, Path.cwd()):
-            find_modules_in(folder)
+    for folder in (*modules, *[Path.cwd()] * (":" in implementation)):
+        find_modules_in(folder)
     steady_memory()
     try:
         found = find_credentials(key, broker_key)
         termination = SignalTermination(0 if restarted else TERMINATED)
-        cls = load(role, implementation)
+        cls = with_inputs(load(role, implementation), inputs)
         runner = Runner(name, cls, implementation, broker, connect_timeout_s, termination, credentials=found)
         status = runner.run()
     except CaviarError as error:
@@ -399,9 +400,17 @@ def main() -> int:
         "0 after SIGTERM",
     )
     parser.add_argument(
+        "--inputs",
+        nargs="+",
+        default=[],
+        metavar="TOPIC[.PART]",
+        help="what the implementation consumes by its settings, as a policy that observes lidar.grid",
+    )
+    parser.add_argument(
         "--modules", type=Path, action="append", default=[], help="folder of the module of ROLE:module:Class"
     )
     arguments = parser.parse_args()
+    inputs = [text.partition(".") for text in arguments.inputs]
     return serve(
         arguments.name,
         arguments.use,
@@ -411,4 +420,5 @@ def main() -> int:
         arguments.broker_key,
         restarted=arguments.restarted,
         modules=arguments.modules,
+        inputs=[Input(topic=topic, parts=(part,) if part else ()) for topic, _, part in inputs],
     )

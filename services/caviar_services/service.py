@@ -256,6 +256,15 @@ class Service(ABC, Generic[S]):
         """
         return cls.changes_geometry
 
+    @classmethod
+    def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
+        """What the implementation consumes beside `inputs`, by its settings.
+
+        Args:
+            settings: As they stand in the scenario.
+        """
+        return ()
+
     @property
     def needs_assets(self) -> bool:
         """Whether the assets of the run are fetched before `prepare`: where the class uses scenery, or what

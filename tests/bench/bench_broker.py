@@ -8,7 +8,8 @@ made in it, and each of them takes what the hub made in the frame before. The ki
 by round, so that a machine's moods fall on all of them; ratios are medians of the ratios within each round.
 
 - *bare*: a ROUTER loop that knows nothing but this pattern, and DEALER clients that send bytes back;
-- *broker*: `caviar bench broker`: frame clock, deadlines, journal, latency record, clients of the protocol;
+- *broker*: `caviar measure bench broker`: frame clock, deadlines, journal, latency record, clients of the
+  protocol;
 - *helics*, *mosaik*: where they are installed (``pip install helics mosaik``);
 - *helics-lagged*: the hub too takes what was made in the frame before, which is less: none waits for it.
 
@@ -143,7 +144,7 @@ def received(socket: zmq.Socket[bytes]) -> list[Any]:
 
 
 def broker(services: int, payload: int, frames: int, wire: str) -> float:
-    """The broker of `caviar bench broker`, in a process of its own, like the bare loop."""
+    """The broker of `caviar measure bench broker`, in a process of its own, like the bare loop."""
     command = [sys.executable, __file__, "--broker", *map(str, (services, payload, frames)), wire]
     done = subprocess.run(command, stdout=subprocess.PIPE, timeout=600, check=True)
     return float(done.stdout)

@@ -101,7 +101,9 @@ static Value of(const caviar::Command& command) {
                      {"position", command.position},
                      {"speed", command.speed},
                      {"at_once", command.at_once},
-                     {"velocity", command.velocity}});
+                     {"velocity", command.velocity},
+                     {"yaw", command.yaw},
+                     {"yaw_rate", command.yaw_rate}});
 }
 
 static Value of(const caviar::LinkUser& user) {

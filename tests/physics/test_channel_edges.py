@@ -76,7 +76,7 @@ def test_a_corner_is_the_same_where_one_mesh_divides_the_border_and_the_other_do
 
 
 def test_enumerated_paths_are_continuous_in_steps_of_a_micrometre(tmp_path: Path) -> None:
-    """As launched ones are (`caviar stability`): across the line at which light ends, and that at which a
+    """As launched ones are (`measure stability`): across the line at which light ends, and that at which a
     wall's reflection ends, H changes by less than 3 % of free space from step to step; light ends once."""
     model = corner(tmp_path, Plate("one", ONE), Plate("other", OTHER), candidates="enumerated")
     steps = (np.arange(-60, 60) + 0.3) * 1e-6
@@ -113,7 +113,7 @@ def walk(folder: Path, steps: int, frames: int, candidates: str) -> tuple[int, i
 @pytest.mark.parametrize("candidates", ["launched", "enumerated"])
 def test_ids_stay_with_their_edges_over_ten_thousand_steps(tmp_path: Path, candidates: str) -> None:
     """From step to step, 4 mm on, no path is suddenly 30 cm away: edges are farther apart than that. The
-    long form of a case of `caviar stability`."""
+    long form of a case of `caviar measure stability`."""
     lived, swapped = walk(tmp_path, 10_000, 20, candidates)
     assert lived > 45_000
     assert swapped == 0

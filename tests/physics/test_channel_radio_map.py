@@ -273,7 +273,9 @@ def test_air_absorbs() -> None:
 
 
 def test_memory_that_does_not_do_names_cells_that_would(nothing: SionnaChannel) -> None:
-    devices = transmitters_of(scene([antenna("bs", "tx", (0, 0, 10), AntennaArray(columns=64))]), "here")
+    devices = transmitters_of(
+        scene([antenna("bs", "tx", (0, 0, 10), AntennaArray(columns=64))]), "here", "mm"
+    )
     fine, memory = level_surface((0, 0, 1000, 1000), 1.0, 1.5), 2**28
     with pytest.raises(RunError, match=r"1000 × 1000 cells of 1 m and 64 beams need .* cells of 2\.\d m"):
         rays_at_once(fine, devices, "best", RAYS, memory)

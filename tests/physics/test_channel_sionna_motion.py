@@ -206,6 +206,20 @@ def test_parked_bodies_and_receivers_do_not_matter(tmp_path: Path) -> None:
     assert (one.interactions == Interaction.TRANSMISSION).any()
 
 
+@pytest.mark.parametrize("settings", [{}, {"candidates": "enumerated"}], ids=["launched", "enumerated"])
+def test_more_objects_than_bodies_have_bodies_made(tmp_path: Path, settings: dict[str, Any]) -> None:
+    """The channel is that of a pool which was large enough, in the frame that is short and in those after."""
+    assets = write_scenery(tmp_path, [GROUND, WALL])
+    small = sionna(F, assets, bodies=1, max_depth=2, **settings)
+    large = sionna(F, assets, bodies=24, max_depth=2, **settings)
+    for count in (1, 3, 7, 2):
+        frame = traffic(count)
+        one, other = measure(small, frame), measure(large, frame)
+        assert np.array_equal(one.id, other.id)
+        assert np.array_equal(one.offsets, other.offsets)
+        assert (np.abs(one.a - other.a) < 1e-4 * np.abs(one.a)).all()
+
+
 def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
     """Launches of two receivers each give the paths of one launch of all."""
     assets = write_scenery(tmp_path, [GROUND, WALL])

@@ -1,4 +1,4 @@
-"""Every case of `caviar stability` is right, and the table in the documentation shows them all."""
+"""Every case of `caviar measure stability` is right, and the table in the documentation shows them all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``caviar generate`` with real processes: kills, other numbers of workers, a scheduler that comes back."""
+"""``caviar dataset generate`` with real processes: kills, numbers of workers, a scheduler that comes back."""
 
 from __future__ import annotations
 
@@ -7,20 +7,26 @@ import os
 import signal
 import socket
 import sqlite3
+import ssl
 import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
 import pytest
+from distributed import Security
 
 import caviar
 from caviar_clients.datasets import cluster_watch
+from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.generate import Outcome
 from caviar_clients.datasets.generate import generate as generate_dataset
 from caviar_clients.datasets.plan import plan_dataset
@@ -29,7 +35,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.scenario import load_scenario
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
-COMMAND = (sys.executable, "-m", "caviar_clients", "generate")
+COMMAND = (sys.executable, "-m", "caviar_clients", "dataset", "generate")
 EPISODES = 16
 
 
@@ -163,6 +169,36 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def test_processes_of_this_machine_answer_no_other_user() -> None:
+    stranger = Security.temporary().get_connection_args("client")["ssl_context"]
+    stranger.verify_mode = ssl.CERT_NONE  # it takes any scheduler for its own
+    with Episodes(1) as episodes:
+        about = episodes._connected.scheduler_info()
+        (worker,) = about["workers"].values()
+        for address in (about["address"], worker["nanny"], *about["workers"]):
+            with socket.create_connection(address_of("tls", address), timeout=10) as tcp:
+                tcp.sendall(b"GET / HTTP/1.0\r\n\r\n")
+                with pytest.raises(ConnectionResetError):
+                    tcp.recv(1)
+            with (
+                socket.create_connection(address_of("tls", address), timeout=10) as tcp,
+                pytest.raises(ssl.SSLError, match="UNKNOWN_CA"),
+                stranger.wrap_socket(tcp) as tls,
+            ):
+                tls.recv(1)
+        for host, services in ((about["address"], about["services"]), (worker["nanny"], worker["services"])):
+            page = f"http://{address_of('tls', host)[0]}:{services['dashboard']}/info/main/workers.html"
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(page, timeout=10)
+
+
+def address_of(scheme: str, text: str) -> tuple[str, int]:
+    """Host and port of an address of Dask, which has to be of a scheme."""
+    found = urlsplit(text)
+    assert (found.scheme, found.hostname) == (scheme, "127.0.0.1")
+    return found.hostname, found.port
 
 
 @pytest.mark.slow

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scenarios_support import ROOT, run
+import pytest
+from scenarios_support import ROOT, run, run_as_printed
 
+from caviar_clients.cli.radio_map_inputs import channel_of
 from caviar_clients.cli.scenarios import new_scenario
+from caviar_clients.tradeoff.scenes import scene_at
+from caviar_protocol.errors import RunError
 
 
 def test_the_agent_of_the_contributing_page_runs_from_beside_its_scenario(tmp_path: Path) -> None:
@@ -18,3 +22,35 @@ def test_the_agent_of_the_contributing_page_runs_from_beside_its_scenario(tmp_pa
     finished = run(path, tmp_path / "runs", "--frames", "3")
     assert finished.status == 0, finished.output
     assert "3/3" in finished.output
+
+
+def hostile(folder: Path, *modules: str) -> None:
+    """Write modules that say so when they are imported."""
+    for module in modules:
+        (folder / f"{module}.py").write_text(f"open({str(folder / 'imported')!r}, 'a').write({module!r})\n")
+
+
+def test_no_file_of_the_current_folder_is_imported_in_place_of_a_library_nor_to_look(tmp_path: Path) -> None:
+    (tmp_path / "evil.py").write_text(
+        "from caviar_services.agent.baselines import LosBeamAgent\n"
+        "from caviar_services.channel.statistical.free_space import FreeSpaceChannel\n"
+        "class Mine(LosBeamAgent): pass\n"
+        "class Air(FreeSpaceChannel): pass\n"
+    )
+    text = (ROOT / "deploy" / "caviar_scenarios" / "smoke.toml").read_text()
+    text = text.replace('use = "los-beam"', 'use = "evil:Mine"')
+    (tmp_path / "mine.toml").write_text(text.replace('use = "free-space"', 'use = "evil:Air"'))
+    hostile(tmp_path, "random", "signal", "types", "queue", "threading")
+    size = ["--episodes", "1", "--scenes", "1", "--workers", "1"]
+    run_as_printed(["caviar", "run", "mine.toml", "--frames", "2", "--out", "r"], tmp_path)
+    run_as_printed(["caviar", "generate", "mine.toml", "--out", "d", *size], tmp_path)
+    assert not (tmp_path / "imported").exists()
+    hostile(tmp_path, "evil")
+    (directory,) = (tmp_path / "r").iterdir()
+    looks = ("inspect", directory), ("plot", directory), ("doctor", directory), ("budget", directory)
+    for command, path in (*looks, ("verify", "d"), ("look", "d")):
+        run_as_printed(["caviar", command, path], tmp_path)
+    scenes = scene_at(directory)
+    with pytest.raises(RunError, match="module:Class, which are not loaded"):
+        channel_of(scenes, scenes.instants[0].scene)
+    assert not (tmp_path / "imported").exists()

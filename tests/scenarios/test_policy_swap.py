@@ -51,11 +51,11 @@ def test_a_policy_is_swapped_while_the_run_goes_on_and_the_replay_is_the_same(tm
     with running(scenario, out, "--http", "127.0.0.1:0", "--pace", "2") as (process, mark):
         eventually(lambda: recorded_below(out) > 20, 30, "frame 20 is recorded")
         directory = next(out.glob("*/"))
-        swapped = caviar("swap", second, "--run", directory)
+        swapped = caviar("policy", "swap", second, "--run", directory)
         assert swapped.status == 0, swapped.output
         assert "from frame" in swapped.output
         for bad, why in ((torn, "no ONNX model"), (other, "32 × 1"), (tmp_path / "no.onnx", "No such file")):
-            refused = caviar("swap", bad, "--run", directory)
+            refused = caviar("policy", "swap", bad, "--run", directory)
             assert refused.status == 1
             assert why in refused.output
         os.kill(pid_of(mark, "caviar_services agent"), signal.SIGKILL)
@@ -65,7 +65,7 @@ def test_a_policy_is_swapped_while_the_run_goes_on_and_the_replay_is_the_same(tm
         assert (status, answer["state"], answer["sha256"]) == (200, "serving", digests[2])
         status, answer = posted(url, torn.read_bytes())
         assert (status, "no ONNX model" in answer["detail"]) == (409, True)
-        assert caviar("swap", first, "--run", directory, "--agent", "link").status == 1
+        assert caviar("policy", "swap", first, "--run", directory, "--agent", "link").status == 1
         process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=60)
     before = decided(directory)

@@ -62,7 +62,7 @@ def replayed(directory: Path, out: Path) -> None:
 
 
 def swapped(directory: Path, file: Path) -> Finished:
-    done = caviar("swap", file, "--run", directory)
+    done = caviar("policy", "swap", file, "--run", directory)
     assert done.status == 0, done.output
     return done
 
@@ -141,7 +141,7 @@ def test_a_broker_that_dies_after_a_swap_is_followed_by_one_that_knows_it(tmp_pa
         directory = next(out.glob("*/"))
         swapped(directory, second)
         # Nobody waits for what comes of it, so the run keeps the torn file.
-        assert caviar("swap", torn, "--run", directory, "--wait", "0").status == 1
+        assert caviar("policy", "swap", torn, "--run", directory, "--wait", "0").status == 1
         events = directory / "events.jsonl"
         eventually(lambda: "is refused" in events.read_text(), WITHIN_S, "the agent refuses it")
         seen = recorded_below(out)

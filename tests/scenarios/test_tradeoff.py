@@ -1,4 +1,4 @@
-"""`caviar tradeoff` from beginning to end, with few settings on small scenarios."""
+"""`caviar measure tradeoff` from beginning to end, with few settings on small scenarios."""
 
 from __future__ import annotations
 
@@ -131,24 +131,24 @@ def test_deeper_tracing_comes_nearer_and_takes_longer(
 
 
 def test_an_unknown_label_is_refused_with_a_near_one() -> None:
-    finished = caviar("tradeoff", SCENARIOS / "smoke.toml", "--reference", "siso-rt 1e6 d33")
+    finished = caviar("measure", "tradeoff", SCENARIOS / "smoke.toml", "--reference", "siso-rt 1e6 d33")
     assert finished.status == 1
     assert "did you mean 'siso-rt 1e6 d3'?" in finished.output
-    finished = caviar("tradeoff", SCENARIOS / "smoke.toml", "--part", "lader")
+    finished = caviar("measure", "tradeoff", SCENARIOS / "smoke.toml", "--part", "lader")
     assert finished.status == 1
     assert "did you mean 'ladder'?" in finished.output
 
 
 def test_a_scenario_with_an_error_is_refused_as_by_a_run(tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path, [('use = "free-space"', 'use = "free-spaec"')])
-    finished = caviar("tradeoff", scenario)
+    finished = caviar("measure", "tradeoff", scenario)
     assert finished.status == 1
     assert "did you mean 'free-space'?" in finished.output
 
 
 def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    finished = caviar("tradeoff", SCENARIOS / "smoke.toml", "--json", tmp_path / "file" / "t.json")
+    finished = caviar("measure", "tradeoff", SCENARIOS / "smoke.toml", "--json", tmp_path / "file" / "t.json")
     assert finished.status == 1
     assert "cannot write" in finished.output
 

@@ -1,4 +1,4 @@
-"""``caviar train``: seeds in processes of their own, ended by Ctrl-C and by kill -9, and gone on with."""
+"""``caviar policy train``: seeds in processes of their own, ended by Ctrl-C and by kill -9, resumed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,18 @@ def results(folder: Path) -> dict[int, str]:
 
 def train(file: Path, out: str, jobs: int = 2) -> subprocess.Popen[str]:
     """Start the command, in a process group of its own, as a terminal has it."""
-    command = [sys.executable, "-m", "caviar_clients", "train", str(file), "--out", out, "--jobs", str(jobs)]
+    command = [
+        sys.executable,
+        "-m",
+        "caviar_clients",
+        "policy",
+        "train",
+        str(file),
+        "--out",
+        out,
+        "--jobs",
+        str(jobs),
+    ]
     return subprocess.Popen(
         command, cwd=file.parent, start_new_session=True, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -81,7 +92,7 @@ def test_a_killed_command_goes_on_to_the_policy_of_one_that_was_not(tmp_path: Pa
     status, output = finish(train(file, "killed"))
     assert status == 0, output
     assert "killed/beams goes on: seed 1 from step " in output
-    whole = CliRunner().invoke(app, ["train", str(file), "--out", str(tmp_path / "whole")])
+    whole = CliRunner().invoke(app, ["policy", "train", str(file), "--out", str(tmp_path / "whole")])
     assert whole.exit_code == 0, whole.output
     assert results(tmp_path / "killed") == results(tmp_path / "whole")
     assert len(results(tmp_path / "whole")) == 1
@@ -112,15 +123,15 @@ def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch
     os.killpg(first.pid, signal.SIGINT)
     status, output = finish(first)
     assert status == 130, output
-    assert f"stopped; caviar train {file} --out training goes on: seed 1 from step " in output
+    assert f"stopped; caviar policy train {file} --out training goes on: seed 1 from step " in output
     assert "Traceback" not in output
-    second = CliRunner().invoke(app, ["train", str(file), "--jobs", "2"])
+    second = CliRunner().invoke(app, ["policy", "train", str(file), "--jobs", "2"])
     assert second.exit_code == 0, second.output
     policies = results(tmp_path / "training")
     assert sorted(policies) == [1, 2]
     # One more seed is all that is left to a third call.
     file.write_text(file.read_text().replace("[1, 2]", "[1, 2, 3]"))
-    third = CliRunner().invoke(app, ["train", str(file), "--jobs", "2"])
+    third = CliRunner().invoke(app, ["policy", "train", str(file), "--jobs", "2"])
     assert third.exit_code == 0, third.output
     assert "seed 1 is done, seed 2 is done, seed 3 from step 0" in third.output
     assert policies.items() < results(tmp_path / "training").items()
@@ -140,7 +151,7 @@ def test_bar_and_table_have_the_steps_that_are_trained_and_say_why(
     file = written(tmp_path, steps=200)
     text = file.read_text().replace('name = "dqn", learning_starts = 20, gamma = 0.0', algorithm)
     file.write_text(text.replace("seeds = [1, 2]", "seeds = [1]"))
-    command = ["train", str(file), "--out", str(tmp_path)]
+    command = ["policy", "train", str(file), "--out", str(tmp_path)]
     first, again = (CliRunner().invoke(app, command, env={"COLUMNS": "200"}).output for _ in range(2))
     for output in (first, again):
         assert f"{real}/{real} steps" in output
@@ -190,7 +201,8 @@ def test_an_environment_of_ones_own_beside_the_file_is_trained_and_gone_on_with(
         algorithm = { name = "a2c" }
         """)
     command = [
-        Path(sys.executable).parent / "caviar", "train", file, "--out", tmp_path / "out", "--jobs", str(jobs),
+        Path(sys.executable).parent / "caviar", "policy", "train", file, "--out", tmp_path / "out",
+        "--jobs", str(jobs),
     ]  # fmt: skip
     first = subprocess.Popen(
         command, cwd=elsewhere, start_new_session=True, text=True,

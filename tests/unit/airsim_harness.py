@@ -15,6 +15,8 @@ from caviar_services.airsim.bridge import Bridge, Snapshot
 from caviar_services.airsim.calls import Offer, StateCalls
 from caviar_services.airsim.manoeuvres import Flown
 from caviar_services.airsim.motion_calls import Habits, MotionCalls
+from caviar_services.airsim.sensor_calls import SensorCalls
+from caviar_services.world.flight_commands import motion_of
 from caviar_services.world.flight_dynamics import Flyer, Limits, Motion
 
 PERIOD_NS = 100_000_000
@@ -36,11 +38,11 @@ class Body:
         for command in commands:
             if isinstance(command, WaypointCommand) and command.object == self.name:
                 if command.at_once:
-                    self.flyer.reset(command.position, self.flyer.state.yaw)
-                else:
-                    motion = Motion(target=command.position, speed=command.speed)
+                    assert command.yaw is not None
+                    self.flyer.reset(command.position, command.yaw)
+                motion = motion_of("pilot", command)
             if isinstance(command, VelocityCommand) and command.object == self.name:
-                motion = Motion(velocity=command.velocity)
+                motion = motion_of("pilot", command)
         self.flyer.fly(motion, length_ns)
 
     def flown(self, t_ns: int) -> Flown:
@@ -86,6 +88,7 @@ class Flight:
         bodies: What is flown; each is the vehicle of its name.
         cars: Positions of cars in frame 0, by name.
         drives: Their velocity [m/s].
+        walls: Triangles of the scenery.
         products: Further fields of each snapshot.
     """
 
@@ -95,15 +98,17 @@ class Flight:
         cars: Mapping[str, Vector] | None = None,
         paused: bool = False,
         drives: Vector = (0.0, 0.0, 0.0),
+        walls: np.ndarray | None = None,
         **products: Any,
     ) -> None:
         self.bodies = bodies or (Body(),)
         self.bridge = Bridge({body.name: body.name for body in self.bodies}, paused=paused)
-        state, motion = (
-            StateCalls(self.bridge, {"front_center": "uav/front"}),
-            MotionCalls(self.bridge, Habits()),
+        further = {"front_center": "uav/front"}
+        sensors = SensorCalls(
+            self.bridge, further, load_scenery=lambda: np.zeros((0, 3, 3)) if walls is None else walls
         )
-        self.offer = Offer({**state.offered(), **motion.offered()})
+        motion = MotionCalls(self.bridge, Habits())
+        self.offer = Offer({**StateCalls(self.bridge).offered(), **sensors.offered(), **motion.offered()})
         self.cars, self.drives, self.products = cars or {}, drives, products
         self.frame, self.ended = 0, False
         self.log: list[Sequence[object]] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import time
@@ -150,12 +151,104 @@ def test_what_is_not_understood_is_counted_and_changes_nothing(
     elif wrong == "nan":
         peer.send(peer.position_target(POSITION_ONLY, math.nan, 1.0, 1.0))
     elif wrong == "command":
-        peer.send(peer.link.command_long_encode(1, 1, common.MAV_CMD_NAV_TAKEOFF, 0, *(0.0,) * 7))
+        peer.send(peer.link.command_long_encode(1, 1, common.MAV_CMD_NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
     else:
         peer.socket.sendto(b"\xfd" + bytes(40), ("127.0.0.1", pilot.port))
     found, counts = arrived(pilot)
     assert found == ()
     assert counts["mavlink-ignored"] >= 1
+
+
+class Ground:
+    """A quadrotor of the world ``flight`` that stands on the ground, and the agent, frame by frame."""
+
+    def __init__(self, pilot: MavlinkAgent, peer: Peer) -> None:
+        uav = FlownObject(
+            name="uav",
+            start_m=(10.0, 20.0, 0.125),
+            start_yaw_deg=90.0,
+            dimensions_m=(0.6, 0.6, 0.25),
+            max_speed_m_s=8,
+            max_acceleration_m_s2=4,
+            dynamics="quadrotor",
+        )
+        self.world = FlightWorld(FlightSettings(flown=(uav,)), RunInfo(name="world"))
+        self.world.reset(0, 1, 0)
+        self.pilot, self.peer, self.number, self.action = pilot, peer, 0, None
+        self.newest: dict[str, Any] = {}
+
+    def frames(self, count: int) -> Scene:
+        """So many frames; the last scene."""
+        for _ in range(count):
+            entry = GrantInput(topic="action", source="pilot", status=Status.FRESH, frame=self.number - 1)
+            inputs = (FrameInput(entry, payload=self.action),) if self.action else ()
+            seen = self.world.step(
+                Frame(
+                    episode=0,
+                    number=self.number,
+                    t_ns=self.number * PERIOD_NS,
+                    previous=self.number - 1,
+                    inputs=inputs,
+                )
+            ).products["scene"]
+            self.action = step(self.pilot, self.number, seen).products["action"]
+            self.number += 1
+            self.peer.socket.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    self.newest |= {
+                        m.get_type(): m for m in self.peer.link.parse_buffer(self.peer.socket.recv(65536))
+                    }
+            self.peer.socket.settimeout(2.0)
+        assert isinstance(seen, Scene)
+        return seen
+
+    def command(self, command: int, *values: float) -> int:
+        """The result with which a command is acknowledged."""
+        self.newest.pop("COMMAND_ACK", None)
+        numbers = (*values, *(math.nan,) * (7 - len(values)))
+        self.peer.send(self.peer.link.command_long_encode(1, 1, command, 0, *numbers))
+        until = time.monotonic() + 2.0
+        while "COMMAND_ACK" not in self.newest and time.monotonic() < until:
+            self.frames(1)
+        return int(self.newest["COMMAND_ACK"].result)
+
+    @property
+    def state(self) -> tuple[bool, int, int]:
+        """Whether it is armed, main mode and landed state, as telemetry says in the newest frames."""
+        self.frames(11)
+        beat = self.newest["HEARTBEAT"]
+        armed = bool(beat.base_mode & common.MAV_MODE_FLAG_SAFETY_ARMED)
+        return armed, beat.custom_mode >> 16 & 0xFF, self.newest["EXTENDED_SYS_STATE"].landed_state
+
+
+def test_a_vehicle_takes_off_flies_in_body_axes_and_lands_as_it_says(pilot: MavlinkAgent, peer: Peer) -> None:
+    flight, accepted, denied = Ground(pilot, peer), common.MAV_RESULT_ACCEPTED, common.MAV_RESULT_DENIED
+    on_ground, in_air = common.MAV_LANDED_STATE_ON_GROUND, common.MAV_LANDED_STATE_IN_AIR
+    arm, land = common.MAV_CMD_COMPONENT_ARM_DISARM, common.MAV_CMD_NAV_LAND
+    assert flight.command(common.MAV_CMD_NAV_TAKEOFF) == denied  # not armed
+    assert flight.state == (False, 4, on_ground)
+    assert flight.command(arm, 1.0) == accepted
+    assert flight.command(common.MAV_CMD_NAV_TAKEOFF) == accepted
+    assert flight.frames(80).position[0, 2] == pytest.approx(2.625, abs=0.2)
+    assert flight.state == (True, 4, in_air)
+    assert flight.command(arm, 0.0) == denied  # it flies
+    before = flight.frames(1)
+    # Forward at 3 m/s while the heading, which is north at first, turns to the right by 30 °/s.
+    target = peer.position_target(0b010111000111, 0, 0, 0, 3.0, 0.0, 0.0, frame=8)
+    target.yaw_rate = math.radians(30.0)
+    peer.send(target)
+    flight.frames(1)
+    after = flight.frames(61)
+    (x, y, _), radius = (after.position[0] - before.position[0]).tolist(), 3.0 / math.radians(30.0)
+    assert (x, y) == pytest.approx((2 * radius, 0.0), abs=1.5)  # half a circle to the east, from a standstill
+    assert flight.state == (True, 6, in_air)
+    assert flight.command(land) == accepted
+    flight.frames(60)
+    assert flight.state == (True, 4, on_ground)
+    assert flight.command(arm, 0.0) == accepted
+    assert flight.state == (False, 4, on_ground)
+    assert flight.newest["GLOBAL_POSITION_INT"].relative_alt == pytest.approx(0, abs=50)
 
 
 def test_set_points_for_another_vehicle_are_not_taken(pilot: MavlinkAgent, peer: Peer) -> None:
@@ -174,10 +267,19 @@ def test_telemetry_is_the_scene_in_ned(pilot: MavlinkAgent, peer: Peer) -> None:
     until = time.monotonic() + 2.0
     while pilot._peer is None and time.monotonic() < until:
         step(pilot, 12, scene(angular_velocity=turning))
-    found = peer.receive(5)
+    found = peer.receive(9)
     assert found["COMMAND_ACK"].result == common.MAV_RESULT_ACCEPTED
     assert found["HEARTBEAT"].type == common.MAV_TYPE_QUADROTOR
     assert found["SYS_STATUS"].battery_remaining == -1
+    home, globe = found["HOME_POSITION"], found["GLOBAL_POSITION_INT"]
+    assert (globe.lat - home.latitude, globe.relative_alt, globe.hdg) == (
+        0,
+        0,
+        round(9000 - 40 / math.pi * 180),
+    )
+    assert (home.x, home.y, home.z, home.altitude) == (4.0, 3.0, -30.0, 152_000)
+    assert home.latitude == pytest.approx(1e7 * (47.641468 + math.degrees(4.0 / 6_378_137)), abs=1)
+    assert found["EXTENDED_SYS_STATE"].landed_state == common.MAV_LANDED_STATE_IN_AIR
     place = found["LOCAL_POSITION_NED"]
     assert (place.time_boot_ms, place.x, place.y, place.z) == (1200, 4.0, 3.0, -30.0)
     assert (place.vx, place.vy, place.vz) == (2.0, 1.0, -3.0)

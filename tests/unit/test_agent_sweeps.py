@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, random_h, scene_of
 
 from caviar_protocol.arrays import Complex128Array
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Panel, Scene
 from caviar_services.agent.pilots import PILOT_TIME, PILOTS, PilotAgent, PilotSettings, share_left
 from caviar_services.agent.sweeps import (
@@ -25,7 +26,6 @@ from caviar_services.agent.sweeps import (
     used_elements,
 )
 from caviar_services.antenna_arrays import dft_codebook
-from caviar_services.link.beam_sweep import sweep
 from caviar_services.service import RunInfo, StepResult
 
 SECOND = Carrier(name="second", frequency_hz=60e9)
@@ -188,7 +188,9 @@ def test_a_beam_of_fewer_elements_is_that_of_the_codebook_with_the_others_off() 
     used, h = used_elements(tx, wide), random_h(5, 1, tx.size)
     switched = np.zeros((wide.size, tx.size), np.complex128)
     switched[:, used] = dft_codebook(wide)
-    np.testing.assert_allclose(sweep(h[:, used], wide, rx)[:, 0], np.abs(switched.conj() @ h[0]), rtol=1e-12)
+    np.testing.assert_allclose(
+        beam_gains(h[:, used], wide, rx)[:, 0], np.abs(switched.conj() @ h[0]), rtol=1e-12
+    )
 
 
 # --- the last sweep -------------------------------------------------------------------------------

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from airsim_harness import PERIOD_NS, START, Body, Flight
+from msgspec.structs import replace
 
 from caviar_protocol.topics import Lidar, LidarScan, VelocityCommand, WaypointCommand
+from caviar_services.airsim.calls import WITHOUT_EFFECT
 from caviar_services.airsim.rpc import CallError
+from caviar_services.airsim.sensor_calls import NAVIGATION, atmosphere
+from caviar_services.airsim.wire import NedFrame
 
 
 def do(work: Awaitable[Any]) -> Any:
@@ -76,7 +80,10 @@ def test_a_velocity_is_kept_for_its_time_and_then_braked() -> None:
         return [commands[0] for commands in flight.log[1:]]
 
     commands = do(fly())
-    assert commands[:5] == [VelocityCommand(object="uav", velocity=(-1.0, 3.0, 2.0))] * 5
+    kept = VelocityCommand(object="uav", velocity=(-1.0, 3.0, 2.0), yaw=math.pi / 2)  # to the north
+    assert [replace(command, yaw=round(command.yaw, 6)) for command in commands[:5]] == [
+        replace(kept, yaw=round(math.pi / 2, 6))
+    ] * 5
     assert commands[5:] == [VelocityCommand(object="uav", velocity=(0.0, 0.0, 0.0))] * len(commands[5:])
 
 
@@ -121,6 +128,183 @@ def test_a_vehicle_turns_where_it_has_to_head_and_moves_by_centimetres(heading: 
     yaw, where = do(fly())
     assert math.remainder(yaw - heading, 360.0) == pytest.approx(0.0, abs=2.0)
     assert math.hypot(*where[:2]) < 0.1
+
+
+def yaw_of(orientation: Any) -> float:
+    """Heading [°], clockwise from north, of a level orientation."""
+    return math.degrees(2 * math.atan2(orientation["z_val"], orientation["w_val"]))
+
+
+def test_a_vehicle_turns_with_a_rate_and_keeps_or_follows_its_heading_as_asked() -> None:
+    """A yaw mode with a rate of 0 keeps the heading; ``ForwardOnly`` follows the way."""
+    keeps, follows = (0, {"is_rate": True, "yaw_or_rate": 0.0}), (1, {"is_rate": False, "yaw_or_rate": 0.0})
+    given = (0, {"is_rate": False, "yaw_or_rate": -45.0})
+
+    async def fly() -> list[float]:
+        flight, found = await ready(), list[float]()
+        for call in (
+            ("rotateByYawRate", 30.0, 2.0),
+            ("moveByVelocity", 0.0, 4.0, -1.0, 2.0, *keeps),
+            ("moveToPosition", 0.0, 0.0, -4.0, 4.0, 60.0, *follows),
+            ("moveToPosition", 9.0, 0.0, -4.0, 4.0, 60.0, *given),
+        ):
+            await flight.during(call)
+            found.append(yaw_of((await flight.call("simGetVehiclePose"))["orientation"]))
+        return found
+
+    assert do(fly()) == pytest.approx([60.0, 60.0, -90.0, -45.0], abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("method", "last"), [("moveByVelocityBodyFrame", 0.0), ("moveByVelocityZBodyFrame", -6.0)]
+)
+def test_a_velocity_in_body_axes_goes_forward_and_to_the_right(method: str, last: float) -> None:
+    async def fly() -> list[float]:
+        flight = await ready()
+        await flight.during(("moveToZ", -6.0, 5.0), ("rotateToYaw", 90.0, 20.0, 0.1))  # to the east
+        before = np.array(await place(flight))
+        await flight.during((method, 3.0, 1.0, last, 3.0))
+        return list(np.array(await place(flight)) - before)
+
+    # Less than 3 m south and 9 m east by the time in which it speeds up.
+    assert do(fly()) == pytest.approx([-3.0, 9.0, 0.0], abs=1.0)
+
+
+def test_sensors_of_motion_measure_what_the_run_has() -> None:
+    async def ask() -> Any:
+        flight = await ready()
+        at_rest = [await flight.call(name, "", "uav") for name in NAVIGATION]
+        task = asyncio.ensure_future(flight.call("moveByVelocity", 12.0, 0.0, 0.0, 9.0))
+        for _ in range(15):
+            await flight.step()
+        imu, place_ = await flight.call("getImuData"), await flight.call("simGetGroundTruthEnvironment")
+        gps = await flight.call("getGpsData")
+        task.cancel()
+        return at_rest, imu, gps, place_
+
+    (imu, pressure, field, gps), moving, flown, there = do(ask())
+    assert list(imu["linear_acceleration"].values()) == pytest.approx([0.0, 0.0, -9.80665])
+    # 1 km of the standard atmosphere has 898.7 hPa; this origin is at sea level.
+    assert (pressure["altitude"], pressure["pressure"]) == (0.0, 101_325.0)
+    assert list(field["magnetic_field_body"].values()) == pytest.approx([0.312, 0.0, 0.0])  # at the equator
+    assert gps["gnss"]["geo_point"] == {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+    # It speeds up northward, where it heads, with 5 m/s², and is still doing so after 1.5 s.
+    assert list(moving["linear_acceleration"].values()) == pytest.approx([5.0, 0.0, -9.80665], abs=0.01)
+    north = there["position"]["x_val"]
+    assert north > 4.0
+    assert flown["gnss"]["geo_point"]["latitude"] == pytest.approx(math.degrees(north / 6_378_137.0))
+    assert flown["gnss"]["velocity"]["x_val"] == pytest.approx(7.0, abs=0.6)
+    assert there["air_density"] == pytest.approx(1.225, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("altitude", "pressure", "kelvin", "density"),  # of the tables of ISO 2533:1975
+    [
+        (-1000.0, 113_929.0, 294.65, 1.3470),
+        (5000.0, 54_020.0, 255.65, 0.73612),
+        (15_000.0, 12_044.6, 216.65, 0.19367),
+    ],
+)
+def test_the_atmosphere_is_the_standard_one(
+    altitude: float, pressure: float, kelvin: float, density: float
+) -> None:
+    assert atmosphere(altitude) == pytest.approx((pressure, kelvin, density), rel=1e-4)
+
+
+def test_a_camera_is_found_by_airsims_names_and_numbers_and_says_how_it_sees() -> None:
+    async def ask() -> list[Any]:
+        flight = Flight()
+        await flight.step()
+        return [
+            await flight.call("simGetCameraInfo", name)
+            for name in ("0", "front_center", "front", "uav/front")
+        ]
+
+    found = do(ask())
+    assert all(info == found[0] for info in found)
+    assert found[0]["fov"] == 90.0
+    # What is 10 m ahead, 5 m to the right and 2 m below lands at half the width; 4 × 3 pixels.
+    x, y, _, w = np.array(found[0]["proj_mat"]["matrix"]) @ [10.0, 5.0, 2.0, 1.0]
+    assert (x / -w, y / w) == pytest.approx((0.5, 2.0 / 10.0 * 4 / 3))
+
+
+def test_a_line_of_sight_ends_at_a_wall_of_the_scenery() -> None:
+    """A wall 10 m north of the start, 4 m wide and 6 m high."""
+    x, y, _ = START
+    corners = np.array(
+        [[x - 2, y + 10, 0.0], [x + 2, y + 10, 0.0], [x + 2, y + 10, 6.0], [x - 2, y + 10, 6.0]]
+    )
+    ned = NedFrame(START)
+    places = {
+        "behind": (x, y + 20, 3.0),
+        "above": (x, y + 20, 20.0),
+        "before": (x + 1, y + 9, 3.0),
+        "beside": (x + 9, y + 20, 3.0),
+    }
+
+    async def ask() -> tuple[dict[str, bool], bool, Any]:
+        flight = Flight(walls=corners[[[0, 1, 2], [0, 2, 3]]])
+        await flight.step()
+        seen = {
+            name: await flight.call("simTestLineOfSightToPoint", ned.geo_point(place))
+            for name, place in places.items()
+        }
+        ends = [ned.geo_point(places[name]) for name in ("above", "behind")]
+        return (
+            seen,
+            await flight.call("simTestLineOfSightBetweenPoints", *ends),
+            await flight.call("simGetWorldExtents"),
+        )
+
+    seen, beyond, (low, high) = do(ask())
+    assert seen == {"behind": False, "above": True, "before": True, "beside": True}
+    assert beyond is True
+    assert ned.from_geo_point(low, "low") == pytest.approx(corners.min(axis=0), abs=1e-6)
+    assert ned.from_geo_point(high, "high") == pytest.approx(corners.max(axis=0), abs=1e-6)
+
+
+def test_what_is_without_effect_or_not_offered_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    async def ask() -> int:
+        flight, refused = await ready(), 0
+        for _ in range(3):
+            for name in WITHOUT_EFFECT:
+                assert await flight.call(name, "whatever", 1) is None
+            for number in range(200):
+                try:
+                    await flight.call(f"simDream{number}")
+                except CallError:
+                    refused += 1
+        return refused
+
+    with caplog.at_level("WARNING", "caviar.airsim"):
+        assert do(ask()) == 600
+    assert len(caplog.messages) == len(set(caplog.messages)) == len(WITHOUT_EFFECT) + 200
+    assert sum("is not offered here" in line for line in caplog.messages) == 200
+
+
+def test_an_object_that_no_command_moves_is_not_put_anywhere() -> None:
+    async def ask() -> list[Any]:
+        flight = Flight(cars={"car.1": (50.0, 75.0, 0.75)})
+        await flight.step()
+        return [await flight.call("simSetObjectPose", name, {}) for name in ("car.1", "nothing")]
+
+    assert do(ask()) == [False, False]
+
+
+def test_a_pose_of_zeros_keeps_the_heading() -> None:
+    zeros = {
+        "position": dict.fromkeys(("x_val", "y_val", "z_val"), 0.0),
+        "orientation": dict.fromkeys(("w_val", "x_val", "y_val", "z_val"), 0.0),
+    }
+
+    async def fly() -> Any:
+        flight = await ready()
+        await flight.during(("rotateToYaw", 120.0, 20.0, 0.1), ("simSetVehiclePose", zeros, True))
+        return await flight.call("simGetVehiclePose")
+
+    pose = do(fly())
+    assert list(pose["position"].values()) == pytest.approx([0.0] * 3, abs=1e-6)
+    assert yaw_of(pose["orientation"]) == pytest.approx(120.0, abs=0.5)
 
 
 def test_a_new_call_replaces_the_one_under_way_which_returns_false() -> None:
@@ -359,7 +543,6 @@ def test_lidar_points_count_from_where_the_vehicle_started() -> None:
         (("getLidarData", "roof"), "there is no LIDAR 'roof' on vehicle 'uav'; there are: 0 (uav/lidar)"),
         (("getLidarData", ""), "there is no product 'lidar' in this frame"),
         (("getMultirotorState", "Drone9"), "there is no vehicle 'Drone9'; there are: uav"),
-        (("simSetObjectPose", "car.1", {}), "object 'car.1' cannot be put anywhere"),
         (("simPause", 1), "is_paused is 1; give True or False"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What `caviar bench broker` measures: real processes, every product delivered, figures that agree."""
+"""What `caviar measure bench broker` measures: real processes, all products delivered, figures that agree."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ def test_deliveries_are_the_edges_of_the_graph(topology: Topology, services: int
 def test_figures_of_a_run_agree(tmp_path: Path, curve: bool) -> None:
     file = tmp_path / "figures.json"
     arguments = [
+        "measure",
         "bench",
         "broker",
         "--services",
@@ -67,7 +68,7 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("caviar_broker.bench.measure", lambda *_, **__: pytest.fail("measured"))
-    result = CliRunner().invoke(app, ["bench", "broker", "--json", str(tmp_path)])
+    result = CliRunner().invoke(app, ["measure", "bench", "broker", "--json", str(tmp_path)])
     assert isinstance(result.exception, RunError)
     assert str(result.exception) == f"cannot write {tmp_path}: Is a directory; choose another file"
 

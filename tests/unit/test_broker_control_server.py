@@ -1,4 +1,4 @@
-"""The desk of a running broker, over its socket, and ``caviar why``."""
+"""The desk of a running broker, over its socket, and ``caviar status``."""
 
 from __future__ import annotations
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +27,14 @@ def test_a_run_gives_its_directory_and_open_reads_it(
     assert capsys.readouterr().out == ""
     assert (len(caviar.open(run)), caviar.open().directory.name) == (3, run.name)
     assert json.loads((run / "summary.json").read_text())["seed"] == 7
+
+
+@pytest.mark.parametrize("embedded", [False, True])
+def test_a_run_from_a_thread_leaves_signals_alone(tmp_path: Path, embedded: bool) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    run = asyncio.run(asyncio.to_thread(caviar.run, "smoke", frames=2, out=tmp_path, embedded=embedded))
+    assert len(caviar.open(run)) == 2
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_run_that_ends_early_raises_its_cause(tmp_path: Path) -> None:

@@ -82,10 +82,32 @@ def test_flush_houses_share_planes_and_bodies_do_not() -> None:
     corners, faces, planes, counts = joined([*houses, box((40.0, 44.0), (0.0, 10.0), (0.0, 6.0))])
     table = PlaneTable(planes, faces)
     table.update(corners)
-    shared = shared_planes(table, counts[0] + counts[1])
+    shared = shared_planes(table, np.zeros(counts[0] + counts[1], np.int64))
     assert len(set(shared[:12].tolist())) == 4 + 3
     assert len(set(shared[12:].tolist())) == 6
     assert not set(shared[:12].tolist()) & set(shared[12:].tolist())
+
+
+@pytest.mark.parametrize(
+    ("height", "planes_shared"), [(0.0, True), (1e-4, True), (4e-4, False), (-9e-4, False)]
+)
+def test_a_sheet_of_another_material_above_a_ground_has_a_plane_of_its_own(
+    height: float, planes_shared: bool
+) -> None:
+    """Where both overlap, so that the upper one is met; a sheet elsewhere shares the ground's plane."""
+    ground, there = square(0.0), square(height)
+    elsewhere = Mesh(there.vertices + np.array([100.0, 0.0, 0.0]), there.faces)
+    for sheet, expected in ((there, planes_shared), (elsewhere, True)):
+        corners, faces, planes, _ = joined([ground, sheet])
+        table = PlaneTable(planes, faces)
+        table.update(corners)
+        assert (len(set(shared_planes(table, np.array([0, 1])).tolist())) == 1) is expected
+        assert len(set(shared_planes(table, np.array([0, 0])).tolist())) == 1
+
+
+def square(z: float) -> Mesh:
+    corners = np.array([[-9, -9, z], [9, -9, z], [9, 9, z], [-9, 9, z]], np.float64)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
 
 
 def test_the_largest_triangle_stands_for_a_plane_and_the_box_holds_all() -> None:
@@ -116,7 +138,7 @@ def test_where_faces_coincide_the_first_is_met() -> None:
     )
     table = PlaneTable(planes, faces)
     table.update(corners)
-    table = PlaneTable(shared_planes(table, sum(counts))[planes], faces)
+    table = PlaneTable(shared_planes(table, np.zeros(sum(counts), np.int64))[planes], faces)
     table.update(corners)
     wall = next(t for t in range(12, 24) if np.allclose(corners[faces[t], 0], 8.0))
     points = np.array([[8.0, 3.0, 2.0], [8.0, 3.0, 7.5]])

@@ -16,6 +16,7 @@ from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.stability.lab import frame_of
+from caviar_services.mesh.shapes import ply, unit_box
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
 
@@ -144,9 +145,19 @@ class TestPreparing:
             '"nearest" (constants of the nearest end) or "extrapolate" (power law of the nearest range)'
         )
 
-    def test_bodies_outside_the_range_of_their_material_are_named(self) -> None:
-        with pytest.raises(ScenarioError, match=r"'body_material' \(ITU metal\).*another body_material"):
-            prepared(frequency=140e9)
+    def test_bodies_outside_the_range_of_their_material_are_named_where_an_object_has_it(
+        self, tmp_path: Path
+    ) -> None:
+        """Before the first frame where a mesh of the run is of it, else with the first such object."""
+        named = r"'body_material' \(ITU metal\).*another body_material"
+        (tmp_path / "car.ply").write_bytes(ply(unit_box()))
+        with pytest.raises(ScenarioError, match=named):
+            prepared({"objects/car.ply": tmp_path / "car.ply"}, frequency=140e9)
+        boxes = prepared(frequency=140e9, object_materials={"van": "glass"})
+        step(boxes, ())
+        with pytest.raises(ScenarioError, match=named):
+            step(boxes, ("a",))
+        step(prepared(frequency=140e9, object_materials={"car": "glass"}), ("a",))
 
     def test_without_bodies_their_material_is_not_needed(self) -> None:
         prepared(frequency=140e9, bodies=0)
@@ -217,10 +228,12 @@ def channel() -> SionnaChannel:
 class TestFrames:
     """What a frame may and may not hold."""
 
-    def test_more_objects_than_bodies_name_the_setting(self, channel: SionnaChannel) -> None:
-        text = r"^services\.channel\.settings\.bodies: object 'c' .*the pool has 2; write a larger number$"
+    @pytest.mark.parametrize("settings", [{"bodies": 0}, {"follow": 2}], ids=["none", "followed"])
+    def test_objects_without_bodies_name_the_setting_where_none_are_made(self, settings: Any) -> None:
+        """Where bodies are forbidden, and where what is followed is known by the bodies that there are."""
+        text = r"^services\.channel\.settings\.bodies: object '.' .*the pool has \d; write a larger number$"
         with pytest.raises(PayloadError, match=text):
-            step(channel, ("a", "b", "c"))
+            step(prepared(**settings), ("a", "b", "c"))
 
     def test_an_asset_that_is_not_there_is_named(self, channel: SionnaChannel) -> None:
         with pytest.raises(PayloadError, match=r"the mesh 'objects/tank\.ply', which the run does not have"):
@@ -280,3 +293,40 @@ class TestFrames:
         assert (enough.counts["paths"], enough.counts["path_limit_reached"]) == (4, 0)
         result = step(prepared(scenery(tmp_path, "brick"), max_paths=1), (), *ends)
         assert (result.counts["paths"], result.counts["path_limit_reached"]) == (2, 2)
+
+    @pytest.mark.parametrize("below", ["concrete", "metal"])
+    def test_the_upper_of_two_sheets_a_millimetre_apart_is_met(self, tmp_path: Path, below: str) -> None:
+        """Whichever stands first in the file; two in one plane are warned of by name."""
+        above = {"concrete": "metal", "metal": "concrete"}[below]
+        ends = (
+            AntennaDevice(name="r", role="rx", position=(10.0, 0, 5)),
+            AntennaDevice(name="t", role="tx", position=(0.0, 0, 5)),
+        )
+        heard = []
+        for sheets in ({below: 0.0, above: 0.001}, {above: 0.001, below: 0.0}, {above: 0.001}):
+            channel = step(prepared(sheets_of(tmp_path, sheets)), (), *ends).products["channel"]
+            assert isinstance(channel, Channel)
+            heard.append(channel.a)
+        np.testing.assert_array_equal(heard[0], heard[2])
+        np.testing.assert_array_equal(heard[1], heard[2])
+        made = model()
+        assets = sheets_of(tmp_path, {below: 0.0, above: 0.0})
+        notes = made.prepare(Preparation(demand={}, assets=assets)).notes
+        assert any(f"{below!r}" in note and f"{above!r}" in note and "one plane" in note for note in notes)
+
+
+def sheets_of(folder: Path, heights: dict[str, float]) -> dict[str, Path]:
+    """A floor of each material at its height [m]."""
+    (folder / "floor.ply").write_text(PLY)
+    file = folder / "sheets.xml"
+    file.write_text(
+        '<scene version="2.1.0">'
+        + "".join(
+            f'<bsdf type="diffuse" id="itu_{m}"/><shape type="ply" id="{m}"><string name="filename" '
+            f'value="floor.ply"/><ref id="itu_{m}" name="bsdf"/><transform name="to_world"><translate '
+            f'z="{z}"/></transform></shape>'
+            for m, z in heights.items()
+        )
+        + "</scene>"
+    )
+    return {"scenery/sheets.xml": file, "scenery/floor.ply": folder / "floor.ply"}

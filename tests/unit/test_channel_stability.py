@@ -99,7 +99,7 @@ def test_the_table_keeps_to_its_columns() -> None:
 
 class TestCommand:
     def ask(self, *arguments: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["stability", "--no-traced", *arguments])
+        result = CliRunner().invoke(app, ["measure", "stability", "--no-traced", *arguments])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
         return result.exit_code, result.output
@@ -124,7 +124,7 @@ class TestCommand:
     def test_what_needs_the_ray_tracer_is_not_run_without_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A missing extra is no wrong physics: the rest is judged, one line says what to install."""
         monkeypatch.setattr(cases_module, "has_extra", lambda _: False)
-        result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["stability", "--group", "speed"])
+        result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["measure", "stability", "--group", "speed"])
         ran = sum(case.group == "speed" and not case.traced for case in cases())
         every = sum(case.group == "speed" for case in cases())
         assert result.exit_code == 0

@@ -1,4 +1,4 @@
-"""What `caviar generate` shows while it plays, and what it needs."""
+"""What `caviar dataset generate` shows while it plays, and what it needs."""
 
 from __future__ import annotations
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import sys
 
+import numpy as np
 import pytest
-from recording_builders import absent, frame, link, product, record, recorder, scene, with_packets
+from recording_builders import absent, frame, link, product, record, record_run, recorder, scene, with_packets
 
 from caviar_clients.cli.main import main
 from caviar_clients.cli.recordings import inspect_command
@@ -132,3 +133,15 @@ def test_without_a_run_the_newest_is_taken_and_named(tmp_path, monkeypatch, caps
     out, err = capsys.readouterr()
     assert out == Recording("runs/smoke-1").run_digest().digest + "\n"
     assert err == "run runs/smoke-1, the newest in ./runs\n"
+
+
+def test_the_gain_over_a_random_pair_is_that_of_all_pairs(tmp_path):
+    """Of `smoke`: mean |y|² of the chosen pairs over that of all pairs, each swept."""
+    recording = Recording(record_run(tmp_path))
+    link = summarise(recording).link
+    assert link is not None
+    pairs = recording["channel"].beam_gains ** 2  # frames × users × Nt × Nr, NaN past a user's own arrays
+    chosen = np.mean(recording["link"].abs_y ** 2)
+    random, best = np.nanmean(pairs, (2, 3)).mean(), np.nanmax(pairs, (2, 3)).mean()
+    assert link.gain_over_random_db == pytest.approx(10 * np.log10(chosen / random))
+    assert link.loss_to_best_db == pytest.approx(10 * np.log10(best / chosen))

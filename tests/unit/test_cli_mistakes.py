@@ -78,7 +78,7 @@ def test_a_keys_directory_that_is_missing_is_called_so(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("why", "runs/nosuch"), "there is no directory runs/nosuch; give that of a run"),
+        (("status", "runs/nosuch"), "there is no directory runs/nosuch; give that of a run"),
         (("run", SMOKE, "--bind", "127.0.0.1:5570"), "'127.0.0.1:5570' is no address to listen at"),
         (("run", "--resume", "nosuch"), "give the directory of a run"),
         (("conform", "--role", "agnt"), "no client has the role 'agnt'; did you mean 'agent'?"),
@@ -151,22 +151,28 @@ def test_what_nobody_sent_is_not_called_canonical() -> None:
             ("generate", "smoke", "--out", "s3:/bucket/x"),
             "'s3:/bucket/x' is no address: write 's3://bucket/x'",
         ),
-        (("generate", "smoke", "--out", "file:/data/x", "--overwrite"), "write 'file:///data/x'"),
-        (("generate", "smoke", "--out", ""), "give a folder, or an address as s3://bucket/name"),
-        (("generate", "S008", "--out", "d"), "there is no preset 'S008'; did you mean 's008'?"),
-        (("generate", "s08", "--out", "d"), "there is no preset 's08'; did you mean 's008'?"),
+        (("dataset", "generate", "smoke", "--out", "file:/data/x", "--overwrite"), "write 'file:///data/x'"),
+        (("dataset", "generate", "smoke", "--out", ""), "give a folder, or an address as s3://bucket/name"),
+        (("dataset", "generate", "S008", "--out", "d"), "there is no preset 'S008'; did you mean 's008'?"),
+        (("dataset", "generate", "s08", "--out", "d"), "there is no preset 's08'; did you mean 's008'?"),
         (
             ("tables", "d", "--format", "csv", "--out", "s3://bucket/x"),
             "s3://bucket/x is an address: give a",
         ),
-        (("verify", "d/episodes/episode-000000"), "is the recording of an episode: its dataset is d;"),
-        (("look", "d/episodes"), "d/episodes is a part of a dataset: give d"),
-        (("tables", ".", "--format", "csv"), "is no dataset, it holds 1: give one of them, as d"),
+        (
+            ("dataset", "verify", "d/episodes/episode-000000"),
+            "is the recording of an episode: its dataset is d;",
+        ),
+        (("dataset", "look", "d/episodes"), "d/episodes is a part of a dataset: give d"),
+        (("dataset", "tables", ".", "--format", "csv"), "is no dataset, it holds 1: give one of them, as d"),
         (
             ("inspect", "d"),
             "d is a dataset: give an episode of it, as d/episodes/episode-000000;",
         ),
-        (("swap", "policy.onnx"), "name the directory of a run: caviar swap policy.onnx --run RUN"),
+        (
+            ("policy", "swap", "policy.onnx"),
+            "name the directory of a run: caviar policy swap policy.onnx --run RUN",
+        ),
     ],
 )
 def test_a_mistake_about_datasets_or_policies_is_named_and_changes_nothing(

@@ -1,4 +1,4 @@
-"""`caviar map`: what is asked for, what is drawn, and what the arrays say."""
+"""`caviar plot map`: what is asked for, what is drawn, and what the arrays say."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options, words
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["caviar", "map", "smoke", *options])
+    monkeypatch.setattr(sys, "argv", ["caviar", "plot", "map", "smoke", *options])
     with pytest.raises(SystemExit) as ended:
         command.main()
     assert ended.value.code == 1
@@ -104,7 +104,7 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
 def test_a_scene_without_a_transmitter_is_refused() -> None:
     """It may be mounted on an object that is not there yet."""
     with pytest.raises(RunError, match="frame 7 has no transmitter; give a device"):
-        transmitters_of(msgspec.structs.replace(scene(0), devices=()), "frame 7")
+        transmitters_of(msgspec.structs.replace(scene(0), devices=()), "frame 7", "mm")
 
 
 def test_a_run_without_a_channel_is_refused() -> None:

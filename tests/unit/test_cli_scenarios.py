@@ -166,7 +166,7 @@ def test_every_alternative_that_a_new_scenario_comments_out_is_accepted(tmp_path
     assert "lidar" in scenario.services
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["keys", "new"], ["bench", "broker"]])
+@pytest.mark.parametrize("command", [[], ["run"], ["plot", "map"], ["measure", "bench", "broker"]])
 def test_h_is_help_everywhere(command: list[str]) -> None:
     short = runner.invoke(app, [*command, "-h"], env=ENVIRONMENT)
     assert short.exit_code == 0
@@ -184,3 +184,28 @@ def test_a_shell_completes_names_of_scenarios() -> None:
     done = runner.invoke(app, [], prog_name="caviar", env=environment)
     assert done.output.split() == ["street-canyon"]
     assert "--install-completion" in runner.invoke(app, ["-h"], env=ENVIRONMENT).output
+
+
+FORMER = {
+    **{name: f"dataset {name}" for name in ("generate", "look", "verify", "tables")},
+    **{name: f"policy {name}" for name in ("train", "evaluate", "swap")},
+    **{name: f"measure {name}" for name in ("budget", "bench", "tradeoff", "stability")},
+    "map": "plot map",
+    "video": "plot video",
+    "why": "status",
+    "export-policy": "policy export",
+    "plot runs/x": "plot run runs/x",
+}
+
+
+@pytest.mark.parametrize(("former", "name"), FORMER.items())
+def test_a_former_name_of_a_command_goes_on_and_is_not_shown(former: str, name: str) -> None:
+    old, new = (
+        runner.invoke(app, [*words.split(), "-h"], env=ENVIRONMENT).output.splitlines()[2:]
+        for words in (former, name)
+    )
+    assert old == new
+    assert any("--help" in line for line in old)
+    shown = re.findall(r"(?m)^\W ([a-z-]+) ", runner.invoke(app, ["-h"], env=ENVIRONMENT).output)
+    assert former not in shown
+    assert name.split()[0] in shown

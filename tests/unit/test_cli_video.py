@@ -1,4 +1,4 @@
-"""`caviar video`: how many pictures a video has, what they show, and what is refused."""
+"""`caviar plot video`: how many pictures a video has, what they show, and what is refused."""
 
 from __future__ import annotations
 
@@ -279,7 +279,7 @@ def test_the_times_of_a_gif_are_right_on_average(fps):
 def test_the_command_says_file_frames_and_speed(tmp_path, monkeypatch, capsys):
     run, file = record(tmp_path / "run", 2), tmp_path / "a.gif"
     monkeypatch.setattr(
-        sys, "argv", ["caviar", "video", str(run), "--out", str(file), "--fps", "5", "--width", "320"]
+        sys, "argv", ["caviar", "plot", "video", str(run), "--out", str(file), "--fps", "5", "--width", "320"]
     )
     with pytest.raises(SystemExit) as ended:
         command.main()
@@ -290,7 +290,7 @@ def test_the_command_says_file_frames_and_speed(tmp_path, monkeypatch, capsys):
 
 
 def test_the_command_refuses_what_is_no_recording(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["caviar", "video", str(tmp_path / "nothing")])
+    monkeypatch.setattr(sys, "argv", ["caviar", "plot", "video", str(tmp_path / "nothing")])
     with pytest.raises(SystemExit) as ended:
         command.main()
     assert ended.value.code == 1

@@ -136,12 +136,29 @@ def test_clause_11_an_answer_after_its_deadline_is_late_though_the_shell_looked_
 
 
 def test_clause_13_an_overrun_that_no_deadline_caught_is_counted_and_told() -> None:
-    run = Simulation(loop(channel={"latency": slow_at(0, takes=None)})).join()
-    run.run(lambda run: bool(run.grants("channel")))
+    run = Simulation(loop(channel={"latency": slow_at(1, takes=None)})).join()
+    run.run(lambda run: len(run.grants("channel")) == 2)
     run.now += 150 * MS
-    run.answer("channel", run.grants("channel")[0])
-    assert [x.missed for x in run.seen(ev.Latency, "channel")] == [True]
+    run.answer("channel", run.grants("channel")[1])
+    assert [x.missed for x in run.seen(ev.Latency, "channel")] == [False, True]
     assert "answered before the frame went on" in run.notices("miss", "channel")[0].text
+
+
+@pytest.mark.parametrize("caught", [True, False], ids=["deadline", "answer"])
+@pytest.mark.parametrize("policy", ["wait", "hold"])
+def test_clause_13_only_under_wait_the_first_frame_of_a_run_is_no_miss(policy: str, caught: bool) -> None:
+    """Caught by its deadline, or answered before that was looked at; where others go on it is a miss."""
+    slow = None if caught else slow_at(0, takes=None)
+    services = loop(channel={"latency": slow or slow_at(0, takes=250 * MS), "policy": policy})
+    run = Simulation(services, frames=1, episodes=2).join()
+    if not caught:
+        run.run(lambda run: bool(run.grants("channel")))
+        run.now += 250 * MS
+        run.answer("channel", run.grants("channel")[0])
+    run.run(lambda run: len(run.seen(ev.Latency, "channel")) == (2 if caught else 1))
+    missed = [(x.episode, x.missed) for x in run.seen(ev.Latency, "channel")]
+    assert missed == [(0, policy == "hold"), (1, True)][: len(missed)]
+    assert len(run.notices("miss", "channel")) == sum(was for _, was in missed)
 
 
 def test_clause_6_the_budget_counts_from_the_grant_not_from_when_inputs_were_there() -> None:

@@ -148,7 +148,10 @@ def test_a_catalogue_whose_types_bind_nothing_is_not_written(data: Path) -> None
 def test_what_is_no_database_has_a_way_out(data: Path) -> None:
     (data / "catalogue.sqlite").write_bytes(b"not a database, but long enough to be looked at as one" * 20)
     said = refused(data)
-    assert "file is not a database; move it away, and the same caviar generate command makes it anew" in said
+    assert (
+        "file is not a database; move it away, and the same caviar dataset generate command makes it anew"
+        in said
+    )
     (data / "catalogue.sqlite").write_bytes(b"")
     with pytest.raises(RecordingError, match=r"table dataset is missing; move it away"):
         caviar.dataset(data)

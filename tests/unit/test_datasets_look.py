@@ -1,4 +1,4 @@
-"""The page of a dataset (``caviar look``)."""
+"""The page of a dataset (``caviar dataset look``)."""
 
 from __future__ import annotations
 
@@ -380,7 +380,7 @@ def test_beams_that_no_codebook_has_are_left_out_and_told(beam: int, copy: Path)
         "left out: best beams of 1 of 24 users that no codebook has (TX 0 to 31, RX 0 to 3), the first of "
         f"episode 1, scene 2, car/rx: TX {beam}, RX 3"
     )
-    assert notes == [f"{said}; caviar verify {copy} says more"]
+    assert notes == [f"{said}; caviar dataset verify {copy} says more"]
     assert said in page.texts["beams"]
     assert page.pictures["beams"] == 1
 
@@ -437,7 +437,7 @@ def test_overwrite_removes_the_page_of_what_is_removed(tmp_path: Path) -> None:
 
 def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
-    result = CliRunner().invoke(app, ["look", str(folder), "--out", str(out)])
+    result = CliRunner().invoke(app, ["dataset", "look", str(folder), "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert result.output.splitlines()[-1] == str(out)
     assert out.stat().st_size > 100_000
@@ -445,9 +445,11 @@ def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> Non
 
 def test_the_command_names_the_extra_that_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("caviar_clients.cli.shared.has_extra", lambda extra: False)
-    result = CliRunner().invoke(app, ["look", str(folder)])
+    result = CliRunner().invoke(app, ["dataset", "look", str(folder)])
     assert isinstance(result.exception, SetupError)
-    assert re.search(r"caviar look needs what is not installed \(plot\); run: .*plot", str(result.exception))
+    assert re.search(
+        r"caviar dataset look needs what is not installed \(plot\); run: .*plot", str(result.exception)
+    )
 
 
 def test_a_browser_opens_the_page_without_an_error(folder: Path, page: Page, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Checks of paths by ``caviar verify``: a right channel passes, each wrong quantity of a path is found."""
+"""Checks of paths by ``caviar dataset verify``: a right channel passes, each wrong quantity is found."""
 
 from __future__ import annotations
 

@@ -272,16 +272,15 @@ def test_the_folder_of_another_level_names_that_of_the_dataset(
     check_level(folder)
     check_level(tmp_path / "nothing")  # of which the catalogue says that it is not there
     for place in (name, f"{name}/episodes"):
-        words = (
-            f"{name} is a dataset: give an episode of it, as {name}/episodes/episode-000000; caviar verify"
-        )
+        words = f"{name} is a dataset: give an episode of it, as {name}/episodes/episode-000000"
         with pytest.raises(RecordingError, match=words):
             caviar.open(place)
 
 
 def test_a_folder_without_a_catalogue_is_no_dataset(tmp_path: Path) -> None:
     with pytest.raises(
-        RecordingError, match=r"is no dataset, it has no catalogue.sqlite; make one with: caviar generate"
+        RecordingError,
+        match=r"is no dataset, it has no catalogue.sqlite; make one with: caviar dataset generate",
     ):
         Dataset(tmp_path)
     (tmp_path / "catalogue.sqlite").write_text("not a database, but long enough to be taken for one" * 20)
@@ -385,6 +384,19 @@ def test_an_episode_that_is_added_again_replaces_itself(folder: Path, tmp_path: 
     assert catalogue.failures() == []
     catalogue.forget([3])
     assert (catalogue.episodes(), catalogue.table("products")[1]) == ([], [])
+
+
+def test_seeds_that_follow_each_other_share_no_epochs(folder: Path) -> None:
+    pytest.importorskip("torch")
+    users, orders = caviar.dataset(folder).users(), []
+    for seed in (7, 8, 9):
+        batches = users.torch_batches(len(users), ["episode", "scene", "rx"], shuffle=seed)
+        for batches.epoch in range(3):
+            (batch,) = batches
+            orders.append(
+                tuple(zip(batch["episode"].tolist(), batch["scene"].tolist(), batch["rx"], strict=True))
+            )
+    assert len(set(orders)) == len(orders)
 
 
 def test_a_data_loader_delivers_one_order_with_any_number_of_processes(folder: Path) -> None:

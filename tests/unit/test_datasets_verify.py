@@ -1,4 +1,4 @@
-"""``caviar verify``: a clean set has no finding, and each planted fault is found at its place."""
+"""``caviar dataset verify``: a clean set has no finding, and each planted fault is found at its place."""
 
 from __future__ import annotations
 
@@ -562,10 +562,10 @@ def test_a_ray_traced_set_is_clean_and_a_wrong_line_of_sight_is_found(tmp_path: 
 
 def test_the_command_says_what_is_wrong_and_fails(data: Path, tmp_path: Path) -> None:
     runner = CliRunner()
-    clean = runner.invoke(app, ["verify", str(data)])
+    clean = runner.invoke(app, ["dataset", "verify", str(data)])
     assert (clean.exit_code, clean.output.strip().splitlines()[-1]) == (0, f"{data}: nothing is wrong")
     edit(data, "UPDATE users SET los = 0 WHERE episode = 1 AND scene = 2 AND rx = 'car/rx'")
-    wrong = runner.invoke(app, ["verify", str(data), "--json", str(tmp_path / "f.json")])
+    wrong = runner.invoke(app, ["dataset", "verify", str(data), "--json", str(tmp_path / "f.json")])
     assert wrong.exit_code != 0
     assert "catalogue: users.los" in " ".join(wrong.output.split())
     assert json.loads((tmp_path / "f.json").read_text()) == [

@@ -89,7 +89,7 @@ def test_settings_that_do_not_fit_are_refused_by_name() -> None:
 
 
 def test_a_setting_is_written_as_agent_setting_and_value() -> None:
-    asked = ["evaluate", "none.onnx", "--on", "geometric", "--set", "ucb=3"]
+    asked = ["policy", "evaluate", "none.onnx", "--on", "geometric", "--set", "ucb=3"]
     ended = CliRunner().invoke(app, asked)
     assert ended.exit_code != 0
     assert "write agent, setting and value" in str(ended.exception)
@@ -176,8 +176,16 @@ def test_the_tables_of_an_evaluation_are_whole_at_80_columns() -> None:
         scenario="street-canyon",
         found={name: dict.fromkeys(KINDS, mean) for name, mean in means.items()},
         frames={"all": 1_000_000, "LOS": 600_000, "NLOS": 400_000},
+        power={
+            "policy": 2.0,
+            "random": 0.5,
+            "hierarchical-sweep": 1.0,
+            "my_module:AgentOfALongName": 0.0,
+            "optimum": 4.0,
+        },
         efficiency=dict.fromkeys(means, Interval(24.17, 0.0251, 20)),
         pilots=dict.fromkeys(means, 6.4),
+        by_episode={},
     )
     console = Console(width=80, record=True, file=io.StringIO())
     for table in _evaluation_tables(made):
@@ -189,7 +197,8 @@ def test_the_tables_of_an_evaluation_are_whole_at_80_columns() -> None:
         "│ hierarchical-sweep     │ 0.01235 ± 2e-06 │",
         "│ my_module:AgentOfALong │   1e-06 ± 4e-08 │",
         "│ optimum                │              25 │",
-        "│ optimum                    │            6.4 │ 24.17 ± 0.025 │",
+        "│ policy                  │     6.0 │     3.0 │            6.4 │ 24.17 ± 0.025 │",
+        "│ my_module:AgentOfALongN │         │         │            6.4 │ 24.17 ± 0.025 │",
     ):
         assert row in text
     assert "…" not in text

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, random_h, scene_of
 
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import angles
 from caviar_protocol.space.scene import directions, pairs_of
-from caviar_protocol.topics import Carrier
+from caviar_protocol.topics import AntennaDevice, Carrier, Channel
+from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.base import channels_of, users_of
 from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 BS = antenna("bs", "tx", (1, 4))
 CAR = antenna("car/rx", "rx", (1, 2), (10.0, 0.0, 0.0))
@@ -96,3 +100,37 @@ def test_users_with_different_arrays_are_swept_in_their_own_shapes_and_order() -
     for u, matrix in enumerate(h):
         abs_y = swept[u]
         assert np.sum(abs_y**2) == pytest.approx(np.sum(np.abs(matrix) ** 2))
+
+
+def test_devices_that_name_carriers_are_users_on_those_alone() -> None:
+    """Two stations at one carrier each, a receiver with both, one with the higher alone."""
+    low, high = Carrier(name="low", frequency_hz=3.5e9), Carrier(name="high", frequency_hz=28e9)
+
+    def on(device: AntennaDevice, *carriers: str) -> AntennaDevice:
+        return msgspec.structs.replace(device, carriers=carriers)
+
+    scene = scene_of(
+        on(antenna("lamp", "tx"), "high"),
+        on(antenna("macro", "tx", position=(0.0, 50.0, 0.0)), "low"),
+        antenna("both", "rx", position=(30.0, 0.0, 0.0)),
+        on(antenna("mm", "rx", position=(40.0, 0.0, 0.0)), "high"),
+    )
+    assert [(p.tx.name, p.rx.name) for p in pairs_of(scene)] == [
+        ("lamp", "both"), ("lamp", "mm"), ("macro", "both")
+    ]  # fmt: skip
+    users = users_of(scene, (low, high))
+    expected = ["macro → both on low", "lamp → both on high", "lamp → mm on high"]
+    assert [str(user) for user in users] == expected
+    model = FreeSpaceChannel(FreeSpaceSettings(), RunInfo(name="channel", carriers=(low, high)))
+    model.prepare(Preparation(demand={"channel": frozenset({"h"})}))
+    entry = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=0)
+    frame = Frame(episode=0, number=0, t_ns=0, inputs=(FrameInput(entry, payload=scene),), service="channel")
+    result = model.step(frame)
+    channel = result.products["channel"]
+    assert isinstance(channel, Channel)
+    # Pairs: lamp–both, lamp–mm, macro–both, macro–mm; the last has no carrier in common.
+    assert channel.offsets.tolist() == [0, 1, 2, 3, 3]
+    assert (channel.a != 0).tolist() == [[False, False, True], [True, True, False]]
+    assert [(m.carrier, m.tx, m.rx) for m in channel.h] == [(0, 1, 0), (1, 0, 0), (1, 0, 1)]
+    assert channels_of(channel, users).has_path.all()
+    assert not any(name.startswith("no-path") for name in result.counts)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import AssetError
-from caviar_services.channel.sionna.scene_loading import file_vertices
+from caviar_services.channel.sionna.scene_loading import file_pieces
 from caviar_services.mesh.scenery import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
 from caviar_services.world.scenery import scenery_assets
 
@@ -245,4 +245,4 @@ def test_the_ray_tracer_refuses_a_shape_without_radio_constants(tmp_path: Path) 
     with pytest.raises(
         AssetError, match=r"^scenery/scene\.xml:2: shape 'mesh-wall' has material 'paint' of type"
     ):
-        file_vertices(described(tmp_path, body, "wall"))
+        file_pieces(described(tmp_path, body, "wall"))

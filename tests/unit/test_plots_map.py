@@ -119,7 +119,7 @@ def test_the_lobe_stands_at_the_array_and_points_to_the_user():
     links.tx_beam[:] = chosen
     beam = chosen_beam(a_map(link=links))
     assert beam is not None
-    assert beam.label == f"beam {chosen} of bs, chosen for car.1/rx"
+    assert beam.label == f"beam {chosen} of bs on c0, chosen for car.1/rx"
     reach = beam.outline - [0.0, 20.0]
     in_front = reach[reach[:, 1] < 0]
     tip = in_front[np.argmax(np.linalg.norm(in_front, axis=1))]

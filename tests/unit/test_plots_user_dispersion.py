@@ -83,6 +83,6 @@ def test_the_axis_of_a_coherence_has_numbers(values: list[float]) -> None:
 
 
 def test_a_panel_without_a_value_says_why() -> None:
-    assert _why_empty(np.array([np.nan, np.inf])) == "infinite: one path in each frame"
+    assert _why_empty(np.array([np.nan, np.inf])) == "infinite, with one path in each frame"
     assert _why_empty(np.array([np.nan, -np.inf])) == "no direct path"
     assert _why_empty(np.array([np.nan])) == "no path"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import pickle
 import shutil
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 from recording_builders import absent, frame, link, product, record, recorder, scene
@@ -54,6 +57,17 @@ def test_it_gives_metadata_topics_and_typed_frames(run):
         assert stored.payloads("link", Link) == {"link": link(number)}
         assert stored.scene() == scene(number)
         assert [entry.status for entry in stored.inputs] == [Status.FRESH] * 2
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda given: pickle.loads(pickle.dumps(given))])  # noqa: S301
+def test_a_recording_and_its_topics_are_copied_and_pickled_as_their_files(run, monkeypatch, copied):
+    monkeypatch.chdir(run.parent)
+    recording = Recording(run.name)
+    other, topic, stored = copied((recording, recording["link"][2:4], recording.frame(0, 5)))
+    monkeypatch.chdir("/")
+    assert (other.run_digest(), len(other)) == (Recording(run).run_digest(), 6)
+    assert np.array_equal(topic.abs_y, Recording(run)["link"].abs_y[2:4])
+    assert stored.payloads("link", Link) == {"link": link(5)}
 
 
 def test_products_are_found_by_frame_and_by_topic(run):

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import Scenario, find_scenario, load_scenario, parse_scenario
+from caviar_protocol.scenario import (
+    Scenario,
+    find_scenario,
+    load_scenario,
+    parse_scenario,
+    read_toml,
+    set_keys,
+)
 from caviar_protocol.scenario.conversion import located
 from caviar_protocol.scenario.rules import with_overrides
 
@@ -426,3 +433,38 @@ def test_pattern_files_are_found_beside_the_scenario_and_differ_in_name(tmp_path
     (tmp_path / "two.toml").write_text(text + second + "array.pattern_file = 'file:b/sector.msi'\n")
     with pytest.raises(ScenarioError, match=r"two.toml:\d+: devices\[2\].array.pattern_file: .*rename one"):
         load_scenario(tmp_path / "two.toml")
+
+
+@pytest.mark.parametrize(
+    ("given", "key", "value"),
+    [
+        ("run.frames=7", "run.frames", 7),
+        ("services.world.budget_ms=1.5", "services.world.budget_ms", 1.5),
+        ("link.codebook=dft", "services.link.settings.codebook", "dft"),
+        ('run.record=["scene"]', "run.record", ["scene"]),
+        ("carriers.mmwave.frequency_hz=60e9", "carriers.0.frequency_hz", 60e9),
+        ("carriers[0].name=mm wave", "carriers.0.name", "mm wave"),
+    ],
+)
+def test_keys_of_a_scenario_are_set_from_outside(given: str, key: str, value: object) -> None:
+    table, source = read_toml(find_scenario("smoke").read_text())
+    set_keys(table, source, [given])
+    for part in key.split("."):
+        table = table[int(part) if isinstance(table, list) else part]
+    assert table == value
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("run.frames", "--set run.frames: write it as in --set services"),
+        ("run.frames=0", "run.frames: is 0, write a whole number"),
+        ("run.frmes=3", "run.frmes.*frames"),
+        ("carriers.7.bandwidth_hz=1", "there is no '7'; there are: mmwave"),
+        ("run.name.first=3", "run.name is a value, and has no keys"),
+        ("chanel.samples=3", "chanel"),
+    ],
+)
+def test_keys_that_cannot_be_set_are_refused_by_name(given: str, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario("smoke", [given])

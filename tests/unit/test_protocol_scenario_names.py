@@ -19,13 +19,17 @@ def test_every_shipped_scenario_is_loaded_by_its_name_from_any_folder(
         assert load_scenario(name) == load_scenario(path)
 
 
-def test_a_file_comes_before_the_shipped_scenario_of_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("own", ["smoke", "smoke.toml"])
+def test_a_name_that_is_a_shipped_scenario_and_a_file_here_is_refused(
+    own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("smoke").write_text("x")
-    assert find_scenario("smoke") == Path("smoke")
-    assert find_scenario("./geometric") == Path("geometric")
+    shipped = find_scenario("smoke")
+    Path(own).write_text("x")
+    with pytest.raises(ScenarioError, match=rf"^smoke is .*, and {own} is a file here: write .*/{own} or .*"):
+        find_scenario("smoke")
+    assert find_scenario("smoke.toml") == Path("smoke.toml")
+    assert find_scenario(str(shipped)) == shipped
 
 
 @pytest.mark.parametrize(

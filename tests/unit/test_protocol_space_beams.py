@@ -10,6 +10,7 @@ from link_builders import random_h
 
 from caviar_protocol.space.beams import (
     beam_gain,
+    beam_gains,
     beam_towards,
     coupled_polarizations,
     straight_beams,
@@ -17,7 +18,6 @@ from caviar_protocol.space.beams import (
 )
 from caviar_protocol.topics import AntennaArray, Panel
 from caviar_services.antenna_arrays import dft_beam, dft_codebook, pointing_directions, steering_vector
-from caviar_services.link.beam_sweep import sweep
 
 CROSS = AntennaArray(rows=2, columns=4, polarization="cross")
 SIDES = (Panel(position_m=(0.0, 0.1, 0.0), yaw_deg=90.0), Panel(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0))
@@ -49,7 +49,7 @@ def test_a_codebook_has_the_beams_of_each_subarray_and_is_unitary(array: Antenna
 def test_the_sweep_is_eq_1_beam_by_beam(tx: AntennaArray, rx: AntennaArray) -> None:
     h = random_h(3, rx.size, tx.size)
     expected = np.abs(dft_codebook(rx).conj() @ h @ dft_codebook(tx).conj().T).T
-    np.testing.assert_allclose(sweep(h, tx, rx), expected, atol=1e-12)
+    np.testing.assert_allclose(beam_gains(h, tx, rx), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("array", [CROSS, PHONE])
@@ -89,7 +89,7 @@ def test_one_wave_between_dual_arrays_is_heard_with_full_gain_on_its_polarizatio
     at = steering_vector(subarrays(tx)[0].array, pointing_directions(tx, 3)[0])
     ar = steering_vector(subarrays(rx)[0].array, pointing_directions(rx, 1)[0])
     h = np.kron(np.diag([2e-6, 5e-6]), np.outer(ar, at))  # V to V and, stronger, H to H
-    y = sweep(h, tx, rx)
+    y = beam_gains(h, tx, rx)
     assert y[3, 1] == pytest.approx(2e-6 * math.sqrt(32))
     assert y[8 + 3, 4 + 1] == pytest.approx(5e-6 * math.sqrt(32))
     assert np.sort(y.ravel())[-3] < 1e-18

@@ -93,3 +93,25 @@ def test_faces_may_have_numbers_beside_their_corners(
     assert np.array_equal(vertices, VERTICES)
     corners = [face[1:] for face in faces]
     assert triangles.tolist() == [[c[0], c[i], c[i + 1]] for c in corners for i in range(1, len(c) - 1)]
+
+
+@pytest.mark.parametrize("first", range(6))
+@pytest.mark.parametrize("sense", [1, -1])
+def test_polygons_that_are_not_convex_are_cut_within_their_border(
+    tmp_path: Path, first: int, sense: int
+) -> None:
+    """An L-shaped roof of 3 m² on a slope: triangles cover it once, all in its sense."""
+    outline = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], np.float64)
+    corners = np.column_stack([outline.sum(1), outline])[::sense]  # the header says z, x, y
+    rows = "\n".join(" ".join(map(str, corner)) for corner in np.roll(corners, first, axis=0))
+    head = header("ascii", "double").replace("vertex 3", "vertex 6").replace("property uchar red\n", "")
+    file = tmp_path / "roof.ply"
+    file.write_text(f"{head}{rows}\n6 0 1 2 3 4 5\n")
+    vertices, triangles = read_ply(file)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    areas = np.cross(b - a, c - a)[:, 2] / 2 * sense
+    assert len(areas) == 4
+    assert areas.min() >= 0
+    assert areas.sum() == pytest.approx(3.0)
+    middles = (a + b + c)[areas > 0, :2] / 3
+    assert not (middles > 1).all(1).any()

@@ -19,7 +19,7 @@ from caviar_protocol.scenario import find_scenario, parse_scenario, shipped_scen
 from caviar_services.registry import scenario_schema
 
 ROOT = Path(__file__).resolve().parents[2]
-# Experiments, which `caviar train` takes, ship beside the scenarios.
+# Experiments, which `caviar policy train` takes, ship beside the scenarios.
 SHIPPED = sorted((ROOT / "deploy" / "caviar_scenarios").rglob("*.toml"))
 FILES = [
     *(path for path in SHIPPED if "experiment" not in tomllib.loads(path.read_text())),

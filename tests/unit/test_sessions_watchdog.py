@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+from msgspec.structs import replace as replace_field
 
 from caviar_broker.core.plan import briefings, plan_run
 from caviar_clients.session import watchdog
-from caviar_clients.session.checks import check_implementations
+from caviar_clients.session.checks import check_implementations, checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun, EmbeddedSession
 from caviar_protocol.messages import Grant, Input
 from caviar_protocol.scenario import Scenario, parse_scenario
@@ -197,3 +198,11 @@ def test_an_order_to_stop_names_what_keeps_the_run_from_its_end(
     assert (outcome.error, run.statistics.frames) == ("enough of it", 2)
     assert ["waiting for agent 'agent' in frame 2" in text for text in told] == [True]
     assert not set(threading.enumerate()) - before
+
+
+def test_misses_of_a_run_in_one_process_are_counted_after_its_first_frame(tmp_path: Path) -> None:
+    scenario = checked_scenario(Path("smoke"), 4)
+    services = {name: replace_field(spec, budget_ms=1e-6) for name, spec in scenario.services.items()}
+    run = EmbeddedRun(replace_field(scenario, services=services), tmp_path)
+    assert run.run().error == ""
+    assert {s.frames - s.misses for s in run.statistics.services().values()} == {1}

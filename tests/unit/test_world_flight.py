@@ -96,6 +96,30 @@ def test_a_waypoint_is_reached_without_passing_it_or_any_limit(target: Vector, s
     assert np.linalg.norm(slow) < 1e-2
 
 
+@pytest.mark.parametrize("dynamics", ["point", "quadrotor"])
+@pytest.mark.parametrize("moving", [(0.0, 0.0, 0.0), (0.0, -3.0, 0.0)])
+def test_a_heading_is_kept_turned_to_or_turned_as_commanded_wherever_it_flies(
+    dynamics: str, moving: Vector
+) -> None:
+    made = world(flown(dynamics=dynamics))
+    turns = fly(made, VelocityCommand(object="uav", velocity=moving, yaw_rate=0.5), 40)
+    turned, scene = state(turns[-1])[2], turns[-1].products["scene"]
+    assert turned == pytest.approx(2.0, abs=0.08)  # a body follows its set-point with a lag
+    assert isinstance(scene, Scene)
+    assert scene.angular_velocity is not None
+    assert scene.angular_velocity[0, 2] == pytest.approx(0.5, abs=0.05)
+    to = fly(made, VelocityCommand(object="uav", velocity=moving, yaw=-2.0), 40, 41)
+    # The short way round, over ±π, and a point never faster than 120 °/s.
+    course = np.unwrap([turned, *(state(result)[2] for result in to)])
+    assert course[-1] == pytest.approx(2.0 * math.pi - 2.0, abs=0.02)
+    if dynamics == "point":
+        assert np.abs(np.diff(course)).max() <= math.radians(12.0) + 1e-9
+    there = fly(made, WaypointCommand(object="uav", position=(9.0, 0.0, 30.0), speed=5.0, yaw=-2.0), 60, 81)
+    assert state(there[-1])[2] == pytest.approx(-2.0, abs=0.02)
+    put = WaypointCommand(object="uav", position=(5.0, 5.0, 9.0), speed=5.0, at_once=True, yaw=1.0)
+    assert state(fly(made, put, 1, 141)[0])[2] == pytest.approx(1.0, abs=0.01)
+
+
 @given(st.tuples(coordinates, coordinates, st.floats(0.0, 80.0)))
 @settings(max_examples=40, deadline=None)
 def test_a_velocity_is_taken_up_with_the_greatest_acceleration(asked: Vector) -> None:

@@ -133,7 +133,7 @@ def test_a_missing_mesh_is_named_with_file_line_and_shape(tmp_path: Path) -> Non
         '<shape type="ply" id="mesh-b">\n<string name="filename" value="meshes/roof.ply"/></shape>',
     )
     with pytest.raises(
-        AssetError, match=r"city\.xml:4: <shape> mesh-b names 'meshes/roof\.ply'.*put it there"
+        AssetError, match=r"city\.xml:3: shape 'mesh-b': mesh .*meshes/roof\.ply is missing; put it there"
     ):
         scenery_assets(str(xml))
 
@@ -154,7 +154,7 @@ def test_an_include_is_refused_with_what_to_do(tmp_path: Path) -> None:
 def test_broken_xml_is_named_with_its_line(tmp_path: Path) -> None:
     xml = tmp_path / "city.xml"
     xml.write_text("<scene>\n<shape>\n</scene>")
-    with pytest.raises(AssetError, match=r"city\.xml:3: not well-formed"):
+    with pytest.raises(AssetError, match=r"city\.xml:3: broken XML"):
         scenery_assets(str(xml))
 
 

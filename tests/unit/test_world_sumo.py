@@ -25,7 +25,7 @@ from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.people import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
-from caviar_services.world.sumo_process import check_file, load_libsumo
+from caviar_services.world.sumo_process import load_libsumo
 from caviar_services.world.sumo_steps import step_length_ms
 
 pytestmark = [
@@ -403,22 +403,9 @@ def test_what_is_wrong_with_files_is_named(make: Make, tmp_path: Path) -> None:
         make(meshes=("cart",))
 
 
-@pytest.mark.parametrize("later", ['<flow id="later" begin="0"', '<trip id="later" depart="0.5"'])
-def test_traffic_that_sumo_would_leave_out_is_named_with_its_line(tmp_path: Path, later: str) -> None:
-    routes = tmp_path / "traffic.rou.xml"
-    first = '<flow id="first" begin="1" end="9" period="2" from="a" to="b"/>'
-    routes.write_text(f'<routes>\n{first}\n{later} from="a" to="b"/>\n</routes>\n')
-    with pytest.raises(ScenarioError, match=r"'later' departs at 0.* after flow 'first' at 1 s") as caught:
-        check_file("routes", str(routes))
-    assert (caught.value.line, caught.value.key) == (3, "settings.routes")
-    routes.write_text(f'<routes>\n{later} from="a" to="b"/>\n{first}\n</routes>\n')
-    check_file("routes", str(routes))
-
-
 def test_what_sumo_refuses_is_said_in_its_words(make: Make) -> None:
-    world = make(options=("--no-such-option",))
     with pytest.raises(SetupError, match=r"SUMO does not start: .*--no-such-option"):
-        world.reset(0, 1, 0)
+        make(options=("--no-such-option",))
 
 
 def test_a_route_over_unknown_roads_ends_the_run_with_sumos_words(make: Make, tmp_path: Path) -> None:
@@ -426,6 +413,47 @@ def test_a_route_over_unknown_roads_ends_the_run_with_sumos_words(make: Make, tm
     routes.write_text('<routes><vehicle id="lost" depart="0"><route edges="nowhere"/></vehicle></routes>')
     with pytest.raises(CaviarError, match=r"SUMO .*'nowhere'.*'lost'"):
         scenes(make(routes=str(routes)), 1, 2)
+
+
+CORNER = '<nodes><node id="a" x="0" y="0"/><node id="b" x="99" y="0"/><node id="c" x="99" y="99"/></nodes>'
+TWO_ROADS = """<edges><edge id="ab" from="a" to="b"/><edge id="bc" from="b" to="c"/></edges>"""
+TRAIN_AND_GAP = """<routes><vType id="long" vClass="bus" length="{length}"/><vType id="c"/>
+<vehicle id="turns" type="long" depart="0" departPos="60"><route edges="ab bc"/></vehicle>
+<vehicle id="gap" type="c" depart="{gap}"><route edges="bc ab"/></vehicle></routes>"""
+
+
+def bent(folder: Path, length: float, gap: float) -> dict[str, str]:
+    """A right angle of road, a vehicle that takes it, and one whose route leads nowhere."""
+    (folder / "r.nod.xml").write_text(CORNER)
+    (folder / "r.edg.xml").write_text(TWO_ROADS)
+    (folder / "r.rou.xml").write_text(TRAIN_AND_GAP.format(length=length, gap=gap))
+    converted(folder)
+    return {"net": str(folder / "r.net.xml"), "routes": str(folder / "r.rou.xml")}
+
+
+@pytest.mark.parametrize(("length", "named"), [(40.0, True), (11.0, False)])
+def test_a_vehicle_too_long_for_its_bend_is_named(
+    make: Make, tmp_path: Path, length: float, named: bool
+) -> None:
+    world = make(**bent(tmp_path, length, gap=500.0), begin_s=0.0)
+    world.reset(0, 1, 0)
+    frames = [Frame(episode=0, number=k, t_ns=k * T_SAM_NS) for k in range(100)]
+    found = [world.step(frame).counts.get("beside-road/traffic.turns", 0) for frame in frames]
+    assert bool(sum(found)) is named
+    assert not any(found[:5])
+
+
+def test_a_route_with_a_gap_is_said_in_words_and_its_jump_is_counted(make: Make, tmp_path: Path) -> None:
+    files = bent(tmp_path, 11.0, gap=0.0)
+    with pytest.raises(CaviarError, match=r"SUMO .*'gap' has no valid route"):
+        scenes(make(**files, begin_s=0.0), 1, 2)
+    world = make(**files, begin_s=0.0, options=("--ignore-route-errors", "--time-to-teleport", "1"))
+    world.reset(0, 1, 0)
+    counts = Counter[str]()
+    for k in range(200):
+        counts.update(world.step(Frame(episode=0, number=k, t_ns=k * T_SAM_NS)).counts)
+    jumps = [name for name in counts if name.startswith("simulator-says/Teleporting vehicle …")]
+    assert sum(counts[name] for name in jumps) == 1
 
 
 def test_two_simulations_in_one_process_are_refused(make: Make) -> None:

@@ -183,7 +183,9 @@ class Deadlines:
         if self._plan.ephemeral:
             return
         elapsed = now - task.started_at
-        missed = task.overran or elapsed > self._table.participants[task.service].plan.budget_ns
+        plan = self._table.participants[task.service].plan
+        missed = task.overran or elapsed > plan.budget_ns
+        missed = missed and not self._plan.is_warm_up(plan, self._episode, task.frame)
         if missed and not task.overran:
             self.overruns.append((task, "answered before the frame went on"))
         self._actions.append(Latency(task.service, self._episode, task.frame, elapsed, missed))
@@ -217,10 +219,12 @@ class Deadlines:
             self._expire(participant, task, deadline, now)
 
     def _expire(self, participant: Participant, task: Task, deadline: int, now: int) -> None:
-        self._actions.append(Overdue(task.service, self._episode, task.frame, deadline))
         plan, granted = participant.plan, task.state is _GRANTED
         # Noted before the policy is asked: `measure` counts a miss under each of them.
         task.overran = granted
+        if self._plan.is_warm_up(plan, self._episode, task.frame):
+            return
+        self._actions.append(Overdue(task.service, self._episode, task.frame, deadline))
         if plan.ends_run_when_late:
             self.aborted = self.aborted or task
             return

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from caviar_protocol.fields import Version, required_knowledge
+from caviar_protocol.fields import SINCE, Version, parse_version, required_knowledge
 from caviar_protocol.messages import Asset, GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec, instants_ns
 from caviar_protocol.scenario.conversion import Source
@@ -165,6 +165,13 @@ class RunPlan:
         """Whether services save their state."""
         return self.checkpoint_frames > 0 and not self.ephemeral
 
+    def is_warm_up(self, service: ServicePlan, episode: int, frame: int) -> bool:
+        """Whether a service still compiles in a frame, which waits for it without a miss.
+
+        It is the run's first one, under ``wait``.
+        """
+        return service.waits_for_answer and frame == 0 and episode == self.first_episode
+
     def t_ns(self, frame: int) -> int:
         """Simulated time of a frame of any episode [ns]; one past the last comes a period later."""
         if not self.instants_ns:
@@ -233,7 +240,13 @@ def _features(scenario: Scenario, world: str) -> tuple[Feature, ...]:
     """What the devices of a world, or of all for the empty name, need a service to know."""
     found = []
     for index, device in enumerate(scenario.devices):
-        if device.array is not None and (not world or world_of(scenario, index) == world):
+        if world and world_of(scenario, index) != world:
+            continue
+        if device.carriers:
+            text = f"carriers of device {device.name!r}"
+            since = parse_version(SINCE["AntennaDevice.carriers"])
+            found.append(Feature(f"devices[{index}].carriers", text, since))
+        if device.array is not None:
             for field, value, since in required_knowledge(device.array):
                 shown = repr(value) if isinstance(value, str) else f"{len(value)} of them"
                 text = f"{field} ({shown}) of device {device.name!r}"

@@ -24,6 +24,7 @@ from caviar_broker.control.socket import Ask, ask_in_thread, call_at_end, connec
 from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.supervision import describe_exit
 from caviar_protocol.errors import CaviarError, RunError, SetupError
+from caviar_protocol.host import PYTHON
 from caviar_protocol.keys import Credentials, Pair
 from caviar_protocol.run_directory import RunDirectory
 
@@ -62,7 +63,7 @@ class HttpProcess:
         # Of its own, so that no request takes time from the loop that serves frames.
         if not self._address:
             return
-        command = [sys.executable, "-m", "caviar_broker.http", str(self._directory), "--http", self._address]
+        command = [*PYTHON, "-m", "caviar_broker.http", str(self._directory), "--http", self._address]
         command += ["--keys", str(self._keys)] if self._keys is not None else []
         log = RunDirectory(self._directory).log("http")
         log.parent.mkdir(exist_ok=True)

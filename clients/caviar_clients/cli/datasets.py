@@ -1,4 +1,4 @@
-"""``caviar generate``, ``caviar look`` and ``caviar tables``: datasets of episodes."""
+"""``caviar dataset``: datasets of episodes are generated, looked at, verified, and tabulated."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from rich.text import Text
 
 from caviar_clients.cli.shared import (
     FiguresFile,
+    Record,
+    Set,
     complete_scenario,
     counted,
+    keys_set,
     print_line,
     progress_bar,
     require_installed,
@@ -78,6 +81,8 @@ def generate_command(
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")
     ] = None,
+    set_: Set = None,
+    record: Record = None,
     workers: Annotated[int, typer.Option(min=0, help="processes that play; 0: one for each core")] = 0,
     scheduler: Annotated[
         str, typer.Option(help="address of a Dask scheduler, tcp://HOST:8786, instead of own processes")
@@ -93,22 +98,22 @@ def generate_command(
     from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
     from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
     from caviar_clients.session.checks import checked_scenario
-    from caviar_protocol.scenario import find_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
+    settings = keys_set(set_, record)
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
-        loaded = apply_preset(preset, checked_scenario(find_scenario(scene or preset.scenario)))
+        loaded = apply_preset(preset, checked_scenario(scene or preset.scenario, settings=settings))
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
-        loaded = checked_scenario(find_scenario(scenario))
+        loaded = checked_scenario(scenario, settings=settings)
     for extra in dict.fromkeys(more or ()):
         require_known("--with", extra, ("camera",))
         loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
-    require_installed(f"caviar generate {scenario}", ("datasets", *extras_of(loaded)))
+    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(loaded)))
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
     if overwrite:
         _remove(out)
@@ -158,7 +163,7 @@ def tables_command(
 
     require_known("--format", form, ("csv", "parquet"))
     if form == "parquet":
-        require_installed("caviar tables --format parquet", ["datasets"])
+        require_installed("caviar dataset tables --format parquet", ["datasets"])
     if out is not None:
         check_out(out)
     check_level(dataset)
@@ -175,7 +180,7 @@ def look_command(
     ] = None,
 ) -> None:
     """Write a page of a dataset: what it is, maps, histograms, samples, and how it was generated."""
-    require_installed("caviar look", ["plot"])
+    require_installed("caviar dataset look", ["plot"])
     from caviar_clients.datasets.look.page import write_page
     from caviar_clients.datasets.reader import check_level
 

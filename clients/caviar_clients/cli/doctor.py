@@ -33,7 +33,7 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.files import PrivateFolder
-from caviar_protocol.host import DISTRIBUTION, install_command
+from caviar_protocol.host import DISTRIBUTION, PYTHON, install_command
 from caviar_protocol.scenario import load_scenario, shipped_scenarios
 from caviar_services import drjit_setup
 
@@ -188,7 +188,7 @@ def check_frames() -> Check:
 
 def _two_frames(folder: Path) -> tuple[Finished, float]:
     """How two embedded frames of `smoke` end, and their mean |y|."""
-    outcome = EmbeddedRun(checked_scenario(Path("smoke"), frames=2), folder).run()
+    outcome = EmbeddedRun(checked_scenario(shipped_scenarios()["smoke"], frames=2), folder).run()
     figures = recorded_figures(folder)
     return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 
@@ -210,7 +210,7 @@ def check_llvm() -> Check:
         return Check("LLVM", False, str(error), drjit_setup.INSTALL)
     if not tracer:
         return Check("LLVM", True, f"{library}; not tried, Dr.Jit is not installed")
-    ok, text = _run([sys.executable, "-c", _KERNEL], {drjit_setup.ENVIRONMENT: str(library.path)})
+    ok, text = _run([*PYTHON, "-c", _KERNEL], {drjit_setup.ENVIRONMENT: str(library.path)})
     found = f"{library}; compiled a kernel" if ok else f"{library} cannot compile: {text}"
     return _check("LLVM", ok, found, drjit_setup.INSTALL)
 
@@ -227,7 +227,7 @@ def check_sumo() -> Check:
     if spec is None or not spec.submodule_search_locations:
         return Check("SUMO", False, "not installed", install_command("world"), extra="world")
     home = Path(next(iter(spec.submodule_search_locations)))
-    for command in ([str(home / "bin" / "netconvert"), "--version"], [sys.executable, "-c", _SUMO]):
+    for command in ([str(home / "bin" / "netconvert"), "--version"], [*PYTHON, "-c", _SUMO]):
         ok, text = _run(command, {"SUMO_HOME": str(home)})
         if not ok:
             return Check("SUMO", False, f"does not load: {text}", SUMO_LIBRARIES)

@@ -6,9 +6,8 @@ import json
 import os
 import selectors
 import subprocess
-import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,9 +19,11 @@ from caviar_clients.cli.processes import Child, end, wait
 from caviar_clients.session.checks import module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import PrivateFolder, file_system_of, open_to_append
+from caviar_protocol.host import PYTHON
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
+from caviar_services.registry import load
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -63,6 +64,7 @@ class Launcher:
         resume: Whether the run in the directory is resumed, whatever path, frames, seed and pace are.
         force: Whether it is, though code, libraries or files have changed.
         airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
     """
 
     scenario: Scenario
@@ -77,6 +79,7 @@ class Launcher:
     force: bool = False
     pace: str | None = None
     airsim: str = ""
+    settings: Sequence[str] = ()
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
     refused: bool = False
@@ -152,6 +155,8 @@ class Launcher:
         if self._broker is None:
             self._start_broker()
         while not self._finished:
+            if not self._over and not self.directory.exists():
+                self.stop("its directory was deleted")
             for key, _ in self._selector.select(LOOK_S):
                 if self._selector.get_map().get(key.fd) is not key:
                     # An earlier event of this batch, the broker's end, replaced all services, and one of
@@ -206,10 +211,11 @@ class Launcher:
             arguments += ["--pace", self.pace]
         if self.airsim:
             arguments += ["--airsim", self.airsim]
+        arguments += [f"--set={text}" for text in self.settings]
         return arguments
 
     def _start_broker(self) -> None:
-        command = [sys.executable, "-m", "caviar_broker", *self._broker_arguments()]
+        command = [*PYTHON, "-m", "caviar_broker", *self._broker_arguments()]
         command += ["--http", self.http] if self.http else []
         command += [*self._key.options(), "--control", "--supervised", *self._local]
         with open_to_append(self._log) as log:
@@ -237,8 +243,10 @@ class Launcher:
 
     def _start(self, name: str) -> None:
         spec, path = self._local[name], RunDirectory(self.directory).log(name)
-        command = [sys.executable, "-m", "caviar_services", name]
+        command = [*PYTHON, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
+        if wanted := load(spec.role, spec.use).inputs_with(spec.settings):
+            command += ["--inputs", *(".".join((i.topic, *i.parts)) for i in wanted)]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]
         child = Child.start(name, command, path, {**self._threads, **self._key.environment()})

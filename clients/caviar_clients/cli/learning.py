@@ -1,4 +1,4 @@
-"""``caviar train``, ``caviar export-policy``, ``caviar evaluate`` and ``caviar swap``: trained policies."""
+"""``caviar policy``: policies are trained, exported, evaluated, and swapped in a running run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def train_command(
             results = train_experiment(loaded, out, jobs or cores(), report)
     except KeyboardInterrupt:
         print_line(
-            console, f"stopped; caviar train {experiment} --out {out} goes on: {_steps_of(loaded, out)}"
+            console,
+            f"stopped; caviar policy train {experiment} --out {out} goes on: {_steps_of(loaded, out)}",
         )
         raise
     console.print(_results_table(loaded, folder, results))
@@ -147,6 +148,12 @@ def export_command(
     on: Annotated[str, typer.Option("--on", help="scenario that it was trained on, by name or file")],
     users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
     steps: Annotated[int, typer.Option(min=0, help="of training, for the card")] = 0,
+    normalization: Annotated[
+        Path | None, typer.Option(help="statistics of the VecNormalize that it was trained behind")
+    ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="the model is from you: to read it runs what is pickled in it")
+    ] = False,
 ) -> None:
     """Write a trained model as an ONNX policy, with its card, for the agent `policy`."""
     from caviar_clients.envs.base import BeamSelectionEnv
@@ -162,6 +169,11 @@ def export_command(
         ) from error
     if not model.is_file():
         raise ScenarioError(f"{model}: there is no such file; give the zip file that model.save() wrote")
+    if not trust:
+        raise ScenarioError(
+            f"{model} is a model of Stable-Baselines3, and to read one runs the code that is pickled in it; "
+            "give --trust if you know who wrote it"
+        )
     try:
         trained = getattr(stable_baselines3, algorithm.upper()).load(model, device="cpu")
     except Exception as error:  # whatever a file that is no model makes it raise
@@ -178,11 +190,22 @@ def export_command(
         warnings.simplefilter("ignore")
         env = BeamSelectionEnv(on, observe=tuple(spaces), users=users)
     wanted, found = trained.action_space, env.action_space
-    if wanted != found or trained.observation_space != env.observation_space:
+    # Bounds are looked at by `export_policy`, which says what they come from.
+    if wanted != found or _spaces(trained.observation_space) != _spaces(env.observation_space):
         raise ScenarioError(
             f"{model} was trained for actions {wanted} and {_spaces(trained.observation_space)}, and {on} "
             f"has {found} and {_spaces(env.observation_space)}; name scenario and users of its training"
         )
+    if normalization is not None:
+        from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+        try:
+            trained.set_env(VecNormalize.load(str(normalization), DummyVecEnv([lambda: env])))
+        except Exception as error:  # whatever a file that is none makes it raise
+            raise ScenarioError(
+                f"{normalization} cannot be read as statistics of VecNormalize: {error}; give the file that "
+                "its save() wrote"
+            ) from error
     card = export_policy(trained, env, policy, steps=steps or int(trained.num_timesteps))
     typer.echo(f"{policy}: {card.algorithm}, observes {', '.join(card.observe)}, {policy.stat().st_size:,} B")
 
@@ -209,7 +232,7 @@ def evaluate_command(
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:
     """Hold a policy against los-beam, random, the optimum and other agents, LOS and NLOS apart."""
-    from caviar_clients.learning.evaluate import BASELINES, KINDS, evaluate
+    from caviar_clients.learning.evaluate import BASELINES, evaluate
 
     rivals: dict[str, dict[str, Any]] = {name: {} for name in (BASELINES if against is None else against)}
     rivals |= _settings_of(settings or [])
@@ -225,35 +248,60 @@ def evaluate_command(
     for table in _evaluation_tables(made):
         console.print(table)
     if json is not None:
+        played = [seed for seed in chosen for _ in range(episodes)]
         write_json(
             json,
             {
                 "frames": dict(made.frames),
-                "abs_y": {m: {k: vars(means[k]) for k in KINDS} for m, means in made.found.items()},
+                "abs_y": {m: {k: vars(mean) for k, mean in means.items()} for m, means in made.found.items()},
                 "spectral_efficiency": {m: vars(mean) for m, mean in made.efficiency.items()},
                 "pilots": dict(made.pilots),
+                "episodes": {"seeds": played, "abs_y": dict(made.by_episode)},
+                "policy_minus": {
+                    m: {k: vars(made.difference(m, k)) for k in means}
+                    for m, means in made.found.items()
+                    if m != "policy"
+                },
             },
         )
 
 
-def _evaluation_tables(made: Evaluation) -> tuple[Table, Table]:
-    """|y|, and what pilots cost: two tables, as 80 columns hold no more."""
+def _evaluation_tables(made: Evaluation) -> Iterator[Table]:
+    """|y| by frames, by station where there are several, and what pilots cost: 80 columns hold no more."""
     from caviar_clients.learning.evaluate import KINDS
 
-    exponent = _common_exponent([means[kind].mean for means in made.found.values() for kind in KINDS])
-    unit = f" in 10{str(exponent).translate(_RAISED)}" if exponent else ""
-    gains = Table(title=f"mean |y|{unit}, by frames", title_justify="left")
-    gains.add_column("", overflow="fold")
-    for kind in KINDS:
-        gains.add_column(f"{kind} ({made.frames[kind]:,})", justify="right", no_wrap=True)
-    costs = Table(title="pilots, and the spectral efficiency that they leave", title_justify="left")
+    yield _gains(made, KINDS, "frames")
+    # Of each a table: |y| of carriers is orders of magnitude apart.
+    for station in (kind for kind in made.frames if kind not in KINDS):
+        yield _gains(made, (station,), "station")
+    title = "mean |y|² over random and below the optimum, pilots, and what these leave"
+    costs = Table(title=title, title_justify="left")
     costs.add_column("", overflow="fold")
+    costs.add_column("gain dB", justify="right", no_wrap=True)
+    costs.add_column("loss dB", justify="right", no_wrap=True)
     costs.add_column("pilots a frame", justify="right", no_wrap=True)
     costs.add_column("bit/s/Hz left", justify="right", no_wrap=True)
+    for method in made.found:
+        gain = _decibels(made.power[method], made.power["random"])
+        loss = _decibels(made.power["optimum"], made.power[method])
+        costs.add_row(method, gain, loss, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
+    yield costs
+
+
+def _gains(made: Evaluation, kinds: Sequence[str], by: str) -> Table:
+    exponent = _common_exponent([means[kind].mean for means in made.found.values() for kind in kinds])
+    unit = f" in 10{str(exponent).translate(_RAISED)}" if exponent else ""
+    gains = Table(title=f"mean |y|{unit}, by {by}", title_justify="left")
+    gains.add_column("", overflow="fold")
+    for kind in kinds:
+        gains.add_column(f"{kind} ({made.frames[kind]:,})", justify="right", no_wrap=True)
     for method, means in made.found.items():
-        gains.add_row(method, *(_short(means[kind], exponent) for kind in KINDS))
-        costs.add_row(method, f"{made.pilots[method]:.4g}", _short(made.efficiency[method]))
-    return gains, costs
+        gains.add_row(method, *(_short(means[kind], exponent) for kind in kinds))
+    return gains
+
+
+def _decibels(power: float, reference: float) -> str:
+    return f"{10 * math.log10(power / reference):.1f}" if power > 0 and reference > 0 else ""
 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -306,7 +354,7 @@ def swap_command(
     from caviar_broker.policies import awaited_outcome, offer_policy
     from caviar_clients.cli.remote import RUNS, newest_run
 
-    directory = run if run is not None else newest_run(RUNS, f"caviar swap {policy} --run RUN")
+    directory = run if run is not None else newest_run(RUNS, f"caviar policy swap {policy} --run RUN")
     try:
         content = policy.read_bytes()
     except OSError as error:
@@ -320,6 +368,6 @@ def swap_command(
     if found["state"] == "offered":
         raise RunError(
             f"agent {name!r} has not decided a frame with {policy} within {wait:g} s, and will as soon "
-            f"as it can: caviar why {directory} says what the run waits for"
+            f"as it can: caviar status {directory} says what the run waits for"
         )
     typer.echo(f"{name} serves {policy} (SHA-256 {digest[:12]}…) from frame {found['frame']} on")

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 from rich.text import Text
+from typer.core import TyperGroup
 
 from caviar_clients.cli.datasets import (
     generate_command,
@@ -24,12 +26,14 @@ from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
     AirSim,
     Embedded,
+    Episodes,
     FiguresFile,
     Force,
     Frames,
     Http,
     Keys,
     Pace,
+    Record,
     Restarted,
     Resume,
     RunDirectory,
@@ -37,24 +41,52 @@ from caviar_clients.cli.shared import (
     ScenarioOrNone,
     ScenarioOrRun,
     Seed,
+    Set,
     SummaryFile,
+    keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
 
-RUN, LOOK, MEASURE, OPERATE = "Run", "Look", "Measure", "Operate"
-"""Groups of commands in the help."""
+PANELS = RUN, LOOK, DATASETS, POLICIES, MEASURE, OPERATE = (
+    "Run", "Look at a run", "Datasets", "Policies", "Measure", "Operate"
+)  # fmt: skip
+"""Panels of commands in the help, in their order."""
+
+
+class _Commands(TyperGroup):
+    """Group of all commands, listed by their panels."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        shown = [(name, command) for name, command in self.commands.items() if not command.hidden]
+        shown.sort(key=lambda item: PANELS.index(getattr(item[1], "rich_help_panel", "")))
+        return [name for name, _ in shown]
+
+
+class _PlotGroup(TyperGroup):
+    """Group of ``caviar plot``, whose command `run` is meant where none is named: ``caviar plot RUN``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = args[:1] and args[0] in (*self.commands, *ctx.help_option_names)
+        if not named and not ctx.resilient_parsing:  # a shell that completes is offered all commands
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
 
 # Commands import what they need when they run: `caviar --help` and completion in a shell load none of it.
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,  # a bug shows the traceback of Python, which reports can quote
 )
+pictures = typer.Typer(
+    cls=_PlotGroup, help="Draw a run, map its coverage, or make a video: plot RUN, map, video."
+)
+dataset = typer.Typer(no_args_is_help=True, help="Datasets: generate, look, verify, tables.")
+policy = typer.Typer(no_args_is_help=True, help="Trained policies: train, evaluate, export, swap.")
+measure = typer.Typer(no_args_is_help=True, help="Time and error: budget, bench, tradeoff, stability.")
 bench = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
-app.add_typer(bench, name="bench", rich_help_panel=MEASURE)
-app.add_typer(paper, name="paper", rich_help_panel=MEASURE)
-app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
 _console = Console()
 # Warnings, errors and progress: what a command prints on standard output can be piped.
 _errors = Console(stderr=True)
@@ -93,7 +125,10 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
+    episodes: Episodes = None,
     seed: Seed = None,
+    set_: Set = None,
+    record: Record = None,
     json: SummaryFile = None,
     out: RunsFolder = Path("runs"),
     bind: Annotated[
@@ -111,12 +146,15 @@ def run(
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
     from caviar_clients.cli.run import resume_run, run_scenario
 
-    source = _started_anew(resume, scenario, frames, seed, embedded or None, pace, airsim or None)
+    keys_given = keys_set(set_, record, episodes)
+    source = _started_anew(
+        resume, scenario, frames, seed, embedded or None, pace, airsim or None, keys_given or None
+    )
     if resume is not None:
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
         ended = run_scenario(
-            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim, keys_given
         )
     raise typer.Exit(ended.status)
 
@@ -157,7 +195,7 @@ def schema(
         write_file(out, text + "\n")
 
 
-@app.command(rich_help_panel=RUN)
+@app.command(rich_help_panel=OPERATE)
 def broker(
     scenario: ScenarioOrNone = None,
     bind: Annotated[
@@ -186,7 +224,7 @@ def broker(
     raise typer.Exit(serve_broker(source, out, frames, seed, pace, bind, keys, options))
 
 
-@app.command(rich_help_panel=RUN)
+@app.command(rich_help_panel=OPERATE)
 def service(
     name: Annotated[str, typer.Argument(help="name of the service in the scenario")],
     use: Annotated[str, typer.Option(help="implementation, as ROLE:NAME, for example channel:sionna-rt")],
@@ -212,7 +250,7 @@ def service(
 
 
 @app.command(rich_help_panel=LOOK)
-def why(
+def status(
     run: Annotated[
         Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
     ] = None,
@@ -239,7 +277,7 @@ def doctor(
     raise typer.Exit(checks.exit_status(found))
 
 
-@app.command(rich_help_panel=MEASURE)
+@measure.command()
 def stability(
     group: Annotated[list[str] | None, typer.Option(help="only this group of cases; may be repeated")] = None,
     json: Annotated[Path | None, typer.Option(help="write the results to this file")] = None,
@@ -250,11 +288,6 @@ def stability(
     from caviar_clients.cli.measure import stability as ask
 
     raise typer.Exit(ask(_console, group or (), json, markdown, traced))
-
-
-@bench.callback()
-def _bench() -> None:
-    """Measure what the parts of a run cost on this machine."""
 
 
 @bench.command("broker")
@@ -335,7 +368,7 @@ def inspect(
     raise typer.Exit(inspect_command(run, digest, json))
 
 
-@app.command(rich_help_panel=LOOK)
+@pictures.command("run")
 def plot(
     run: RunDirectory,
     out: Annotated[
@@ -347,15 +380,14 @@ def plot(
         str | None, typer.Option(help="camera whose images are drawn, in files with its name")
     ] = None,
 ) -> None:
-    """Draw a run: the map with rays and beam, |y| over time and angle, delay spread and frequency response, a
-    LIDAR scan, what a camera saw."""
+    """Draw a run: its map with rays and beam, |y|, delay spread, frequency response, LIDAR and cameras."""
     from caviar_clients.cli.plot import plot_run
 
     for picture in plot_run(run, out, frame, user, camera):
         typer.echo(picture)
 
 
-@app.command("map", rich_help_panel=LOOK)
+@pictures.command("map")
 def radio_map(
     source: ScenarioOrRun,
     metric: Annotated[
@@ -400,7 +432,7 @@ def radio_map(
         typer.echo(file)
 
 
-@app.command(rich_help_panel=LOOK)
+@pictures.command()
 def video(
     run: RunDirectory,
     out: Annotated[
@@ -452,7 +484,7 @@ def replay(
     raise typer.Exit(status)
 
 
-@app.command(rich_help_panel=MEASURE)
+@measure.command()
 def budget(
     run: RunDirectory,
     json: FiguresFile = None,
@@ -463,7 +495,7 @@ def budget(
     budget_run(run, _console, json)
 
 
-@app.command(rich_help_panel=MEASURE)
+@measure.command()
 def tradeoff(
     source: ScenarioOrRun,
     json: FiguresFile = None,
@@ -496,14 +528,31 @@ def tradeoff(
     trade(source, frames, options, json, out, _console)
 
 
-app.command("generate", rich_help_panel=RUN)(generate_command)
-app.command("train", rich_help_panel=RUN)(train_command)
-app.command("evaluate", rich_help_panel=MEASURE)(evaluate_command)
-app.command("look", rich_help_panel=LOOK)(look_command)
-app.command("verify", rich_help_panel=LOOK)(verify_command)
-app.command("tables", rich_help_panel=LOOK)(tables_command)
-app.command("export-policy", rich_help_panel=OPERATE)(export_command)
-app.command("swap", rich_help_panel=OPERATE)(swap_command)
+app.add_typer(pictures, name="plot", rich_help_panel=LOOK)
+app.add_typer(dataset, name="dataset", rich_help_panel=DATASETS)
+app.add_typer(policy, name="policy", rich_help_panel=POLICIES)
+app.add_typer(measure, name="measure", rich_help_panel=MEASURE)
+app.add_typer(paper, name="paper", rich_help_panel=MEASURE)
+app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
+measure.add_typer(bench, name="bench")
+dataset.command("generate")(generate_command)
+dataset.command("look")(look_command)
+dataset.command("verify")(verify_command)
+dataset.command("tables")(tables_command)
+policy.command("train")(train_command)
+policy.command("evaluate")(evaluate_command)
+policy.command("export")(export_command)
+policy.command("swap")(swap_command)
+# The names that commands had before they were in groups go on, and no help shows them.
+FORMER: dict[str, Callable[..., None]] = {
+    "generate": generate_command, "look": look_command, "verify": verify_command, "tables": tables_command,
+    "train": train_command, "evaluate": evaluate_command, "export-policy": export_command,
+    "swap": swap_command, "budget": budget, "tradeoff": tradeoff, "stability": stability,
+    "map": radio_map, "video": video, "why": status,
+}  # fmt: skip
+for _name, _command in FORMER.items():
+    app.command(_name, hidden=True)(_command)
+app.add_typer(bench, name="bench", hidden=True)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

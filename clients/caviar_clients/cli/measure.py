@@ -1,4 +1,4 @@
-"""Commands that measure and judge: ``caviar bench``, ``budget``, ``tradeoff``, ``stability`` and ``conform``.
+"""Commands that measure and judge: ``caviar measure`` and ``caviar conform``.
 
 They compare what was measured with what is right or wanted, show it in a table, and write it to files. A file
 that cannot be written is refused before the work.
@@ -89,7 +89,7 @@ def measure_broker(
     write_json(json_file, measured)
 
 
-# --- caviar budget ---------------------------------------------------------------------------------------
+# --- caviar measure budget -------------------------------------------------------------------------------
 
 
 def budget_run(run: Path, console: Console, json_file: Path | None = None) -> Forecast:
@@ -168,7 +168,7 @@ def _forecast_row(service: ServiceForecast) -> list[str]:
     ]
 
 
-# --- caviar tradeoff -------------------------------------------------------------------------------------
+# --- caviar measure tradeoff -----------------------------------------------------------------------------
 
 
 def tradeoff_options(
@@ -307,7 +307,7 @@ def _compared(source: Path, frames: int, options: Options, console: Console) -> 
         return compare(scenes_of(source, frames), options, machine(), show)
 
 
-# --- caviar stability ------------------------------------------------------------------------------------
+# --- caviar measure stability ----------------------------------------------------------------------------
 
 
 def stability(

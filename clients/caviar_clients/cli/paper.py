@@ -199,7 +199,7 @@ def table3(
     minutes: Minutes = 12.0,
     out: Out = FOLDER,
 ) -> None:
-    """Table 3: time of ray tracing by ray spacing, with and without diffuse scattering (caviar tradeoff)."""
+    """Table 3: time of ray tracing by ray spacing, with diffuse scattering and without (measure tradeoff)."""
     _tradeoff("table3", "spacing", source, frames, minutes, out)
 
 
@@ -210,7 +210,7 @@ def table4(
     minutes: Minutes = 12.0,
     out: Out = FOLDER,
 ) -> None:
-    """Table 4: time of ray tracing by the elements of the arrays (caviar tradeoff)."""
+    """Table 4: time of ray tracing by the elements of the arrays (measure tradeoff)."""
     _tradeoff("table4", "arrays", source, frames, minutes, out)
 
 

@@ -13,7 +13,7 @@ from caviar_clients.files import make_folder_of, require_folder
 from caviar_clients.plots.map import MapData, draw_map
 from caviar_clients.plots.packets import draw_traffic, packet_series
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
-from caviar_clients.plots.sensors import CameraView, draw_scan, draw_view
+from caviar_clients.plots.sensors import CameraView, draw_grid, draw_scan, draw_view
 from caviar_clients.plots.user_curves import (
     choose_user,
     draw_dispersion,
@@ -185,6 +185,9 @@ def _scan(frame: RecordedFrame, file: Path) -> None:
     if lidar is None:
         raise RecordingError(f"frame {frame.number} has no LIDAR scan; choose another with --frame")
     scan = lidar.scans[0]
+    if not len(scan.ray) and scan.grid is not None:
+        draw_grid(scan.grid, f"LIDAR {scan.sensor}, recorded as a grid: {moment(frame)}", file)
+        return
     draw_scan(scan, lidar, frame.scene(), f"LIDAR {scan.sensor}: {moment(frame)}", file)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import dropwhile
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from caviar_protocol.files import open_to_append
 
@@ -64,6 +65,8 @@ class Child:
     def last_line(self) -> str:
         """The last line that the process printed, or what it died of in a library; empty if it printed
         nothing."""
+        if not self.log.exists():  # the run's directory was deleted
+            return ""
         with self.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
             lines = file.read().decode(errors="replace").strip().splitlines()
@@ -112,7 +115,9 @@ def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
 
 
 class Interruption:
-    """Turns signals into an order to end the run, for as long as a ``with`` block lasts in the main thread.
+    """Turns signals into an order to end the run, for as long as a ``with`` block lasts.
+
+    Python hands signals to the main thread alone: in another one a block leaves them as they are.
 
     Args:
         stop: Orders an orderly end, for a reason. Called from a signal handler; with ``in_process`` from a
@@ -130,6 +135,7 @@ class Interruption:
 
     def __init__(self, stop: Callable[[str], None], *, in_process: bool = False) -> None:
         self._stop, self._in_process = stop, in_process
+        self._before = dict[signal.Signals, Any]()
         self.came = False
         """Whether a signal came."""
         self._is_ordered = False  # by the handler
@@ -138,6 +144,8 @@ class Interruption:
         self._is_over = threading.Event()
 
     def __enter__(self) -> Interruption:
+        if threading.current_thread() is not threading.main_thread():
+            return self
         self._before = {order: signal.signal(order, self._handle) for order in ORDERS}
         if self._in_process:
             self._read, self._write = os.pipe()

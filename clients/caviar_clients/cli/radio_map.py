@@ -1,4 +1,4 @@
-"""``caviar map``: best server, gain, received power and SINR over a surface, as PNG and NumPy archive."""
+"""``caviar plot map``: best server, gain, received power and SINR over a surface: PNG, NumPy archive."""
 
 from __future__ import annotations
 
@@ -240,9 +240,10 @@ class _Mapped:
 def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
     scenes = scene_at(source, options.frame)
     instant = scenes.instants[0]
-    devices = transmitters_of(instant.scene, f"frame {options.frame} of {scenes.origin}")
     index = carrier_of(scenes.carriers, options.carrier)
     carrier = scenes.carriers[index]
+    where = f"frame {options.frame} of {scenes.origin}"
+    devices = transmitters_of(instant.scene, where, carrier.name)
     channel, assets = channel_of(scenes, instant.scene)
     noise_w, noise = noise_of(scenes.services, carrier)
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())

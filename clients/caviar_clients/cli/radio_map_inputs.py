@@ -145,7 +145,10 @@ def channel_of(scenes: Scenes, scene: Scene) -> tuple[SionnaChannel, Mapping[str
             return SionnaChannel(nothing, run), patterns
         refused.append(f"channel {name!r} is {spec.use!r}, which traces no rays")
     what = "; ".join(refused) or f"{scenes.origin} has no channel"
-    raise RunError(f"{what}; a radio map is made with the channel sionna-rt, adaptive or free-space")
+    raise RunError(
+        f"{what}; a radio map is made with the channel sionna-rt, adaptive or free-space, and of a recording "
+        "without classes named module:Class, which are not loaded"
+    )
 
 
 def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[float, str]:

@@ -25,10 +25,18 @@ from rich.text import Text
 from caviar_broker.journal_format import NO_BROKER, JournalReader, run_of_journal
 from caviar_broker.run_record import RunRecord, read_record
 from caviar_clients.cli.shared import counted, print_line, scaled
-from caviar_clients.cli.summary import RunSummary, SourceSummary, resume_hint, summarise
+from caviar_clients.cli.summary import (
+    LinkFigures,
+    RunSummary,
+    SourceSummary,
+    StationSummary,
+    resume_hint,
+    summarise,
+)
 from caviar_clients.cli.summary_table import (
     SHOWN_DAMAGE,
     decided_lines,
+    gain_line,
     link_quality,
     outage_lines,
     packet_line,
@@ -130,18 +138,24 @@ def _facts(summary: RunSummary) -> Table:
         f"{summary.simulated_s:g} s simulated",
     )
     link = summary.link
-    if link is not None and link.mean_abs_y is not None:
-        table.add_row(
-            "mean |y|",
-            f"{link.mean_abs_y:.4g}, best {link.mean_abs_y_best:.4g}, straight line "
-            f"{link.mean_abs_y_baseline:.4g} (over users with a path)",
-        )
-    if link is not None and link.mean_bit_rate is not None:
-        table.add_row("mean SNR", link_quality(link.mean_snr_db, link.mean_snr_best_db, link.mean_bit_rate))
+    parts: Sequence[LinkFigures] = [] if link is None else link.stations or [link]
+    for of in parts:
+        place = f"{of.tx} on {of.carrier}: " if isinstance(of, StationSummary) else ""
+        if of.mean_abs_y is not None:
+            table.add_row(
+                "mean |y|",
+                f"{escape(place)}{of.mean_abs_y:.4g}, best {of.mean_abs_y_best:.4g}, LOS beam "
+                f"{of.mean_abs_y_baseline:.4g} (over links with a path)",
+            )
+            gains = gain_line(of.loss_to_best_db, of.gain_over_random_db)
+            table.add_row("", f"{escape(place)}{gains}")
+        if of.mean_bit_rate is not None:
+            quality = link_quality(of.mean_snr_db, of.mean_snr_best_db, of.mean_bit_rate)
+            table.add_row("mean SNR", f"{escape(place)}{quality}")
     if link is not None and link.packets is not None:
         table.add_row("packets", packet_line(link.packets).removeprefix("packets: "))
     if link is not None:
-        table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'user')} over all frames")
+        table.add_row("no path", f"{link.no_path_share:.2%} of {counted(link.users, 'link')} over all frames")
     for line in [] if summary.outage is None else outage_lines(summary.outage):
         table.add_row("no path", escape(line))
     for line in decided_lines(summary.decided):
@@ -213,11 +227,12 @@ def replay_run(
     from caviar_clients.cli.run import run_scenario
     from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
     from caviar_clients.replay.recorded import RecordedRun
-    from caviar_clients.session.checks import check_implementations
+    from caviar_clients.session.checks import check_implementations, names_class
     from caviar_services.registry import find_modules_in
 
-    find_modules_in(Path.cwd())  # of classes that --replace names as module:Class
     found = RecordedRun(Recording(run))
+    if any(map(names_class, found.scenario.services.values())) or any(":" in text for text in replace):
+        find_modules_in(Path.cwd())
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)
     check_implementations(plan.scenario)

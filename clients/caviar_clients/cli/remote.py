@@ -1,4 +1,4 @@
-"""Runs with services or brokers of other machines: ``caviar broker``, commands to type, and ``caviar why``.
+"""Runs with services or brokers of other machines: ``caviar broker``, commands to type, ``caviar status``.
 
 The file ``NAME.current`` in the folder of runs names the run in progress. It exists exactly while a broker
 serves that run, or after a broker died while it did: a broker that starts again resumes the run.
@@ -54,7 +54,7 @@ def serve_broker(
         ScenarioError: A key or value of the scenario is wrong.
         RunError: The run's directory cannot be made.
     """
-    # `caviar run` and `caviar why` load this module, and no broker: a server takes a third of a second.
+    # `caviar run` and `caviar status` load this module, and no broker: a server takes a third of a second.
     from caviar_broker.launch import DEFAULT_BIND, parser, serve
     from caviar_broker.security.access import check_bind
     from caviar_clients.session.checks import checked_scenario
@@ -150,7 +150,7 @@ def why_command(run: Path | None, console: Console) -> None:
         print_line(console, line)
 
 
-def newest_run(root: Path, command: str = "caviar why RUN") -> Path:
+def newest_run(root: Path, command: str = "caviar status RUN") -> Path:
     """Find the run below a folder whose broker was started last and is still noted there.
 
     Args:

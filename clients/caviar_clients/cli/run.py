@@ -62,6 +62,7 @@ class EmbeddedLauncher:
         self._pending: deque[dict[str, Any]] = deque()
         self._reported_at = 0.0
         self._log_error = ""
+        self._deleted = False
         self._stopping = ""
         self._run = EmbeddedRun(scenario, directory, self._notice, self._frame, self._waiting)
 
@@ -75,6 +76,8 @@ class EmbeddedLauncher:
         """Run, and yield what happens, in the words of the broker's events; the last one is ``finished``."""
         with closing(self._run.steps()) as steps:
             for _ in steps:
+                if self._deleted:
+                    self.stop("its directory was deleted")
                 while self._pending:
                     event = self._pending.popleft()
                     if event["event"] == "notice":
@@ -136,8 +139,9 @@ class EmbeddedLauncher:
         now = time.monotonic()
         if now - self._reported_at >= REPORT_S:
             self._reported_at = now
-            frames = self._run.statistics.frames
-            self._pending.append({"event": "frame", "episode": frame.episode, "frames": frames, "misses": 0})
+            self._deleted = not self._directory.exists()
+            done = {"frames": self._run.statistics.frames, "misses": self._run.statistics.misses}
+            self._pending.append({"event": "frame", "episode": frame.episode, **done})
 
 
 def with_recording_checked(
@@ -177,12 +181,6 @@ def with_recording_checked(
     return {**outcome, "error": f"{differs}: {figures}"}
 
 
-QUIET = frozenset({"stale", "note", "lag"})
-"""Kinds of notices that are logged, and only counted on the screen."""
-REPEATED = frozenset({"warning", "lost", "away", "back", "restarted", "refused", "disk"})
-"""Kinds of notices that are shown every time, since what they ask of the user is always new."""
-
-
 class RunOutcome(NamedTuple):
     """How a run ended."""
 
@@ -205,6 +203,7 @@ def run_scenario(
     http: str = "",
     pace: str | None = None,
     airsim: str = "",
+    settings: Sequence[str] = (),
 ) -> RunOutcome:
     """Run a scenario to its end, with progress and summary on the screen.
 
@@ -219,13 +218,14 @@ def run_scenario(
         keys: Keys directory; None: a run without keys.
         http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
         airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
 
     Raises:
         ScenarioError: A key or value of the scenario is wrong.
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace, airsim)
+    scenario = checked_scenario(path, frames, seed, pace, airsim, settings)
     if bind:
         check_bind(bind, keys=keys is not None)
     require_extras(scenario)
@@ -261,6 +261,7 @@ def run_scenario(
             http,
             pace=pace,
             airsim=airsim,
+            settings=settings,
         )
     return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
 
@@ -337,6 +338,8 @@ def _follow(
         words = f"{outcome['error']}; there is no summary, since {outcome['disk']}"
         console.print(Text.assemble(("the run ended early:", "red"), f" {words}"), soft_wrap=True)
         return RunOutcome(directory, 130 if interrupted.came else 1, outcome["error"])
+    if not directory.exists():
+        raise RunError(f"{directory} was deleted while the run went on, which ended it")
     # Before anything is read of the recording for the summary: figures of another run would mislead.
     outcome = with_recording_checked(directory, scenario, outcome)
     recorded = recorded_figures(directory) if outcome["frames"] else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
@@ -99,6 +100,18 @@ Pace = Annotated[
         "realtime, as simulated time passes; or a number, 2 for twice as fast as real time"
     ),
 ]
+Episodes = Annotated[int | None, typer.Option(min=1, help="episodes, instead of the scenario's")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        help="KEY=VALUE instead of the scenario's: services.channel.settings.samples=1000, or as in replay "
+        "channel.samples=1000; may be repeated",
+    ),
+]
+Record = Annotated[
+    str | None, typer.Option(help="topics to record, as scene,channel.h, instead of the scenario's")
+]
 RunsFolder = Annotated[Path, typer.Option(help="directory in which the run's own is made")]
 Embedded = Annotated[bool, typer.Option("--embedded", help="all in this process, without sockets")]
 SummaryFile = Annotated[Path | None, typer.Option(help="write the summary to this file too")]
@@ -153,6 +166,25 @@ def require_known(option: str, name: str, known: Iterable[str]) -> None:
     known = tuple(known)
     if name not in known:
         raise RunError(f"{option} {name!r} does not exist; {suggestion(name, known)}")
+
+
+def keys_set(
+    set_: Sequence[str] | None, record: str | None = None, episodes: int | None = None
+) -> tuple[str, ...]:
+    """List what options say in place of a scenario's keys, as `caviar_protocol.scenario.set_keys` reads it.
+
+    Args:
+        set_: ``KEY=VALUE`` each.
+        record: Topics with commas between.
+        episodes: Of the run.
+
+    Example:
+        >>> keys_set(["run.seed=3"], "scene,link", 2)
+        ('run.seed=3', 'run.record=["scene", "link"]', 'run.episodes=2')
+    """
+    topics = [] if record is None else [json.dumps([topic.strip() for topic in record.split(",")])]
+    numbers = [] if episodes is None else [f"run.episodes={episodes}"]
+    return *(set_ or ()), *(f"run.record={text}" for text in topics), *numbers
 
 
 def require_writable(*files: Path | None) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -16,18 +16,20 @@ import msgspec
 import numpy as np
 
 from caviar_clients.cli.shared import counted
-from caviar_protocol.arrays import quantity
+from caviar_protocol.arrays import BoolArray, Float64Array, quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Report, Status
 from caviar_protocol.policies import REFUSED
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.topics import Link
+from caviar_protocol.topics import Channel, Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 from caviar_protocol.topics.scene import (
+    BESIDE_ROAD_PREFIX,
     LEFT_GEOFENCE_PREFIX,
     MESH_REFUSED_PREFIX,
     OUTSIDE_GEOFENCE_PREFIX,
+    SIMULATOR_SAYS_PREFIX,
     WITHOUT_OBJECT_PREFIX,
 )
 
@@ -52,6 +54,9 @@ _EVER: Mapping[str, str] = {
     LEFT_GEOFENCE_PREFIX: "{rest!r} of {source} left its geofence {times}, first in {first}",
     OUTSIDE_GEOFENCE_PREFIX: "{rest!r} of {source} was commanded to places outside of its geofence in "
     "{frames}, first in {first}, and kept within",
+    SIMULATOR_SAYS_PREFIX: "the simulator of {source} warned {times}, first in {first}: {rest}",
+    BESIDE_ROAD_PREFIX: "{rest!r} of {source} is one rigid box, and too long for its bend in {frames}, first "
+    "in {first}: its rear is beside the road or track",
     MESH_REFUSED_PREFIX: "mesh {rest!r} of {source} was refused in {first}; its objects were boxes",
 }
 
@@ -110,13 +115,19 @@ class PacketSummary(msgspec.Struct, kw_only=True):
     """Of these, how many were not decoded."""
 
 
-class LinkSummary(msgspec.Struct, kw_only=True):
+class LinkFigures(msgspec.Struct, kw_only=True):
     """Means over frames and users that have a path; |y| of beams of unit norm."""
 
     mean_abs_y: float | None
     """None where no user ever had a path."""
     mean_abs_y_best: float | None
     mean_abs_y_baseline: float | None
+    loss_to_best_db: Annotated[
+        float | None, quantity("dB", "mean |y|² of the best pairs over that of the chosen")
+    ]
+    """None where no user had a path, or none was served."""
+    gain_over_random_db: Annotated[float | None, quantity("dB", "mean |y|² over that of a random pair")]
+    """None likewise, and where H was not recorded."""
     mean_snr_db: Annotated[float | None, quantity("dB", "mean of the linear SNR of the chosen pairs")]
     """None where no user had a path, or none was served."""
     mean_snr_best_db: Annotated[float | None, quantity("dB", "the same of the best pairs")]
@@ -125,6 +136,20 @@ class LinkSummary(msgspec.Struct, kw_only=True):
     """Share of users without a path; None where there was no user."""
     users: int
     """Users summed over frames."""
+
+
+class StationSummary(LinkFigures, kw_only=True):
+    """The users of one transmitter on one carrier."""
+
+    tx: str
+    carrier: str
+
+
+class LinkSummary(LinkFigures, kw_only=True):
+    """All users of a run, and those of each transmitter and carrier."""
+
+    stations: list[StationSummary] = []
+    """Empty where there is one alone."""
     packets: PacketSummary | None = None
     """None where the link has no packets."""
 
@@ -321,57 +346,112 @@ class PacketTotals:
         )
 
 
-class _LinkTotals:
+class _UserTotals:
     """Sums over users that have a path, and how many users had none."""
 
     def __init__(self) -> None:
         self.users = self.served = 0
-        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate; sums, so that a run of any length fits.
-        self._sums = np.zeros(6)
-        self._packets = PacketTotals()
+        # Of |y|, best and baseline |y|, SNR, best SNR, bit rate, |y|² chosen, best, random; sums, so that a
+        # run of any length fits.
+        self._sums = np.zeros(9)
 
-    def add(self, link: Link) -> None:
-        with_path = link.has_path
-        self._packets.add(link)
-        self.users += len(link.rx)
+    def add(self, link: Link, random: Float64Array, which: BoolArray | slice = slice(None)) -> None:
+        """Add a frame's users, or some of them; ``random`` is the mean |y|² of all pairs of each."""
+        with_path = link.has_path[which]
+        self.users += len(with_path)
         self.served += int(with_path.sum())
         best = link.top_abs_y[:, :1].sum(axis=1)  # the column lacks where there is no user
-        figures = (link.abs_y, best, link.baseline_abs_y, link.snr, link.snr_best, link.bit_rate)
-        self._sums += [values[with_path].sum() for values in figures]
+        amplitudes = (link.abs_y, best, link.baseline_abs_y)
+        powers = (link.abs_y**2, best**2, random)
+        figures = (*amplitudes, link.snr, link.snr_best, link.bit_rate, *powers)
+        self._sums += [values[which][with_path].sum() for values in figures]
 
-    def summary(self) -> LinkSummary | None:
-        if not self.users:
-            return None
+    def means(self) -> dict[str, Any]:
+        """Fields of `LinkFigures`."""
         means: list[float | None] = [None] * len(self._sums)
         if self.served:
             means = (self._sums / self.served).tolist()
-        abs_y, best, baseline, snr, snr_best, bit_rate = means
+        abs_y, best, baseline, snr, snr_best, bit_rate, power, power_best, power_random = means
+        return {
+            "mean_abs_y": abs_y,
+            "mean_abs_y_best": best,
+            "mean_abs_y_baseline": baseline,
+            "loss_to_best_db": _db(power_best / power) if power and power_best else None,
+            "gain_over_random_db": _db(power / power_random) if power and power_random else None,
+            "mean_snr_db": _db(snr),
+            "mean_snr_best_db": _db(snr_best),
+            "mean_bit_rate": bit_rate,
+            "no_path_share": 1 - self.served / self.users,
+            "users": self.users,
+        }
+
+
+class _LinkTotals:
+    """Totals of all users, and of those of each transmitter and carrier."""
+
+    def __init__(self) -> None:
+        self.all, self._packets = _UserTotals(), PacketTotals()
+        self._stations: dict[tuple[str, str], _UserTotals] = defaultdict(_UserTotals)
+
+    def add(self, link: Link, channels: Sequence[Channel]) -> None:
+        self._packets.add(link)
+        random = _random_power(link, channels)
+        self.all.add(link, random)
+        of_user = list(zip(link.tx, link.carrier, strict=True))
+        for station in dict.fromkeys(of_user):
+            self._stations[station].add(link, random, np.array([user == station for user in of_user]))
+
+    def summary(self) -> LinkSummary | None:
+        if not self.all.users:
+            return None
+        stations = [
+            StationSummary(tx=tx, carrier=carrier, **totals.means())
+            for (tx, carrier), totals in sorted(self._stations.items())
+        ]
         return LinkSummary(
-            mean_abs_y=abs_y,
-            mean_abs_y_best=best,
-            mean_abs_y_baseline=baseline,
-            mean_snr_db=_db(snr),
-            mean_snr_best_db=_db(snr_best),
-            mean_bit_rate=bit_rate,
-            no_path_share=1 - self.served / self.users,
-            users=self.users,
+            **self.all.means(),
+            stations=stations if len(stations) > 1 else [],
             packets=self._packets.summary(),
         )
 
 
+def _random_power(link: Link, channels: Sequence[Channel]) -> Float64Array:
+    """Mean |y|² over all beam pairs of each user; NaN where its H is not recorded.
+
+    The codebooks are orthonormal bases, so the sum over all pairs is the squared Frobenius norm of H.
+    """
+    mean = {
+        (channel.tx[matrix.tx], channel.rx[matrix.rx], channel.carriers[matrix.carrier].name): np.vdot(
+            matrix.h, matrix.h
+        ).real
+        / matrix.h.size
+        for channel in channels
+        for matrix in channel.h
+    }
+    users = zip(link.tx, link.rx, link.carrier, strict=True)
+    return np.array([mean.get(user, math.nan) for user in users], np.float64)
+
+
 def _db(ratio: float | None) -> float | None:
-    return 10 * math.log10(ratio) if ratio else None  # 0 is no path at all, and no number of decibels
+    # 0 is no path at all, and no number of decibels; what is not a number is not known.
+    return 10 * math.log10(ratio) if ratio and not math.isnan(ratio) else None
 
 
 def _measure(
     frame: RecordedFrame, sources: dict[tuple[str, str], SourceSummary], totals: _LinkTotals
 ) -> None:
+    links: list[Link] = []
+    channels: list[Channel] = []
     for product in frame.products:
         entry = product.provenance
         if entry.status in (Status.FRESH, Status.LATE):
             sources[entry.topic, entry.source].bytes += product.size
-        if entry.topic == "link" and entry.status is Status.FRESH:
-            totals.add(cast(Link, product.payload))
+        if entry.status is Status.FRESH and entry.topic == "link":
+            links.append(cast(Link, product.payload))
+        elif entry.status is Status.FRESH and entry.topic == "channel":
+            channels.append(cast(Channel, product.payload))
+    for link in links:
+        totals.add(link, channels)
 
 
 def _episodes_planned(scenario: dict[str, Any]) -> int:
@@ -421,7 +501,7 @@ def summarise(recording: Recording) -> RunSummary:
         bytes=sum(file.stat().st_size for file in recording.files),
         sources=[sources[key] for key in sorted(sources)],
         link=totals.summary(),
-        outage=reports.outage(totals.users - totals.served),
+        outage=reports.outage(totals.all.users - totals.all.served),
         decided=reports.decisions(),
         warnings=reports.warnings(),
         versions=metadata.versions,

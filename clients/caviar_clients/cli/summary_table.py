@@ -49,27 +49,34 @@ def _caption(summary: Mapping[str, Any]) -> str:
             f"{summary['frames']}; its digest is that of these"
         )
     late, pace = summary["deadlines"], summary["pace"]
-    if late["decisions"]:
-        parts.append(_missed(sum(s["misses"] for s in summary["services"].values()), late))
+    misses = sum(s["misses"] for s in summary["services"].values())
+    if misses or late["decisions"]:
+        parts.append(_missed(misses, late))
     if pace["slips"]:
         parts.append(
             f"{counted(pace['slips'], 'frame')} slipped behind real time, "
             f"by {pace['worst_slip_ms']:.1f} ms at worst, {pace['lag_ms']:.1f} ms in all; none was skipped"
         )
-    if summary["mean_abs_y"] is not None:
-        share = summary["mean_abs_y"] / summary["mean_abs_y_best"] if summary["mean_abs_y_best"] else 0.0
-        parts.append(
-            f"mean |y| {summary['mean_abs_y']:.3g} of {summary['mean_abs_y_best']:.3g} at best "
-            f"({share:.1%}), straight line {summary['mean_abs_y_baseline']:.3g}"
-        )
-    if summary["mean_bit_rate"] is not None:
-        quality = link_quality(summary["mean_snr_db"], summary["mean_snr_best_db"], summary["mean_bit_rate"])
-        parts.append(f"mean SNR {quality}")
+    # A mean over carriers says nothing of any of them: each has lines of its own.
+    for figures in summary.get("stations") or [summary]:
+        of = f"{figures['tx']} on {figures['carrier']}: " if "tx" in figures else ""
+        if figures["mean_abs_y"] is not None:
+            share = figures["mean_abs_y"] / figures["mean_abs_y_best"] if figures["mean_abs_y_best"] else 0.0
+            parts.append(
+                f"{of}mean |y| {figures['mean_abs_y']:.3g} of {figures['mean_abs_y_best']:.3g} at best "
+                f"({share:.1%}), LOS beam {figures['mean_abs_y_baseline']:.3g}"
+            )
+            parts.append(of + gain_line(figures["loss_to_best_db"], figures["gain_over_random_db"]))
+        if figures["mean_bit_rate"] is not None:
+            numbers = figures["mean_snr_db"], figures["mean_snr_best_db"], figures["mean_bit_rate"]
+            parts.append(f"{of}mean SNR {link_quality(*numbers)}")
+        if of:
+            parts.append(f"{of}{figures['no_path_share']:.1%} of {figures['users']:,} links without a path")
     if summary.get("packets") is not None:
         parts.append(packet_line(msgspec.convert(summary["packets"], PacketSummary)))
     if summary["outage"] is not None:
         causes, *inside = outage_lines(msgspec.convert(summary["outage"], OutageSummary))
-        parts += [f"{summary['no_path_share']:.1%} of users without a path: {causes}", *inside]
+        parts += [f"{summary['no_path_share']:.1%} of links without a path: {causes}", *inside]
     parts += decided_lines(msgspec.convert(summary["decided"], list[Decided]))
     parts += [f"warning: {warning}" for warning in summary["warnings"]]
     return "\n".join(parts)
@@ -80,6 +87,8 @@ def _missed(misses: int, late: Mapping[str, Any]) -> str:
     seen = late["decisions"]
     when = f"{late['p99_ms']:.2f} ms late (p99), {late['worst_ms']:.2f} ms at worst"
     # A late answer that arrives before the broker looks at the clock is a miss without a decision.
+    if not seen:
+        return counted(misses, "missed deadline")
     if misses <= seen:
         return f"{counted(seen, 'missed deadline')}, decided {when}"
     return (
@@ -114,16 +123,27 @@ def outage_lines(outage: OutageSummary) -> list[str]:
     return lines
 
 
+def gain_line(loss_db: float | None, gain_db: float | None) -> str:
+    """Put the loss to the best pair and the gain over a random one [dB] into words.
+
+    Example:
+        >>> gain_line(0.04, 17.25), gain_line(3.0, None)
+        ('beams 0.0 dB below the best pair, 17.2 dB above a random one', 'beams 3.0 dB below the best pair')
+    """
+    loss = "served no link" if loss_db is None else f"{loss_db:.1f} dB below the best pair"
+    return f"beams {loss}" + ("" if gain_db is None else f", {gain_db:.1f} dB above a random one")
+
+
 def link_quality(snr_db: float | None, snr_best_db: float | None, bit_rate: float) -> str:
-    """Put the SNR [dB] of the chosen and of the best beams, and a user's bit rate [bit/s], into words.
+    """Put the SNR [dB] of the chosen and of the best beams, and a link's bit rate [bit/s], into words.
 
     Example:
         >>> link_quality(12.34, 15.0, 2.5e8)
-        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a user'
+        '12.3 dB of 15.0 dB at best, mean rate 250 Mbit/s a link'
     """
     snr, best = ("none" if value is None else f"{value:.1f} dB" for value in (snr_db, snr_best_db))
     rate, unit = scaled(bit_rate, ("bit/s", "kbit/s", "Mbit/s", "Gbit/s"))
-    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a user"
+    return f"{snr} of {best} at best, mean rate {rate:.3g} {unit} a link"
 
 
 def packet_line(found: PacketSummary) -> str:

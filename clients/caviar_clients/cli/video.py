@@ -1,4 +1,4 @@
-"""``caviar video``: a recording as a film."""
+"""``caviar plot video``: a recording as a film."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Catalogue:
         if not writable and not path.is_file():
             raise RecordingError(
                 f"{path.parent} is no dataset, it has no {path.name}; make one with: "
-                f"caviar generate SCENARIO --out {path.parent}"
+                f"caviar dataset generate SCENARIO --out {path.parent}"
             )
         with self._errors():
             mode = "rwc" if writable else "ro"

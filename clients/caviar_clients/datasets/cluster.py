@@ -19,7 +19,8 @@ from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, Cl
 from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
 from caviar_clients.datasets.exits import KNOWN_S, exit_of, noting_nanny
-from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.errors import CaviarError, RunError, SetupError
+from caviar_protocol.host import install_command, safe_path
 
 # Part of the extra `datasets`: imported where it is used.
 if TYPE_CHECKING:
@@ -294,7 +295,7 @@ class Episodes:
         return self._client
 
     def _connect(self) -> None:
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, Security
 
         if self._scheduler:
             try:
@@ -315,13 +316,21 @@ class Episodes:
             self._watch_workers()
             self.workers = len(self._last_seen())
             return
+        # A scheduler runs the code of any client, and any user of the machine reaches its port.
+        try:
+            security = Security.temporary()
+        except ImportError as error:
+            raise SetupError(f"{error}, for TLS between processes: {install_command('datasets')}") from error
+        self._stack.enter_context(safe_path())
         cluster = self._stack.enter_context(
             LocalCluster(
+                security=security,
                 n_workers=self.workers,
                 threads_per_worker=1,
                 worker_class=noting_nanny(),
                 host="127.0.0.1",
                 dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
                 memory_limit=0,
                 silence_logs=logging.CRITICAL,
             )

@@ -22,6 +22,11 @@ _CONFIG = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
+    # HTTP knows no credentials, and any user of the machine reaches it: nothing is served there.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    # `safe_path` is for the processes of workers, and not for what a service starts in them.
+    "distributed.nanny.environ": {"PYTHONSAFEPATH": ""},
     "distributed.comm.timeouts.connect": f"{CONNECT_S:.0f}s",
     # One thread of the ray tracer in each process: two processes do 1.7 times the work of one with two.
     "distributed.nanny.pre-spawn-environ": {

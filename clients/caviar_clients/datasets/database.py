@@ -10,7 +10,7 @@ from pathlib import Path
 
 from caviar_protocol.errors import RecordingError
 
-REBUILT = "move it away, and the same caviar generate command makes it anew from the recordings"
+REBUILT = "move it away, and the same caviar dataset generate command makes it anew from the recordings"
 """What to do with a catalogue that cannot be read."""
 
 _REMEDIES = {

@@ -175,7 +175,9 @@ class Ledger:
         if damaged:
             shown = list(damaged)[:SHOWN]
             said, places = "; ".join(map(damaged.__getitem__, shown)), ", ".join(map(self._at, shown))
-            more = f" and others, which caviar verify {self.out} names," if len(damaged) > SHOWN else ""
+            more = (
+                f" and others, which caviar dataset verify {self.out} names," if len(damaged) > SHOWN else ""
+            )
             raise RunError(
                 f"{counted(len(damaged), 'recording')} damaged: {said}; remove {places}{more} and run the "
                 "same command, which plays what is missing"

@@ -1,6 +1,7 @@
 """The reader of a dataset: tables of its catalogue as columns, and recorded arrays a row for each user.
 
-`caviar.dataset` opens a folder that ``caviar generate`` wrote. No knowledge of MCAP or of the wire is needed.
+`caviar.dataset` opens a folder that ``caviar dataset generate`` wrote. No knowledge of MCAP or of the wire is
+needed.
 """
 
 from __future__ import annotations

@@ -295,7 +295,7 @@ class RemoteDataset:
         if not self.fetch_catalogue(fetched):
             raise RecordingError(
                 f"{self.address} is no dataset, it has no {_CATALOGUE}; make one with: "
-                f"caviar generate SCENARIO --out {self.address}"
+                f"caviar dataset generate SCENARIO --out {self.address}"
             )
         try:
             catalogue = Catalogue(fetched, name=f"{self.address}/{_CATALOGUE}")

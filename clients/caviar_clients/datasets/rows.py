@@ -220,7 +220,7 @@ def _user_rows(
     for c, carrier in enumerate(channel.carriers):
         for t, tx in enumerate(channel.tx):
             for r, rx in enumerate(channel.rx):
-                if tx == rx:
+                if tx == rx or not channel.uses(c, t, r):
                     continue
                 device = receivers.get(rx)
                 x = y = z = None

@@ -78,7 +78,10 @@ class UserBatches(IterableDataset):  # type: ignore[misc]  # it has no types
 
         info = get_worker_info()
         first, step = (info.id, info.num_workers) if info is not None else (0, 1)
-        seed = None if self._seed is None else self._seed + self.epoch
+        # Not the sum: seeds 1 and 2 would share the orders of all epochs but one.
+        seed = self._seed
+        if seed is not None and self.epoch:
+            seed = int(np.random.SeedSequence([seed, self.epoch]).generate_state(1, np.uint64)[0])
         for part in self._users.parts(self._size, shuffle=seed)[first::step]:
             yield _tensors(part.read(self._names))
 

@@ -15,8 +15,10 @@ from caviar_clients.datasets.rows import USER_COLUMNS
 from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, SetupError, suggestion
 from caviar_protocol.host import install_command
+from caviar_protocol.recording import Recording
 from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.recording.topics import TOPIC_ARRAYS
+from caviar_protocol.topics import Lidar, Link
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.reader import Dataset
@@ -125,12 +127,13 @@ class Users:
         """Names of the recorded arrays, each with what it is, its unit and the shape of a row."""
         if not self._dataset.episodes:
             return {}
-        topics = self._dataset.episode(self._dataset.episodes[0]).topics
+        recording = self._dataset.episode(self._dataset.episodes[0])
         return {
             f"{topic}.{name}": f"{column.doc} [{column.unit}], {column.dtype.name}, {list(column.shape)}"
-            for topic in topics
+            for topic in recording.topics
             if topic in _WITH_USERS
             for name, column in TOPIC_ARRAYS[topic].columns.items()
+            if not _lacks(recording, topic, name)
         }
 
     def __getitem__(self, name: str | slice | Sequence[int] | NDArray[Any]) -> Any:
@@ -247,13 +250,13 @@ class Users:
         return UserBatches(self, names, size, shuffle)
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Check names of columns and of recorded arrays, without reading one.
+        """Check names of columns and of recorded arrays, of which the first product is looked at.
 
         Args:
             names: As of `read`.
 
         Raises:
-            RecordingError: There is no such name; the text has the near ones.
+            RecordingError: There is no such name, or it was not recorded; the text has the near ones.
             ValueError: There is none.
             TypeError: It is a text.
         """
@@ -277,6 +280,10 @@ class Users:
                 )
             elif field not in (columns := TOPIC_ARRAYS[topic].columns):
                 raise RecordingError(f"{topic} has no array {field!r}; {suggestion(field, columns)}")
+            elif self._dataset.episodes:
+                recording = self._dataset.episode(self._dataset.episodes[0])
+                if topic in recording.topics and (why := _lacks(recording, topic, field)):
+                    raise RecordingError(why)
 
     def _shuffled(self, seed: int) -> NDArray[np.int64]:
         draw = random.Random(seed)  # noqa: S311 - no secret
@@ -339,6 +346,30 @@ class Users:
             f"{place}: {table['rx'][user]} has {len(own)} sensors of {topic} on its object, and {len(fixed)} "
             f"stand fixed: it takes one of either; read dataset.episode({table['episode'][user]})[{topic!r}]"
         )
+
+
+def _lacks(recording: Recording, topic: str, name: str) -> str:
+    """Say why an array was not recorded, as its topic's first product shows; empty where it was."""
+    arrays = recording[topic]
+    payload = next((payload for payload in arrays if payload is not None), None)
+    if payload is None:
+        return ""
+    try:
+        arrays.columns[name].rows(arrays, payload)
+    except RecordingError as error:
+        return str(error)
+    if isinstance(payload, Link) and getattr(payload, name) is None:
+        return f"{arrays.place} has no {name}: the run had no packets; give its link some, and run again"
+    scans = payload.scans if isinstance(payload, Lidar) and name in _OF_HITS else ()
+    if scans and scans[0].grid is not None and not any(len(scan.ray) for scan in scans):
+        return (
+            f"{arrays.place} was recorded without {name}: its scans have the grid alone; write lidar into "
+            "`record` below [run] of the scenario, and run again"
+        )
+    return ""
+
+
+_OF_HITS = ("hits", "points", "points_world", "range", "ray", "object")
 
 
 def _recorded_like(name: str) -> list[str]:

@@ -56,6 +56,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             the run takes place in this process.
         agent: Name of the agent whose place is taken; None: the remote one, or the only one.
         users: Receivers served, as names with ``*`` and ``?``.
+        transmitters: Transmitters that serve them, likewise; the users of others have no beams.
         observe: Names of the parts of the observation: `caviar_protocol.observations.PARTS`.
         reward: What the reward is: `caviar_clients.envs.rewards.Reward`.
         directory: Where an embedded run records; None: it does not, which is faster.
@@ -101,6 +102,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         key: str | Path | None = None,
         broker_key: str | Path | None = None,
         connect_timeout_s: float = CONNECT_TIMEOUT_S,
+        transmitters: str | Sequence[str] = "*",
     ) -> None:
         if reward not in KINDS:
             raise ScenarioError(f"no reward is called {reward!r}; there are: {', '.join(KINDS)}")
@@ -122,7 +124,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             warnings.warn(text, stacklevel=2)
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
-        self.users = Users(self.scenario, checked_patterns("users", users))
+        self.transmitters = checked_patterns("transmitters", transmitters)
+        """Patterns of those that are served."""
+        served = checked_patterns("users", users)
+        self.users = Users(self.scenario, served, transmitters=self.transmitters)
         self.observer = Observer(self.scenario, self.users, observe)
         """Reads the parts of the observation."""
         self.observation_space: spaces.Dict[Any] = spaces.Dict(  # type: ignore[assignment]  # of arrays
@@ -272,6 +277,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         pair = moment.users[0][1] if moment.users else None
         title = f"frame {moment.frame.number}, t = {moment.frame.t_ns / 1e9:.2f} s"
         return self._renderer.draw(moment.scene, moment.link, pair, title)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, or one in another process, has no run: it begins an episode with `reset`."""
+        return {**self.__dict__, "_session": None, "_moment": None, "_renderer": None}
 
     def _open(self) -> Session:
         """Open the session of the environment's agent."""

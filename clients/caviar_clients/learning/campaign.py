@@ -36,6 +36,7 @@ from caviar_clients.learning.training import (
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
+from caviar_protocol.host import safe_path
 
 RECORD = "experiment.json"
 """What the folder was begun with."""
@@ -294,7 +295,8 @@ def _start(training: _Training) -> tuple[Connection, Any]:
     context = multiprocessing.get_context("spawn")  # what is forked has the threads of PyTorch no more
     pipe, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(theirs, *training[:3]), daemon=True)
-    process.start()
+    with safe_path():
+        process.start()
     theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
     return pipe, process
 
@@ -324,6 +326,7 @@ def _cause(code: int) -> str:
 def _serve(pipe: Connection, experiment: Experiment, seed: int, folder: Path) -> None:
     """Train a seed, and tell the parent; where the parent is gone, the next report ends this process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    os.environ["PYTHONSAFEPATH"] = ""  # of scripts that an environment starts, Python searches the folder
     warnings.showwarning = lambda message, *_, **__: pipe.send(str(message))
     try:
         train_seed(experiment, seed, folder, pipe.send)

@@ -63,8 +63,8 @@ class PolicyPlayer:
     ) -> None:
         card = model.card
         if card is None:
-            raise ScenarioError(f"{called} has no card; export it with caviar export-policy")
-        self._model, self._users = model, Users(scenario, users)
+            raise ScenarioError(f"{called} has no card; export it with caviar policy export")
+        self._model, self._users = model, Users(scenario, users, transmitters=card.transmitters)
         sizes = tuple((place.tx.size, place.rx.size) for place in self._users.places)
         if sizes != card.codebooks:
             raise ScenarioError(
@@ -148,11 +148,17 @@ class Played:
     """Spectral efficiency [bit/s/Hz] that the pilots of the frame leave."""
     pilots: float
     """Of a frame, mean over the episode."""
+    station: tuple[str, ...]
+    """Transmitter and carrier of each, as ``lamp on mm``."""
 
     def of(self, kind: str) -> BoolArray:
-        """Which of them are of a kind: ``all``, ``LOS`` or ``NLOS``."""
+        """Which of them are of a kind: ``all``, ``LOS``, ``NLOS``, or of a station."""
         if kind == "all":
             return np.ones(len(self.los), np.bool_)
+        if kind in self.station:
+            return np.array([name == kind for name in self.station], np.bool_)
+        if kind not in ("LOS", "NLOS"):
+            return np.zeros(len(self.los), np.bool_)
         return self.los if kind == "LOS" else ~self.los
 
 
@@ -164,6 +170,7 @@ class _Seat:
     link: Service[Any]
     last: Link | None = None
     rows: list[Float64Array] = field(default_factory=list)
+    stations: list[str] = field(default_factory=list)
     pilots: list[int] = field(default_factory=list)
 
 
@@ -176,6 +183,7 @@ class Contest:
         players: By name.
         users: Receivers that count, as names with ``*`` and ``?``.
         agent: Of the scenario, whose place they take; None: the only one.
+        transmitters: Whose users count, likewise.
 
     Raises:
         ScenarioError: The scenario has no such agent, or no link, or several.
@@ -196,8 +204,9 @@ class Contest:
         players: Mapping[str, Player],
         users: Sequence[str] = ("*",),
         agent: str | None = None,
+        transmitters: Sequence[str] = ("*",),
     ) -> None:
-        self._scenario, self._users = scenario, Users(scenario, users)
+        self._scenario, self._users = scenario, Users(scenario, users, transmitters=transmitters)
         self._agent = agent_of(scenario, agent)
         links = [name for name, spec in scenario.services.items() if spec.role == "link"]
         if len(links) != 1:
@@ -235,7 +244,7 @@ class Contest:
         """
         frame = self._session.reset(seed)
         for seat in self._seats.values():
-            seat.last, seat.rows, seat.pilots = None, [], []
+            seat.last, seat.rows, seat.stations, seat.pilots = None, [], [], []
             for service in (seat.player, seat.link):
                 service.reset(frame.seed_episode, frame.seed, 0)
         nothing = Action(commands=())
@@ -278,6 +287,8 @@ class Contest:
         )
         kept: Float64Array = np.stack(columns, axis=1, dtype=np.float64)[counted]
         seat.rows.append(kept)
+        stations = [f"{tx} on {carrier}" for tx, carrier in zip(link.tx, link.carrier, strict=True)]
+        seat.stations += [name for name, counts in zip(stations, counted.tolist(), strict=True) if counts]
         seat.pilots.append(made.counts.get(PILOTS, 0))
 
 
@@ -290,6 +301,7 @@ def _played(seat: _Seat) -> Played:
         los=found[:, 3] > 0,
         net_efficiency=found[:, 4],
         pilots=float(np.mean(seat.pilots)),
+        station=tuple(seat.stations),
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.learning.contest import Contest, Player, PolicyPlayer, episodes_of, made_player
+from caviar_clients.learning.contest import Contest, Played, Player, PolicyPlayer, episodes_of, made_player
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
@@ -93,13 +93,29 @@ class Evaluation:
     policy: str
     scenario: str
     found: Mapping[str, Mapping[str, Interval]]
-    """|y| by method, then by kind of frame (`KINDS`)."""
+    """|y| by method, then by kind of frame (`KINDS`); with several transmitters or carriers also by station,
+    as ``lamp on mm``."""
     frames: Mapping[str, int]
     """Users and frames of each kind."""
+    power: Mapping[str, float]
+    """Mean |y|² by method."""
     efficiency: Mapping[str, Interval]
     """Spectral efficiency [bit/s/Hz] that pilots leave, by method."""
     pilots: Mapping[str, float]
     """Of a frame, on average, by method."""
+    by_episode: Mapping[str, Mapping[str, Sequence[float]]]
+    """Mean |y| of each episode by method, then by kind of frame; NaN: it had no such frames."""
+
+    def difference(self, method: str, kind: str = "all") -> Interval:
+        """Mean |y| of the policy less that of a method in the same episodes, with the interval of the paired
+        differences.
+
+        Args:
+            method: One of `found`.
+            kind: One of `KINDS`.
+        """
+        mine, its = self.by_episode["policy"][kind], self.by_episode[method][kind]
+        return mean_of([a - b for a, b in zip(mine, its, strict=True)])
 
     def ratio(self, method: str, kind: str = "all") -> float:
         """Mean |y| of the policy over that of a method."""
@@ -148,27 +164,35 @@ def evaluate(
     for name, settings in (against or {}).items():
         if name not in players:
             players[name] = made_player(known, name, settings, served, agent)
-    means: dict[tuple[str, str], list[float]] = {(m, k): [] for m in players for k in KINDS}
+    episodes_played: dict[str, list[Played]] = {method: [] for method in players}
     efficiency: dict[str, list[float]] = {method: [] for method in players}
     pilots: dict[str, list[float]] = {method: [] for method in players}
-    counts = dict.fromkeys(KINDS, 0)
-    with Contest(known, players, served, agent) as contest:
+    transmitters = model.card.transmitters if model.card else ("*",)
+    with Contest(known, players, served, agent, transmitters) as contest:
         for done, seed in enumerate(episodes_of(seeds, episodes), 1):
             for method, played in contest.play(seed).items():
                 efficiency[method].append(_mean(played.net_efficiency))
                 pilots[method].append(played.pilots)
-                for kind in KINDS:
-                    mine = played.of(kind)
-                    means[method, kind].append(_mean(played.abs_y[mine]))
-                    counts[kind] += int(mine.sum()) if method == "policy" else 0
+                episodes_played[method].append(played)
             progress(done)
+    stations = sorted({name for played in episodes_played["policy"] for name in played.station})
+    kinds = (*KINDS, *(stations if len(stations) > 1 else ()))
+    by_episode = {
+        m: {k: tuple(_mean(p.abs_y[p.of(k)]) for p in played) for k in kinds}
+        for m, played in episodes_played.items()
+    }
     return Evaluation(
         policy=file.name,
         scenario=known.run.name,
-        found={m: {k: mean_of(means[m, k]) for k in KINDS} for m in players},
-        frames=counts,
+        found={m: {k: mean_of(means) for k, means in of.items()} for m, of in by_episode.items()},
+        frames={k: sum(int(p.of(k).sum()) for p in episodes_played["policy"]) for k in kinds},
+        power={
+            m: _mean(np.concatenate([p.abs_y.reshape(-1) ** 2 for p in played]))
+            for m, played in episodes_played.items()
+        },
         efficiency={method: mean_of(values) for method, values in efficiency.items()},
         pilots={method: float(np.mean(values)) for method, values in pilots.items()},
+        by_episode=by_episode,
     )
 
 

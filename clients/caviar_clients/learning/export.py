@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.files import make_folder_of, writing
 from caviar_clients.learning.recorded import RecordedBeamsEnv
-from caviar_protocol.errors import RunError, SetupError
+from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_services.agent.policy import ACTION, CARD_KEY, PolicyCard, PolicyModel, write_card
@@ -56,6 +56,7 @@ def card_of(env: BeamEnv, **facts: Any) -> PolicyCard:
     made = PolicyCard(
         observe=tuple(env.observation_space.spaces),
         codebooks=tuple((place.tx.size, place.rx.size) for place in env.users.places),
+        transmitters=getattr(env, "transmitters", ("*",)),  # a recorded user has one
         environment=f"caviar/{type(env).__name__.removesuffix('Env')}-v0",
         scenario=env.scenario.run.name,
         versions=versions,
@@ -66,8 +67,13 @@ def card_of(env: BeamEnv, **facts: Any) -> PolicyCard:
 def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyCard:
     """Export a model of Stable-Baselines3: its deterministic choice.
 
+    The statistics of a ``VecNormalize`` that the model was trained behind become part of the policy: the file
+    takes observations as the environment makes them.
+
     Args:
-        model: A DQN, PPO or A2C of policy ``MultiInputPolicy``.
+        model: A DQN, PPO or A2C of policy ``MultiInputPolicy``, with the environment that it was trained in
+            where that has a ``VecNormalize``: a model's file has no statistics, and not always a trace of
+            them; a model loaded from one gets them by ``model.set_env(VecNormalize.load(…))``.
         env: An environment as it was trained in.
         file: Where the ONNX file goes.
         facts: Further fields of the card: ``steps``, ``seeds``, ``figures``.
@@ -77,6 +83,7 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
 
     Raises:
         RunError: The file cannot be written.
+        ScenarioError: The model observes something else than the environment.
         SetupError: A package is missing, or the exported policy chooses otherwise than the model.
 
     Example:
@@ -86,26 +93,73 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
         >>> card.observe
         ('aoa', 'last_abs_y')
     """
-    from torch import nn
+    import torch
 
-    names, policy = tuple(env.observation_space.spaces), model.policy
+    policy, normalizer = model.policy, model.get_vec_normalize_env()
+    if normalizer is not None and not normalizer.norm_obs:
+        normalizer = None
+    # In the order of the model's space, in which it makes its features.
+    names = tuple(model.observation_space.spaces)
+    _check_observed(model, env.observation_space, normalizer)
+    turned = {n for n in names if model.observation_space[n].shape != env.observation_space[n].shape}
+    statistics = {} if normalizer is None else {n: normalizer.obs_rms[n] for n in normalizer.norm_obs_keys}
 
-    class Choice(nn.Module):  # type: ignore[misc]  # torch is not looked at
-        """The deterministic choice of the model's policy."""
+    class Choice(torch.nn.Module):  # type: ignore[misc]  # torch is not looked at
+        """The deterministic choice of the model's policy, from what the environment shows."""
 
         def __init__(self) -> None:
             super().__init__()
             self.policy = policy
 
         def forward(self, *parts: Any) -> Any:
-            return self.policy._predict(dict(zip(names, parts, strict=True)), deterministic=True)
+            seen = dict(zip(names, parts, strict=True))
+            for name, found in statistics.items():
+                # In double precision, as the library does.
+                deviation = torch.from_numpy(np.sqrt(found.var + normalizer.epsilon))
+                scaled = (seen[name].double() - torch.from_numpy(found.mean)) / deviation
+                seen[name] = scaled.clamp(-normalizer.clip_obs, normalizer.clip_obs).float()
+            for name in turned:
+                seen[name] = seen[name].permute(0, 3, 1, 2)
+            return self.policy._predict(seen, deterministic=True)
 
-    card = card_of(env, **{"algorithm": f"Stable-Baselines3 {type(model).__name__}"} | facts)
+    card = card_of(
+        env, **{"algorithm": f"Stable-Baselines3 {type(model).__name__}", "observe": names} | facts
+    )
 
     def choose(observation: Observation) -> NDArray[np.int64]:
+        if normalizer is not None:
+            rows = normalizer.normalize_obs({name: value[None] for name, value in observation.items()})
+            observation = {name: value[0] for name, value in rows.items()}
         return np.ravel(model.predict(observation, deterministic=True)[0])
 
-    return export_module(Choice(), env.observation_space, file, card, choose)
+    # What the policy tells apart lies about the mean of what it saw, however narrow that is.
+    usual = {name: (found.mean, np.sqrt(found.var)) for name, found in statistics.items()}
+    return export_module(Choice(), env.observation_space, file, card, choose, usual)
+
+
+def _check_observed(model: Any, shown: spaces.Dict[Any], normalizer: Any) -> None:
+    """Raise `ScenarioError` where a model observes something else than an environment shows."""
+    learnt = model.observation_space
+    if [*learnt.spaces] != [*shown.spaces]:
+        raise ScenarioError(
+            f"the model observes {', '.join(learnt.spaces)}, and the environment {', '.join(shown.spaces)}; "
+            "give the environment that it was trained in"
+        )
+    for name, box in learnt.spaces.items():
+        mine, last = shown[name], (model._last_obs or {}).get(name)
+        shape = mine.shape or ()
+        channels_first = len(shape) == 3 and box.shape == (shape[2], *shape[:2])
+        if normalizer is None and last is not None and not all(map(box.contains, last)):
+            raise ScenarioError(
+                f"the model last saw {name!r} outside of its bounds {box}, as behind VecNormalize, whose "
+                "statistics no model file holds: call model.set_env(VecNormalize.load(…)), or give "
+                "caviar policy export --normalization"
+            )
+        if box != mine and not channels_first:
+            raise ScenarioError(
+                f"the model observes {name!r} as {box}, and the environment shows {mine}; give the "
+                "environment that it was trained in"
+            )
 
 
 def export_module(
@@ -114,16 +168,20 @@ def export_module(
     file: Path,
     card: PolicyCard,
     choose: Callable[[Observation], NDArray[np.int64]] | None = None,
+    usual: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> PolicyCard:
     """Export a PyTorch module.
 
     Args:
         module: A `torch.nn.Module`. It takes one tensor for each part of ``card.observe``, in that order,
-            each of Shape ``[1, …]``, and returns the action, integers of Shape ``[1]`` or ``[1, U]``.
+            each of Shape ``[1, …]`` and of the dtype of ``space``, and returns the action, integers of Shape
+            ``[1]`` or ``[1, U]``.
         space: Of the observation.
         file: Where the ONNX file goes; a file of this name is replaced.
         card: What the policy is.
         choose: What the exported policy is held against; None: the module itself.
+        usual: Mean and standard deviation of parts as the policy sees them, about which they are drawn to
+            hold it against the original; of others values are drawn over their bounds, within ±10.
 
     Returns:
         The card.
@@ -143,8 +201,8 @@ def export_module(
     if file.is_dir():
         raise RunError(f"{file} is a folder; name the ONNX file that is written")
     module = module.eval().cpu()
-    shapes = {name: space[name].shape or () for name in card.observe}
-    example = tuple(torch.zeros((1, *shape), dtype=torch.float32) for shape in shapes.values())
+    blank = {name: np.zeros((1, *(space[name].shape or ())), space[name].dtype) for name in card.observe}
+    example = tuple(map(torch.from_numpy, blank.values()))
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
         # The exporter by tracing is deprecated; the newer one needs onnxscript, for the same graph.
         warnings.simplefilter("ignore")
@@ -153,7 +211,7 @@ def export_module(
             module,
             example,
             str(traced),
-            input_names=list(shapes),
+            input_names=list(blank),
             output_names=[ACTION],
             opset_version=OPSET,
             dynamo=False,
@@ -162,19 +220,25 @@ def export_module(
         onnx.helper.set_model_props(model, {CARD_KEY: write_card(card)})
         made = Path(folder) / file.name
         onnx.save(model, str(made))
-        _check(PolicyModel(made), module if choose is None else choose, space, card)
+        _check(PolicyModel(made), module if choose is None else choose, space, card, usual or {})
         with writing(file):
             replace_file(file, made.read_bytes())
     return card
 
 
-def _check(exported: PolicyModel, original: Any, space: spaces.Dict[Any], card: PolicyCard) -> None:
+def _check(
+    exported: PolicyModel,
+    original: Any,
+    space: spaces.Dict[Any],
+    card: PolicyCard,
+    usual: Mapping[str, tuple[Any, Any]],
+) -> None:
     """Raise `SetupError` where the exported policy chooses otherwise than the original."""
     import torch
 
     rng = np.random.default_rng(0)
     for _ in range(TRIALS):
-        seen = {name: _drawn(space[name], rng) for name in card.observe}
+        seen = {name: _drawn(space[name], rng, usual.get(name)) for name in card.observe}
         if isinstance(original, torch.nn.Module):
             with torch.no_grad():
                 wanted = np.ravel(
@@ -190,8 +254,16 @@ def _check(exported: PolicyModel, original: Any, space: spaces.Dict[Any], card: 
             )
 
 
-def _drawn(space: Any, rng: np.random.Generator) -> NDArray[Any]:
-    """A value of a box, at most 10 where it has hardly a bound."""
-    bound = np.minimum(space.high, 10.0)
-    value: NDArray[Any] = rng.uniform(np.maximum(space.low, -bound), bound).astype(space.dtype)
-    return value
+def _drawn(space: Any, rng: np.random.Generator, usual: tuple[Any, Any] | None) -> NDArray[Any]:
+    """A value of a box: about the usual ones where these are known, else at most 10 where it has hardly a
+    bound."""
+    if usual is not None:
+        mean, deviation = usual
+        value = np.clip(mean + 2 * deviation * rng.standard_normal(space.shape), space.low, space.high)
+    elif np.issubdtype(space.dtype, np.integer):
+        value = rng.integers(space.low, space.high, endpoint=True, dtype=space.dtype)
+    else:
+        bound = np.minimum(space.high, 10.0)
+        value = rng.uniform(np.maximum(space.low, -bound), bound)
+    drawn: NDArray[Any] = value.astype(space.dtype)
+    return drawn

@@ -3,8 +3,8 @@
 Three channels: the geometric model with components drawn anew in each frame, as in the paper; with components
 that last an episode; and flights over Munich, ray-traced. On each a DQN with the library's defaults observes
 the angle alone, as in the paper; on the last two a tuned one observes position and last feedback, and a third
-one, with the same hyper-parameters, the angle alone. All are experiments of ``caviar train``, which ship as
-files; a folder gets copies of these, the recorded flights, and the trainings.
+one, with the same hyper-parameters, the angle alone. All are experiments of ``caviar policy train``, which
+ship as files; a folder gets copies of these, the recorded flights, and the trainings.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from caviar_clients.plots.style import (
     legend_square,
     name_objects,
 )
-from caviar_protocol.arrays import Float64Array, Int32Array
+from caviar_protocol.arrays import Float64Array, Int32Array, Int64Array
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Link, Scene
@@ -235,8 +235,21 @@ def chosen_beam(data: MapData) -> Beam | None:
     # Cut at the elevation of the user: in the plane of the horizon a beam that points down has no lobe.
     gain = data.beam_gain(device.array, beam, world @ rotation_matrix(pose.orientation))
     radius = max(0.6 * distance, 5.0) * gain / max(float(gain.max()), 1e-9)
-    outline: Float64Array = np.array(pose.position[:2]) + radius[:, None] * around
-    return Beam(outline, f"beam {beam} of {device.name}, chosen for {rx}")
+    outline: Float64Array = np.array(pose.position[:2]) + (radius[:, None] * around)[_main_lobe(gain)]
+    carrier = data.user[2] if data.user else ""
+    return Beam(outline, f"beam {beam} of {device.name} on {carrier}, chosen for {rx}")
+
+
+def _main_lobe(gain: Float64Array) -> Int64Array:
+    """Places of the strongest lobe of a pattern over a whole turn, from its null before to its null after."""
+    turned = np.arange(len(gain)) + int(gain.argmax())
+    around = gain[turned % len(gain)]
+    rises = np.flatnonzero(np.diff(around) > 0)
+    falls = np.flatnonzero(np.diff(around) < 0)
+    after = int(rises[0]) if len(rises) else 0
+    before = int(falls[-1]) + 1 if len(falls) else 0
+    lobe: Int64Array = turned[0] + np.arange(before - len(gain), after + 1)
+    return lobe % len(gain)
 
 
 def draw_beam(axes: Any, beam: Beam) -> None:
@@ -246,7 +259,7 @@ def draw_beam(axes: Any, beam: Beam) -> None:
     # Not `axes.fill`, which takes a tenth of a second to find the limits of so many corners.
     area = PolyCollection([beam.outline], facecolors=VERMILION, alpha=BEAM_ALPHA, linewidths=0, zorder=3)
     axes.add_collection(area, autolim=False)
-    axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.3, zorder=3.1, label=beam.label)
+    axes.plot(*beam.outline.T, color=VERMILION, linewidth=1.6, zorder=3.1, label=beam.label)
 
 
 def _chosen(data: MapData) -> tuple[AntennaDevice, int, str] | None:
@@ -413,7 +426,11 @@ def draw_values(view: RadioMapView, values: Float64Array, label: str, file: Path
         low, high, extend = colour_limits(shown)
         image = _draw_cells(axes, view, np.ma.masked_invalid(values), cmap="viridis", vmin=low, vmax=high)
         if len(shown):
-            drawn.colorbar(image, ax=axes, label=label, shrink=0.75, pad=0.01, extend=extend)
+            bar = drawn.colorbar(image, ax=axes, label=label, shrink=0.75, pad=0.01, extend=extend)
+            # Of nearly equal values the bar would have «1e−3 − 94.8», which is no number to read.
+            bar.formatter.set_useOffset(False)
+            bar.formatter.set_scientific(False)
+            bar.update_ticks()
 
 
 def draw_servers(view: RadioMapView, server: Int32Array, file: Path) -> None:

@@ -70,7 +70,8 @@ def rays(scene: Scene, channel: Channel | None) -> Rays:
     tick_gains: list[float] = []
     if channel is not None and len(channel.carriers):
         places = {d.name: np.array(device_pose(scene, d).position) for d in scene.devices}
-        power = np.abs(channel.a[0]) ** 2
+        # Of the first carrier that a pair uses: on others its amplitudes are 0.
+        power = np.abs(channel.a[(channel.a != 0).argmax(0), np.arange(len(channel.tau))]) ** 2
         used = channel.interactions != Interaction.NONE
         leaving, coming = unit_vectors(channel.aod), unit_vectors(channel.aoa)
         for tx in channel.tx:

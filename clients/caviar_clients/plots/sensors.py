@@ -17,7 +17,7 @@ from caviar_clients.plots.rays import OUTLINE, from_above
 from caviar_clients.plots.style import BLACK, LIGHT_GREY, ORANGE, figure, legend_below
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from caviar_protocol.space.coordinates import rotation_matrix
-from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, Scene
+from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, OccupancyGrid, Scene
 
 
 def draw_scan(scan: LidarScan, lidar: Lidar, scene: Scene | None, title: str, file: Path) -> None:
@@ -47,6 +47,35 @@ def draw_scan(scan: LidarScan, lidar: Lidar, scene: Scene | None, title: str, fi
         if device is not None:
             _draw_ranges(drawn, panels[1, 0], scan, device)
         legend_below(drawn, above)
+
+
+def draw_grid(grid: OccupancyGrid, title: str, file: Path) -> None:
+    """Draw the quantised grid of a scan from above: the highest occupied layer of each column.
+
+    Args:
+        grid: Of the scan.
+        title: Title of the picture.
+        file: PNG that is written.
+    """
+    cells, (x, y, z), (dx, dy, dz) = grid.occupancy, grid.origin, grid.cell
+    height = np.where(cells == 1, z + dz * np.arange(cells.shape[2]), -np.inf).max(axis=2)
+    # The first and the last cell reach half a cell beyond their coordinates.
+    extent = (x - dx / 2, x + dx * (len(cells) - 0.5), y - dy / 2, y + dy * (cells.shape[1] - 0.5))
+    ratio = (extent[3] - extent[2]) / (extent[1] - extent[0])
+    with figure(file, 9.5, float(np.clip(8.0 * ratio, 2.0, 8.0)) + 1.2) as drawn:
+        axes = drawn.subplots()
+        shown = axes.imshow(
+            np.ma.masked_invalid(height).T,
+            origin="lower",
+            extent=extent,
+            cmap="viridis",
+            interpolation="none",
+        )
+        drawn.colorbar(shown, ax=axes, label="Highest occupied cell z [m]", pad=0.01)
+        antennas = np.argwhere((cells < 0).any(axis=2)) * (dx, dy) + (x, y)
+        axes.scatter(*antennas.T, marker="^", s=60, color=ORANGE, edgecolors=BLACK, label="antenna")
+        axes.set(xlabel="x, east [m]", ylabel="y, north [m]", title=title)
+        legend_below(drawn, axes)
 
 
 def _view(scan: LidarScan) -> tuple[tuple[float, float], tuple[float, float]]:

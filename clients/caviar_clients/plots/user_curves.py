@@ -66,6 +66,8 @@ class UserSeries:
     baseline: Float64Array
     theta: Float64Array
     """Azimuth of the transmitter seen from the receiver, in the receiver's axes [rad]."""
+    begins: tuple[int, ...] = ()
+    """Frames in which an episode after the first begins."""
 
 
 def link_source(recording: Recording) -> str:
@@ -115,10 +117,13 @@ def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
     """
     # One pass over the frames: the recording's arrays would decode each link anew for every column.
     source = link_source(recording)
-    time, rows = [], []
+    time: list[float] = []
+    rows = []
     episode, base, last = 0, 0, 0
+    begins: list[int] = []
     for frame in recording.frames():
         if frame.episode != episode:
+            begins += [len(time)] if time else []
             episode, base = frame.episode, last + recording.metadata.sampling_period_ns - frame.t_ns
         last = base + frame.t_ns
         time.append(last * 1e-9)
@@ -135,46 +140,61 @@ def series(recording: Recording, user: tuple[str, str, str]) -> UserSeries:
         best=table[:, 3],
         baseline=table[:, 4],
         theta=table[:, 5],
+        begins=tuple(begins),
     )
 
 
 def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
-    """Draw Fig. 8 of the paper: |y| over time above, the angle of arrival below; NLOS shaded.
+    """Draw |y| of the best pair over time, what others lose to it, and the angle of arrival; NLOS shaded.
 
     Args:
         data: The user.
         agent: Name of the agent, for the legend.
         file: PNG that is written.
     """
-    with figure(file, 9.0, 6.0) as drawn:
-        top, bottom = drawn.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    with figure(file, 9.0, 8.0) as drawn:
+        top, middle, bottom = drawn.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
         for label, values, style in curves(data, agent):
-            top.plot(
-                data.time,
-                np.where(data.has_path, values, np.nan),
-                label=f"{label}, mean {_mean(data, values):.3g}",
-                **style,
-            )
-        for axes in (top, bottom):
+            shown = np.where(data.has_path, decibels(values), np.nan)
+            # |y| of a perfect agent is the optimum: its loss shows beside the other's, the curves would not.
+            axes, shown = (top, shown) if values is data.best else (middle, shown - decibels(data.best))
+            axes.plot(*_apart(data, shown), label=f"{label}, mean |y| {_mean(data, values):.3g}", **style)
+        optimum = f"optimum, mean |y| {_mean(data, data.best):.3g}"
+        middle.plot([], [], color=OPTIMUM, linewidth=2.8, label=optimum)
+        for axes in (top, middle, bottom):
             shade(axes, data)
             axes.grid()
-        top.set_ylabel("|y|")
-        top.set_ylim(bottom=0)
+        top.set_ylabel("|y| of the\noptimum [dB]")
+        middle.set_ylabel("|y| below\nthe optimum [dB]")
+        middle.set_ylim(top=max(0.5, -0.03 * middle.get_ylim()[0]))
         top.set_title(f"Beam selection for {data.rx}, served by {data.tx} ({data.carrier})")
-        bottom.plot(*_without_jumps(data.time, np.degrees(_wrapped(data.theta))), color=GREY, linewidth=1.6)
+        theta = _apart(data, np.degrees(_wrapped(data.theta)))
+        bottom.plot(*_without_jumps(*theta), color=GREY, linewidth=1.6)
         bottom.set_ylabel("AoA θ [°]")
         bottom.set_xlabel("Time [s]")
         bottom.margins(x=0)
-        legend_below(drawn, top)
+        legend_below(drawn, middle)
+
+
+def decibels(values: Float64Array) -> Float64Array:
+    """Express amplitudes in dB; NaN for 0."""
+    found: Float64Array = 20 * np.log10(np.where(values > 0, values, np.nan))
+    return found
+
+
+def _apart(data: UserSeries, values: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Insert a gap where an episode begins, so that no line joins two."""
+    begins = list(data.begins)
+    return np.insert(data.time, begins, data.time[begins]), np.insert(values, begins, np.nan)
 
 
 def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
-    """Draw |y| over the angle of arrival, a point a frame; hollow where the line of sight is blocked."""
+    """Draw what is lost to the optimum over the angle of arrival, a point a frame; hollow: NLOS."""
     with figure(file, 9.0, 5.0) as drawn:
         axes = drawn.subplots()
         theta = np.degrees(_wrapped(data.theta))
-        for label, values, style in curves(data, agent):
-            color = style["color"]
+        for label, values, style in curves(data, agent)[1:]:
+            color, values = style["color"], decibels(values) - decibels(data.best)
             for mask, face in ((data.has_path & data.los, color), (data.has_path & ~data.los, "none")):
                 axes.scatter(
                     theta[mask], values[mask], s=_SIZES[color], marker=_MARKERS[color],
@@ -185,8 +205,8 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
             axes.scatter([], [], s=30, facecolors="none", edgecolors=GREY, label="hollow: NLOS")
         axes.grid()
         axes.set_xlabel("AoA θ [°]")
-        axes.set_ylabel("|y|")
-        axes.set_ylim(bottom=0)
+        axes.set_ylabel("|y| below the optimum [dB]")
+        axes.set_ylim(top=max(0.5, -0.03 * axes.get_ylim()[0]))
         axes.set_title(f"|y| over the angle of arrival: {data.rx}, served by {data.tx} ({data.carrier})")
         legend_below(drawn, axes)
 
@@ -335,14 +355,18 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
     sigma_tau, sigma_nu = delay_spread(data.a, data.tau), doppler_spread(data.a, data.doppler)
     with np.errstate(divide="ignore"):
         k_db = 10 * np.log10(k_factor(data.a, data.tau, data.los))
-    rows = (
+    all_rows = (
         ("RMS delay\nspread [ns]", sigma_tau * 1e9, BLUE),
         ("K-factor [dB]", k_db, BLUE),
         ("Coherence\nbandwidth [MHz]", coherence(sigma_tau) * 1e-6, VERMILION),
         ("Coherence\ntime [ms]", coherence(sigma_nu) * 1e3, VERMILION),
     )
-    with figure(file, 9.0, 8.0) as drawn:
-        axes = drawn.subplots(len(rows), 1, sharex=True)
+    # Of one path in each frame only the delay spread, 0, is a number: empty panels would say no more.
+    rows = [row for row in all_rows if np.isfinite(row[1]).any()] or all_rows[:1]
+    left_out = [label.replace("\n", " ").split(" [")[0] for label, *_ in all_rows[len(rows) :]]
+    without = f"\n{', '.join(left_out)}: {_why_empty(all_rows[-1][1])}" if len(rows) == 1 else ""
+    with figure(file, 9.0, 1.0 + 1.75 * len(rows) + 0.6 * bool(without)) as drawn:
+        axes = drawn.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for place, (label, values, color) in zip(axes, rows, strict=True):
             finite = np.where(np.isfinite(values), values, np.nan)
             place.plot(data.time, finite, color=color, linewidth=1.6, marker=".", markersize=4)
@@ -355,8 +379,8 @@ def draw_dispersion(data: UserPaths, file: Path) -> None:
             place.grid()
             shade_frames(place, data.time, ~data.los & np.isfinite(data.tau).any(-1), LIGHT_GREY)
         axes[0].set_title(
-            f"Dispersion of {data.rx}, served by {data.tx} ({data.carrier.name}); shaded: NLOS\n"
-            "coherence: correlation stays above 0.5 for at least 1/(6σ)"
+            f"Dispersion of {data.rx}, served by {data.tx} ({data.carrier.name}); shaded: NLOS"
+            + (without or "\ncoherence: correlation stays above 0.5 for at least 1/(6σ)")
         )
         axes[-1].set_xlabel("Time [s]")
         axes[-1].margins(x=0)
@@ -380,7 +404,7 @@ def _scale(axes: Any, values: Float64Array) -> None:
 def _why_empty(values: Float64Array) -> str:
     """Explain why no value of a user can be drawn."""
     if np.isposinf(values).any():
-        return "infinite: one path in each frame"
+        return "infinite, with one path in each frame"
     return "no direct path" if np.isneginf(values).any() else "no path"
 
 

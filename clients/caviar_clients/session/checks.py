@@ -12,6 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from caviar_broker.core.graph import build_graph
+from caviar_clients.session.plausibility import refuse_carriers
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import PROTOCOL_VERSION, Hello
 from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, load_scenario
@@ -41,6 +42,7 @@ def checked_scenario(
     seed: int | None = None,
     pace: str | None = None,
     airsim: str = "",
+    settings: Sequence[str] = (),
 ) -> Scenario:
     """Load a scenario and check it against the implementations that it uses.
 
@@ -48,6 +50,7 @@ def checked_scenario(
         path: The scenario's file, or the name of one that ships.
         frames, seed, pace: What replaces the scenario's; None: nothing.
         airsim: ``HOST:PORT`` at which scripts written for AirSim fly its objects; empty: its agents do.
+        settings: ``KEY=VALUE`` each, in place of what the file says.
 
     Raises:
         ScenarioError: An implementation or a setting does not exist, or no implementation produces a topic to
@@ -57,7 +60,7 @@ def checked_scenario(
         >>> checked_scenario("smoke", frames=3).run.frames
         3
     """
-    scenario = with_overrides(load_scenario(Path(path)), frames, seed, pace)
+    scenario = with_overrides(load_scenario(Path(path), settings), frames, seed, pace)
     return check_implementations(with_airsim(scenario, airsim))
 
 
@@ -68,11 +71,15 @@ def module_folders(scenario: Scenario) -> tuple[Path, ...]:
         The scenario's folder and the current one; empty where neither a service nor a rung of a service's
         settings is named so.
     """
-    named = (name for spec in scenario.services.values() for name in (spec.use, *_used_by(spec.settings)))
-    if not any(":" in name for name in named):
+    if not any(map(names_class, scenario.services.values())):
         return ()
     beside = (Path(scenario.source.file).resolve().parent,) if scenario.source.file else ()
     return (*beside, Path.cwd())
+
+
+def names_class(spec: ServiceSpec) -> bool:
+    """Whether a service, or a rung of its settings, is named ``module:Class``: a run imports the module."""
+    return any(":" in name for name in (spec.use, *_used_by(spec.settings)))
 
 
 def _used_by(settings: object) -> Iterator[str]:
@@ -124,6 +131,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
     Raises:
         ScenarioError: As of `checked_scenario`.
     """
+    refuse_carriers(scenario)
     # Before classes are loaded; the processes of services get the same folders on their command lines.
     for folder in module_folders(scenario):
         find_modules_in(folder)

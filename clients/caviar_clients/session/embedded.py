@@ -39,10 +39,10 @@ from caviar_protocol.geometry import MeshCheck
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import Answer, sorted_products
-from caviar_services.registry import load
+from caviar_services.registry import load, with_inputs
 from caviar_services.service import Service, StepResult
 from caviar_services.session import ServiceSession
 
@@ -177,6 +177,7 @@ class EmbeddedRun:
             policies=given_policies(scenario, store, directory),
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
+        self._services = {service.name: service for service in plan.services}
         self._now = 0
         self._plan, self._clock = plan, FrameClock(plan, self._now)
         self._journal = (
@@ -204,10 +205,14 @@ class EmbeddedRun:
             progress = partial(self._progressed, name)
             return kind(name, use, cls, send, store, progress=progress, check=check, encodes=self._encodes)
 
+        def loaded(spec: ServiceSpec) -> type[Service[Any]]:
+            cls = load(spec.role, spec.use)
+            return with_inputs(cls, cls.inputs_with(spec.settings))
+
         self.seats = {name: session(OutsideSession, name, cls) for name, cls in seats.items()}
         """Services that decide outside of the run."""
         self._sessions: dict[str, ServiceSession] = {
-            name: self.seats.get(name) or session(ServiceSession, name, load(spec.role, spec.use))
+            name: self.seats.get(name) or session(ServiceSession, name, loaded(spec))
             for name, spec in scenario.services.items()
         }
         self._at_work: Work | None = None  # what a service handles just now
@@ -302,7 +307,11 @@ class EmbeddedRun:
             session.report(failure, phase, episode, frame)
         self._at_work = None
         if self._encodes and type(order.message) is m.Grant:
-            self.statistics.latency(order.service, time.monotonic_ns() - began, missed=False)
+            elapsed, plan = time.monotonic_ns() - began, self._services[order.service]
+            grant = order.message
+            missed = elapsed > plan.budget_ns
+            missed = missed and not self._plan.is_warm_up(plan, grant.episode, grant.frame)
+            self.statistics.latency(order.service, elapsed, missed)
 
     def _close(self, session: ServiceSession) -> None:
         self._direct, self._at_work = None, (session.name, None)

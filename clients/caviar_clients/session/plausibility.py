@@ -1,4 +1,4 @@
-"""Warnings of what a scenario may say and its author hardly means: 28 Hz, a base station below the ground."""
+"""Values that the author of a scenario hardly means: a carrier of 28 Hz, a base station below the ground."""
 
 from __future__ import annotations
 
@@ -68,6 +68,25 @@ def implausible_values(scenario: Scenario) -> list[str]:
         *_positions(scenario),
     ]
     return [str(scenario_error(scenario, key, text)) for key, text in found]
+
+
+LEAST_HZ = 1e6
+"""Frequency below which a carrier is written in another unit: its wave is longer than any scene."""
+
+
+def refuse_carriers(scenario: Scenario) -> None:
+    """Refuse a carrier that can only be written in another unit, as 28 for 28 GHz.
+
+    Raises:
+        ScenarioError: One is below `LEAST_HZ`; the text has what may have been meant.
+    """
+    low, high = FREQUENCY_HZ
+    for index, carrier in enumerate(scenario.carriers):
+        if (frequency := carrier.frequency_hz) < LEAST_HZ:
+            meant = _meant(frequency, low, high) or "; write it in Hz, as 28e9"
+            usual = f"radio carriers are from {in_hertz(low)} to {in_hertz(high)}"
+            key = f"carriers[{index}].frequency_hz"
+            raise scenario_error(scenario, key, f"is {in_hertz(frequency)}; {usual}{meant}")
 
 
 # Keys of the scenario, and what is implausible there.

@@ -17,9 +17,9 @@ import numpy as np
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
 from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.base import User, channels_of, users_of
-from caviar_services.link.beam_sweep import sweep
 from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import noise_power, transmit_power
 
@@ -240,7 +240,7 @@ def _user_channel(
     power = np.abs(a) ** 2
     directions = np.concatenate([channel.aod[paths], channel.aoa[paths]], axis=1)
     noise_w = noise_power(user.carrier, noise.figure_db, noise.temperature_k)
-    abs_y = sweep(h, user.tx.array, user.rx.array)
+    abs_y = beam_gains(h, user.tx.array, user.rx.array)
     return UserChannel(
         los=los,
         path_gain_db=path_gain_db(a),

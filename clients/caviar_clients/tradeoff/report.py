@@ -140,7 +140,7 @@ def answers(
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """Findings of a comparison, as ``caviar tradeoff --json`` writes them."""
+    """Findings of a comparison, as ``caviar measure tradeoff --json`` writes them."""
 
     scenario: str
     origin: str

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.checks import checked_scenario, names_class
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.messages import Input, Role
@@ -172,10 +172,12 @@ def _recorded(
         scenario = metadata.scenario
         carriers = msgspec.convert(scenario.get("carriers", ()), tuple[Carrier, ...])
         devices = msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...])
-        services = msgspec.convert(scenario.get("services", {}), dict[str, ServiceSpec])
+        found = msgspec.convert(scenario.get("services", {}), dict[str, ServiceSpec])
     except msgspec.ValidationError as error:
         path = recording.directory
         raise RecordingError(f"{path}: the scenario in its metadata cannot be read: {error}") from error
+    # A recording may be a stranger's: a class that it names is not loaded.
+    services = {name: spec for name, spec in found.items() if not names_class(spec)}
     return Scenes(
         name=metadata.name,
         origin=f"recording {recording.directory.name}",

@@ -24,7 +24,7 @@ from caviar_clients.tradeoff.errors import Key, Noise, UserChannel, user_channel
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
-from caviar_protocol.host import peak_mib, reset_peak, resident_mib
+from caviar_protocol.host import peak_mib, reset_peak, resident_mib, safe_path
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.scene import antennas
@@ -245,7 +245,8 @@ class Worker:
         self._process = context.Process(
             target=_serve, args=(theirs, setting, scenes, receivers, products), daemon=True
         )
-        self._process.start()
+        with safe_path():
+            self._process.start()
         theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
         self.loaded: Loaded = self._answer(seconds)
 

@@ -85,6 +85,7 @@ export function deviceOf(spec, parent) {
         role: spec.role,
         array: arrayOf(spec.array),
         power_dbm: spec.power_dbm,
+        carriers: spec.carriers ?? [],
       };
     case "lidar": {
       const [low, high] = spec.elevation_deg,

@@ -85,11 +85,17 @@ export interface WaypointCommand {
   position: Vector3;
   speed: number;
   at_once?: boolean;
+  /** Since 1.6: heading to turn to and to keep [rad]; left out: along the course. */
+  yaw?: number;
 }
 export interface VelocityCommand {
   type: "velocity";
   object: string;
   velocity: Vector3;
+  /** Since 1.6: heading to turn to and to keep [rad]; left out: along the course. */
+  yaw?: number;
+  /** Since 1.6: with which the heading turns [rad/s], where `yaw` is left out. */
+  yaw_rate?: number;
 }
 export interface UserSchedule {
   type: "schedule";
@@ -195,6 +201,7 @@ export interface AntennaDevice extends Mounted {
   role: "tx" | "rx" | "both";
   array: AntennaArray;
   power_dbm: number;
+  carriers: string[];
 }
 export interface LidarDevice extends Mounted {
   type: "lidar";
@@ -266,6 +273,7 @@ export interface Channel {
   taps: (ChannelEntry & { first: number })[];
   error_bound_db?: NumericArray;
   error_reference: string;
+  used?: NumericArray;
 }
 
 interface Sensed {

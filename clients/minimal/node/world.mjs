@@ -120,7 +120,8 @@ function device(spec, parent) {
         yaw_deg: float(yaw_deg, 0), pitch_deg: float(pitch_deg, 0), roll_deg: float(roll_deg, 0),
       })) : undefined,
     };
-    return { ...common, role: spec.role, array: unlessEqual(array ?? {}, {}), power_dbm: float(spec.power_dbm, 0) };
+    return { ...common, role: spec.role, array: unlessEqual(array ?? {}, {}), power_dbm: float(spec.power_dbm, 0),
+      carriers: spec.carriers?.length ? spec.carriers : undefined };
   }
   if (spec.kind === "lidar") {
     const [low, high] = spec.elevation_deg.map(radians), [near, far] = spec.range_m;

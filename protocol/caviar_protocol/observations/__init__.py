@@ -41,6 +41,7 @@ __all__ = [
     "Part",
     "Place",
     "Users",
+    "inputs_of",
     "is_feedback",
     "part",
     "require_packets",
@@ -59,6 +60,20 @@ def is_feedback(name: str) -> bool:
     """
     cls = PARTS.get(name.partition(":")[0])
     return isinstance(cls, type) and issubclass(cls, OfLink)
+
+
+def inputs_of(names: Iterable[str]) -> tuple[Input, ...]:
+    """What parts need beside the scene and the link of the frame before, one input for each topic.
+
+    Args:
+        names: Of the parts; those that do not exist need nothing.
+
+    Example:
+        >>> [given.topic for given in inputs_of(("position", "lidar_grid:top"))]
+        ['lidar']
+    """
+    found = (PARTS[kind] for name in names if (kind := name.partition(":")[0]) in PARTS)
+    return tuple({i.topic: i for cls in found for i in getattr(cls, "inputs", ())}.values())
 
 
 def part(scenario: KnownScenario, users: Users, name: str) -> Part:
@@ -123,7 +138,7 @@ class Observer:
     @property
     def inputs(self) -> tuple[Input, ...]:
         """What the parts need beside the scene and the link of the frame before, one input for each topic."""
-        return tuple({i.topic: i for found in self._parts.values() for i in found.inputs}.values())
+        return inputs_of(self._parts)
 
     def read(self, moment: Moment) -> dict[str, NDArray[Any]]:
         """Read all parts at a frame; zeros stand for what is not known.

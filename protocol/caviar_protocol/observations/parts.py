@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from operator import add
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float64Array, Payload
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.observations.users import KnownScenario, Users, spec_name
+from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
 from caviar_protocol.topics import Camera, Depth, Lidar, Scene
@@ -345,66 +346,96 @@ class LastThroughput(_OfPackets):
     field, unit = "throughput", 1e6
 
 
-class LidarGrid(Part):
-    """Occupancy grid of a LIDAR: 0 free, 1 obstacle, −1 TX, −2 RX. Shape ``[X, Y, Z]``."""
+class _OfSensor(Part):
+    """What one sensor sees; of a sensor that is on several objects, what that of each user's object sees, and
+    zeros for a user without."""
+
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
+        super().__init__(scenario, users, sensor)
+        spec = next(d for d in scenario.devices if d.name == sensor)
+        self._is_per_user = spec.count > 1
+        if self._is_per_user and not users.on_objects_of(spec):
+            raise ScenarioError(
+                f"{spec.kind} {sensor!r} is on up to {spec.count} objects {spec.on!r}, of which none carries "
+                f"a receiver that is served: {', '.join(users.receivers)}; observe one that is on one object"
+            )
+        self._one = self._bounds_of_one(scenario, spec)
+
+    @property
+    def bounds(self) -> Bounds:
+        shape = self._one.shape
+        return self._one._replace(shape=(len(self.users), *shape)) if self._is_per_user else self._one
+
+    def read(self, moment: Moment) -> NDArray[Any] | None:
+        seen = {name: value for name, value in self._seen(moment) if spec_name(name) == self.sensor}
+        for name, value in seen.items():
+            if value.shape != self._one.shape:
+                raise PayloadError(
+                    f"{name} shows {list(value.shape)}, and the policy observes {list(self._one.shape)}; use "
+                    "the grid, or the size of the picture, that it was trained with"
+                )
+        if not self._is_per_user:
+            return next(iter(seen.values()), None)
+        found = np.zeros(self.bounds.shape, self._one.dtype)
+        for place, pair in moment.users:
+            if (own := f"{pair.rx.parent}/{self.sensor}") in seen:
+                found[place] = seen[own]
+        return found
+
+    @abstractmethod
+    def _bounds_of_one(self, scenario: KnownScenario, spec: DeviceSpec) -> Bounds:
+        """Bounds of what one sensor sees."""
+
+    @abstractmethod
+    def _seen(self, moment: Moment) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Names of the sensors of a frame, and what they see."""
+
+
+class LidarGrid(_OfSensor):
+    """Occupancy grid of a LIDAR: 0 free, 1 obstacle, −1 TX, −2 RX. Shape ``[X, Y, Z]``; of a LIDAR on several
+    objects ``[U, X, Y, Z]``, each user's own."""
 
     inputs = (Input(topic="lidar", parts=("grid",)),)
     needs_sensor = "lidar"
 
-    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
-        super().__init__(scenario, users, sensor)
-        self._shape = _grid_shape(scenario)
+    def _bounds_of_one(self, scenario: KnownScenario, spec: DeviceSpec) -> Bounds:
+        return Bounds(-2, 1, _grid_shape(scenario), np.int8)
 
-    @property
-    def bounds(self) -> Bounds:
-        return Bounds(-2, 1, self._shape, np.int8)
-
-    def read(self, moment: Moment) -> NDArray[np.int8] | None:
+    def _seen(self, moment: Moment) -> Iterator[tuple[str, NDArray[Any]]]:
         for lidar in moment.frame.payloads("lidar", Lidar).values():
-            for scan in lidar.scans:
-                if spec_name(scan.sensor) == self.sensor and scan.grid is not None:
-                    return scan.grid.occupancy
-        return None
+            yield from ((s.sensor, s.grid.occupancy) for s in lidar.scans if s.grid is not None)
 
 
-class DepthImage(Part):
-    """Depth image [m] of a camera; 0: nothing is hit. Shape ``[H, W]``."""
+class DepthImage(_OfSensor):
+    """Depth image [m] of a camera; 0: nothing is hit. Shape ``[H, W]``; of a camera on several objects
+    ``[U, H, W]``, each user's own."""
 
     inputs = (Input(topic="depth"),)
     needs_sensor = "camera"
 
-    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
-        super().__init__(scenario, users, sensor)
-        width, height = next(d.size_px for d in scenario.devices if d.name == sensor)
-        self._shape = (height, width)
+    def _bounds_of_one(self, scenario: KnownScenario, spec: DeviceSpec) -> Bounds:
+        width, height = spec.size_px
+        return Bounds(0, FAR, (height, width), np.float32)
 
-    @property
-    def bounds(self) -> Bounds:
-        return Bounds(0, FAR, self._shape, np.float32)
-
-    def read(self, moment: Moment) -> NDArray[np.float32] | None:
+    def _seen(self, moment: Moment) -> Iterator[tuple[str, NDArray[Any]]]:
         for depth in moment.frame.payloads("depth", Depth).values():
-            for image in depth.images:
-                if spec_name(image.sensor) == self.sensor:
-                    return image.depth
-        return None
+            yield from ((image.sensor, image.depth) for image in depth.images)
 
 
-class CameraImage(DepthImage):
-    """RGB image of a camera. Shape ``[H, W, 3]``."""
+class CameraImage(_OfSensor):
+    """RGB image of a camera. Shape ``[H, W, 3]``; of a camera on several objects ``[U, H, W, 3]``, each
+    user's own."""
 
     inputs = (Input(topic="camera"),)
+    needs_sensor = "camera"
 
-    @property
-    def bounds(self) -> Bounds:
-        return Bounds(0, 255, (*self._shape, 3), np.uint8)
+    def _bounds_of_one(self, scenario: KnownScenario, spec: DeviceSpec) -> Bounds:
+        width, height = spec.size_px
+        return Bounds(0, 255, (height, width, 3), np.uint8)
 
-    def read(self, moment: Moment) -> NDArray[Any] | None:
+    def _seen(self, moment: Moment) -> Iterator[tuple[str, NDArray[Any]]]:
         for camera in moment.frame.payloads("camera", Camera).values():
-            for image in camera.images:
-                if spec_name(image.sensor) == self.sensor:
-                    return image.rgb
-        return None
+            yield from ((image.sensor, image.rgb) for image in camera.images)
 
 
 def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:

@@ -10,7 +10,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.scenario.schema import ServiceSpec, owned_by
-from caviar_protocol.space.scene import Pair, pairs_of
+from caviar_protocol.space.scene import Pair, pairs_of, share_carrier
 from caviar_protocol.topics import AntennaArray, Scene
 
 
@@ -58,6 +58,7 @@ class Users:
         scenario: Names the devices.
         patterns: Receivers that are served, as names with ``*`` and ``?``.
         without: Receivers among them that are not, in the same form; their places stay empty.
+        transmitters: Transmitters whose pairs have places, in the same form.
 
     Raises:
         ScenarioError: The patterns match no receiver; the text has those there are.
@@ -69,19 +70,32 @@ class Users:
         (1, 64)
     """
 
-    def __init__(self, scenario: KnownScenario, patterns: Sequence[str], without: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        scenario: KnownScenario,
+        patterns: Sequence[str],
+        without: Sequence[str] = (),
+        transmitters: Sequence[str] = ("*",),
+    ) -> None:
         self._patterns, self._without = tuple(patterns), tuple(without)
         antennas = [d for d in scenario.devices if d.kind == "antenna"]
         self._groups: list[tuple[DeviceSpec, DeviceSpec]] = [
             (tx, rx)
             for tx in sorted((d for d in antennas if d.role in ("tx", "both")), key=_name)
+            if any(patterns_overlap(_full_name(tx), pattern) for pattern in transmitters)
             for rx in sorted((d for d in antennas if d.role in ("rx", "both")), key=_name)
-            if rx is not tx and self._may_serve(rx)
+            if rx is not tx and self._may_serve(rx) and share_carrier(tx.carriers, rx.carriers)
         ]
         if not self._groups:
-            receivers = (d for d in antennas if d.role in ("rx", "both"))
-            names = ", ".join(_full_name(d) for d in receivers) or "none"
-            raise ScenarioError(f"no receiver of the scenario is {' or '.join(patterns)}; there are: {names}")
+            receivers, senders = (
+                ", ".join(_full_name(d) for d in antennas if d.role in (role, "both")) or "none"
+                for role in ("rx", "tx")
+            )
+            of_tx = "" if "*" in transmitters else f" with transmitter {' or '.join(transmitters)}"
+            there = f"{receivers}" + (f"; transmitters: {senders}" if of_tx else "")
+            raise ScenarioError(
+                f"no receiver of the scenario is {' or '.join(patterns)}{of_tx}; there are: {there}"
+            )
         self._first: dict[tuple[str, str], int] = {}
         self.places: list[Place] = []
         """One for each pair there may be."""
@@ -94,6 +108,14 @@ class Users:
 
     def __len__(self) -> int:
         return len(self.places)
+
+    def on_objects_of(self, sensor: DeviceSpec) -> bool:
+        """Whether a receiver that is served may be on an object that carries a device.
+
+        Args:
+            sensor: The device, on a pattern of objects.
+        """
+        return any(rx.on and patterns_overlap(rx.on, sensor.on) for _, rx in self._groups)
 
     @property
     def receivers(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, overload
@@ -101,6 +101,10 @@ class Recording:
         for segment in self._segments:
             self._starts.append(self._starts[-1] + len(segment.chunks))
         self._index = self._build_index()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Its files are mapped into the memory of this process: another one opens them itself.
+        return partial(Recording, past_gaps=self._found.past_gaps), (self.path.absolute(),)
 
     def __len__(self) -> int:
         return self._starts[-1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Payload
@@ -22,7 +23,9 @@ from caviar_protocol.recording.scene import (
     SceneArrays,
     SegmentationArrays,
 )
-from caviar_protocol.topics import Action, BeamChoice, Carrier, Channel, Link
+from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
+from caviar_protocol.space.beams import beam_gains
+from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Link
 
 P = TypeVar("P", bound=Payload)
 
@@ -112,7 +115,7 @@ def _pairs(channel: Channel) -> Iterator[tuple[int, int, int]]:
     for c in range(len(channel.carriers)):
         for t, tx in enumerate(channel.tx):
             for r, rx in enumerate(channel.rx):
-                if tx != rx:
+                if tx != rx and channel.uses(c, t, r):
                     yield c, t, r
 
 
@@ -180,6 +183,20 @@ class ChannelArrays(UserArrays[Channel]):
         found = {(m.carrier, m.tx, m.rx): m.h for m in channel.h}
         return self.recorded("channel.h", [found.get(pair) for pair in _pairs(channel)])
 
+    def _beam_gains(self, channel: Channel) -> Rows:
+        pairs = [(self._array(channel.tx[t]), self._array(channel.rx[r])) for _, t, r in _pairs(channel)]
+        return [beam_gains(h, *ends) for h, ends in zip(self._matrices(channel), pairs, strict=True)]
+
+    def _array(self, name: str) -> AntennaArray:
+        """The array of a device, by the scenario of the run."""
+        specs = self._recording.metadata.scenario.get("devices", ())
+        for spec in msgspec.convert(specs, tuple[DeviceSpec, ...]):
+            if is_made_by(spec, name):
+                return spec.array or AntennaArray()
+        raise RecordingError(
+            f"{self.place}: the array of {name!r} is not in the run's scenario; pass it to caviar.beam_gains"
+        )
+
     def _first_taps(self, channel: Channel) -> Rows:
         if not channel.taps:
             return _wideband("taps", "taps")(self, channel)
@@ -188,6 +205,13 @@ class ChannelArrays(UserArrays[Channel]):
 
     h = Column(
         np.complex128, "Nr", "Nt", doc="narrowband gain from TX element n to RX element m", rows=_matrices
+    )
+    beam_gains = Column(
+        np.float64,
+        "Nt",
+        "Nr",
+        doc="|y| of each TX and RX beam, as caviar.beam_gains has it",
+        rows=_beam_gains,
     )
     hf = Column(
         np.complex64,

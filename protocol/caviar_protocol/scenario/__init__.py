@@ -65,23 +65,32 @@ def find_scenario(scenario: Path | str) -> Path:
     """File of a scenario that is given as a path, or as the name of one that ships.
 
     Args:
-        scenario: ``"my/scenario.toml"`` or ``"smoke"``. A file of that path comes first.
+        scenario: ``"my/scenario.toml"`` or ``"smoke"``.
 
     Returns:
         The file. What is neither is returned as it is; reading it says what is wrong.
+
+    Raises:
+        ScenarioError: One that ships has the name, and so has a file in the current folder.
 
     Example:
         >>> find_scenario("smoke").name, str(find_scenario("my/street.toml"))
         ('smoke.toml', 'my/street.toml')
     """
-    # A file beside the user is meant before one that ships under the same name.
     path = Path(scenario)
-    if path.is_file() or path.name != str(scenario):
+    shipped = shipped_scenarios().get(str(scenario))
+    if shipped is None:
         return path
-    return shipped_scenarios().get(str(scenario), path)
+    for own in (path, path.with_suffix(".toml")):
+        if own.is_file() and own.resolve() != shipped:
+            raise ScenarioError(
+                f"{path} is a scenario that ships, and {own} is a file here: write {own.resolve()} or "
+                f"{shipped}"
+            )
+    return shipped
 
 
-def load_scenario(path: Path | str) -> Scenario:
+def load_scenario(path: Path | str, settings: Sequence[str] = ()) -> Scenario:
     """Read and check a scenario.
 
     Strings that begin with ``file:`` in settings of services, and in the ``pattern_file`` of antennas, are
@@ -89,6 +98,7 @@ def load_scenario(path: Path | str) -> Scenario:
 
     Args:
         path: A file, or the name of a scenario that ships, as of `find_scenario`.
+        settings: ``KEY=VALUE`` each, in place of what the file says, as of `set_keys`.
 
     Raises:
         ScenarioError: The file cannot be read or breaks a rule; the text has file, line, key, value and what
@@ -108,16 +118,19 @@ def load_scenario(path: Path | str) -> Scenario:
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
         raise ScenarioError("is not UTF-8 text here; save it as UTF-8", str(path), line=line) from error
-    return parse_scenario(text, str(path), path.parent)
+    return parse_scenario(text, str(path), path.parent, settings)
 
 
-def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Scenario:
+def parse_scenario(
+    text: str, file: str = "", folder: Path | None = None, settings: Sequence[str] = ()
+) -> Scenario:
     """Check a scenario given as text.
 
     Args:
         text: TOML.
         file: What errors call it.
         folder: What its ``file:`` paths are relative to; by default the working directory.
+        settings: ``KEY=VALUE`` each, as of `load_scenario`.
 
     Raises:
         ScenarioError: The text breaks a rule, as of `load_scenario`.
@@ -130,6 +143,7 @@ def parse_scenario(text: str, file: str = "", folder: Path | None = None) -> Sce
         caviar_protocol.errors.ScenarioError: my.toml:8: run.frames: is 0, write a whole number ≥ 1 [frame]
     """
     table, source = read_toml(text, file)
+    set_keys(table, source, settings)
     if isinstance(table.get("run"), dict):
         table["run"] = with_instants(table["run"], Place("run", source), folder or Path())
     # Types first: rules between keys may rely on them.
@@ -166,6 +180,59 @@ def read_toml(text: str, file: str = "") -> tuple[dict[str, Any], Source]:
     # tomllib counts CR LF as one line end, and so must the scanner.
     lines = {dotted(path): line for path, line in key_lines(text.replace("\r\n", "\n")).items()}
     return table, Source(file=file, lines=lines)
+
+
+def set_keys(table: dict[str, Any], source: Source, settings: Sequence[str]) -> None:
+    """Set keys of a scenario that is not checked yet, as ``--set`` of the command line does.
+
+    Args:
+        table: The document; changed in place.
+        source: Where its keys stand; those that are set stand nowhere any more.
+        settings: ``KEY=VALUE`` each. A key is one of the document, with the name or the number of an element
+            of a list (``carriers.mm.frequency_hz``, ``carriers.0.frequency_hz``), or ``SERVICE.SETTING``. A
+            value is TOML, or a text without quotation marks.
+
+    Raises:
+        ScenarioError: There is no value, no such element, or a table is needed where a value stands.
+
+    Example:
+        >>> table, source = read_toml("[services.channel]\\nuse = 'sionna-rt'\\n")
+        >>> set_keys(table, source, ["channel.samples=1000", "services.channel.budget_ms=7"])
+        >>> table["services"]["channel"]
+        {'use': 'sionna-rt', 'settings': {'samples': 1000}, 'budget_ms': 7}
+    """
+    top = {field.encode_name for field in msgspec.structs.fields(Scenario)}
+    for text in settings:
+        path, separator, value = text.partition("=")
+        keys = path.strip().replace("[", ".").replace("]", "").split(".")
+        if not separator or not value.strip() or not all(keys):
+            raise ScenarioError(f"--set {text}: write it as in --set services.channel.settings.samples=1000")
+        if keys[0] not in top and keys[0] in table.get("services", {}):
+            keys = ["services", keys[0], "settings", *keys[1:]]
+        at: Any = table
+        place: list[str | int] = []
+        for key in keys[:-1]:
+            place.append(_element(at, key, text) if isinstance(at, list) else key)
+            at = at.setdefault(key, {}) if isinstance(at, dict) else at[place[-1]]
+            if not isinstance(at, dict | list):
+                raise ScenarioError(f"--set {text}: {dotted(tuple(place))} is a value, and has no keys")
+        if isinstance(at, list):
+            raise ScenarioError(
+                f"--set {text}: {dotted(tuple(place))} is a list; set all of it, or a key of one"
+            )
+        try:
+            at[keys[-1]] = parse_toml(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            at[keys[-1]] = value.strip()
+        source.lines.pop(dotted((*place, keys[-1])), None)  # the value does not stand there
+
+
+def _element(of: list[Any], key: str, text: str) -> int:
+    """The place in a list of the element that has a number or a name."""
+    names = [str(item.get("name", at)) if isinstance(item, dict) else str(at) for at, item in enumerate(of)]
+    if key not in names and not (key.isdecimal() and int(key) < len(of)):
+        raise ScenarioError(f"--set {text}: there is no {key!r}; there are: {', '.join(names)}")
+    return names.index(key) if key in names else int(key)
 
 
 def _with_device_names(source: Source, scenario: Scenario) -> Source:

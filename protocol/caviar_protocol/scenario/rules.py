@@ -25,7 +25,7 @@ BEAM = "beam:"
 """Prefix of the actuators that steer beams; the receiver's name follows. Users may be written without."""
 
 _KIND_KEYS = {
-    "antenna": ("role", "array", "power_dbm"),
+    "antenna": ("role", "array", "power_dbm", "carriers"),
     "lidar": ("beams", "azimuth_steps", "elevation_deg", "range_m"),
     "camera": ("size_px", "field_of_view_deg"),
 }
@@ -82,6 +82,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check_services(scenario, root.at("services"))
     for index, device in enumerate(scenario.devices):
         _check_device(device, root.at("devices").at(index))
+        _check_carriers(device, scenario.carriers, root.at("devices").at(index).at("carriers"))
         world_of(scenario, index)
     _check_antennas(scenario, root.at("devices"))
     _check_users(scenario, root.at("services"))
@@ -422,6 +423,13 @@ def _check_device(device: DeviceSpec, place: Place) -> None:
     for index, size in enumerate(device.size_px):
         if not 1 <= size <= 8192:
             raise place.at("size_px").at(index).error(f"is {size}, write 1 to 8192 [px]")
+
+
+def _check_carriers(device: DeviceSpec, carriers: Sequence[Carrier], place: Place) -> None:
+    known = [carrier.name for carrier in carriers]
+    for index, name in enumerate(device.carriers):
+        if name not in known:
+            raise place.at(index).error(f"no carrier is named {name!r}; {suggestion(name, known)}")
 
 
 def _check_antennas(scenario: Scenario, place: Place) -> None:

@@ -167,6 +167,8 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     array: AntennaArray | None = None
     """Antennas: the elements; absent: one isotropic element."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power", ge=-200, le=200)] = 0.0
+    carriers: tuple[str, ...] = ()
+    """Antennas: names of the carriers that they send and receive on; empty: all of the run."""
     # lidar
     beams: Annotated[int, quantity("1", "beams of a lidar, one above the other", ge=1, le=1024)] = 64
     azimuth_steps: Annotated[int, quantity("1", "rays of a beam in a turn", ge=1, le=36000)] = 1800
@@ -272,6 +274,23 @@ def carries(spec: DeviceSpec, name: str) -> bool:
     return name == spec.on or owned_by((spec.on,), name)
 
 
+def is_made_by(spec: DeviceSpec, name: str) -> bool:
+    """Whether a device of a scene is one that the scenario says is made by ``spec``.
+
+    Args:
+        spec: The device of the scenario.
+        name: Name of the device in the scene.
+
+    Example:
+        >>> is_made_by(DeviceSpec(name="rx", kind="antenna", on="car.*"), "car.17/rx")
+        True
+    """
+    if not spec.on:
+        return name == spec.name
+    ending = f"/{spec.name}"
+    return name.endswith(ending) and carries(spec, name.removesuffix(ending))
+
+
 def fixed_device(spec: DeviceSpec) -> Device:
     """The device of a scenario that stands in the world, without ``on``.
 
@@ -361,6 +380,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
                 role=spec.role,
                 array=_published(spec.array or AntennaArray()),
                 power_dbm=spec.power_dbm,
+                carriers=spec.carriers,
             )
         case "lidar":
             return LidarDevice(

@@ -29,7 +29,8 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
     r"""Read the vertices and triangles of a PLY mesh.
 
     Args:
-        file: A PLY file with elements ``vertex`` and ``face``; polygons are cut into triangles.
+        file: A PLY file with elements ``vertex`` and ``face``; flat polygons, convex or not, are cut into
+            triangles.
         called: What errors call the file, where its path would mean nothing to the user: a copy.
 
     Returns:
@@ -124,18 +125,25 @@ class _Element:
 def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
     order, elements, begin = _header(data)
     body = _Binary(data, begin, order) if order else _Text(data[begin:])
-    found: dict[str, NDArray[Any]] = {}
+    found: dict[str, Any] = {}
     for element in elements:
-        found[element.name] = body.triangles(element) if element.has_lists else body.columns(element)
+        found[element.name] = body.polygons(element) if element.has_lists else body.columns(element)
         # What stands after the faces, such as lines and materials of some tools, need not be readable.
         if element.name == "face":
             break
     if missing := {"vertex", "face"} - set(found):
         raise ValueError(f"no element {missing.pop()}")
-    vertices, faces = found["vertex"], found["face"]
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(f"faces refer to vertices {faces.min()} to {faces.max()} of {len(vertices)}")
-    return vertices, faces
+    vertices, polygons = found["vertex"], found["face"]
+    if isinstance(polygons, np.ndarray):  # triangles alone
+        sizes, corners = np.full(len(polygons), 3), polygons.ravel()
+    else:
+        sizes, corners = (
+            np.array([len(p) for p in polygons], np.int64),
+            np.concatenate([np.zeros(0, np.int64), *polygons]),
+        )
+    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        raise ValueError(f"faces refer to vertices {corners.min()} to {corners.max()} of {len(vertices)}")
+    return vertices, _cut(corners, sizes, vertices)
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -173,12 +181,12 @@ class _Text:
         table = np.array(rows, dtype=np.float64).reshape(element.count, width)
         return table[:, [names.index(axis) for axis in element.axes]]
 
-    def triangles(self, element: _Element) -> Int64Array:
+    def polygons(self, element: _Element) -> list[Int64Array]:
         polygons, first = [], _first_list(element)
         for _ in range(element.count):
             row = [self._next(int(self._next(1)[0]) if length else 1) for _, length, _ in element.properties]
-            polygons.append([int(word) for word in row[first]])
-        return _fans(polygons)
+            polygons.append(np.array([int(word) for word in row[first]], np.int64))
+        return polygons
 
     def _next(self, count: int) -> list[bytes]:
         words = self._words[self._at : self._at + count]
@@ -201,7 +209,8 @@ class _Binary:
             return np.empty((element.count, 0))
         return np.stack([table[axis].astype(np.float64) for axis in element.axes], axis=-1)
 
-    def triangles(self, element: _Element) -> Int64Array:
+    def polygons(self, element: _Element) -> list[Int64Array] | Int64Array:
+        """Corners of each face; as one array, Shape ``[F, 3]``, where all are triangles."""
         properties = [
             (name, np.dtype(self._order + length) if length else None, np.dtype(self._order + item))
             for name, length, item in element.properties
@@ -220,8 +229,8 @@ class _Binary:
                 self._next(item, 1 if length is None else int(self._next(length, 1)[0]))
                 for _, length, item in properties
             ]
-            polygons.append(row[first].tolist())
-        return _fans(polygons)
+            polygons.append(row[first].astype(np.int64))
+        return polygons
 
     def _next(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
         values = (
@@ -251,8 +260,50 @@ def _triangle_row(
     return np.dtype(row)
 
 
-def _fans(polygons: list[list[int]]) -> Int64Array:
-    """Triangles around the first corner of each polygon."""
-    # Right for convex polygons, which are what tools export.
-    corners = [(p[0], *p[i : i + 2]) for p in polygons for i in range(1, len(p) - 1)]
-    return np.array(corners, dtype=np.int64).reshape(-1, 3)
+def _cut(corners: Int64Array, sizes: Int64Array, vertices: Float64Array) -> Int64Array:
+    """Triangles of polygons, in their sense and order, Shape ``[F, 3]``: around the first corner of each,
+    unless that would reach out of one that is not convex, as roofs often are.
+
+    Args:
+        corners: Vertices of all polygons, one polygon after the other.
+        sizes: Corners of each polygon.
+        vertices: [m], Shape ``[V, 3]``.
+    """
+    counts = np.maximum(sizes - 2, 0)
+    of = np.repeat(np.arange(len(sizes)), counts)
+    begin = (np.cumsum(sizes) - sizes)[of]
+    second = begin + 1 + np.arange(len(of)) - (np.cumsum(counts) - counts)[of]
+    fans = np.stack([corners[begin], corners[second], corners[second + 1]], axis=-1).reshape(-1, 3)
+    if (counts <= 1).all():
+        return fans
+    a, b, c = np.moveaxis(vertices[fans], 1, 0)
+    areas = np.cross(b - a, c - a)
+    # Newell's normal, right for flat polygons of any form.
+    normals = np.stack([np.bincount(of, axis, len(sizes)) for axis in areas.T], axis=-1)
+    for number in np.unique(of[np.einsum("fx,fx->f", areas, normals[of]) < 0]).tolist():
+        polygon = corners[sizes[:number].sum() :][: sizes[number]].tolist()
+        fans[of == number] = _ears(polygon, vertices, normals[number])
+    return fans
+
+
+def _ears(polygon: list[int], vertices: Float64Array, normal: Float64Array) -> list[tuple[int, int, int]]:
+    """Triangles of a polygon, cut off one after the other where no other corner is inside (G. H. Meisters,
+    "Polygons have ears", Am. Math. Mon. 82, 1975)."""
+
+    def turn(a: int, b: int, c: int) -> float:
+        return float(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a]) @ normal)
+
+    left, ears = list(polygon), []
+    while len(left) > 3:
+        for i, tip in enumerate(left):
+            a, b = left[i - 1], left[(i + 1) % len(left)]
+            others = (p for p in left if p not in (a, tip, b))
+            if turn(a, tip, b) > 0 and not any(
+                min(turn(a, tip, p), turn(tip, b, p), turn(b, a, p)) >= 0 for p in others
+            ):
+                break
+        else:  # a polygon that crosses itself, or has come down to a line
+            i, a, tip, b = 0, left[-1], left[0], left[1]
+        ears.append((a, tip, b))
+        del left[i]
+    return [*ears, (left[0], left[1], left[2])]

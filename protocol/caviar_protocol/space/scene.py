@@ -1,7 +1,7 @@
 """Poses in a scene, scenes of several worlds merged, and pairs of antennas (contract, clause 3).
 
-A *pair* is a transmitting and a receiving device of the scene. A device that both transmits and receives is
-no pair with itself.
+A *pair* is a transmitting and a receiving device of the scene that have a carrier in common. A device that
+both transmits and receives is no pair with itself.
 """
 
 from __future__ import annotations
@@ -202,9 +202,17 @@ class Pair:
     rx: AntennaDevice
     """The same."""
 
+    def uses(self, carrier: str) -> bool:
+        """Whether both ends use a carrier.
+
+        Args:
+            carrier: Name of the carrier.
+        """
+        return self.tx.uses(carrier) and self.rx.uses(carrier)
+
 
 def pairs_of(scene: Scene) -> list[Pair]:
-    """All pairs of a transmitting and a receiving device, sorted by TX, then RX.
+    """All pairs of a transmitting and a receiving device with a carrier in common, sorted by TX, then RX.
 
     Args:
         scene: The scene.
@@ -216,7 +224,26 @@ def pairs_of(scene: Scene) -> list[Pair]:
         [('bs', 'car/rx'), ('bs', 'uav/rx-uav')]
     """
     receivers = antennas(scene, "rx")
-    return [Pair(tx, rx) for tx in antennas(scene, "tx") for rx in receivers if rx.name != tx.name]
+    return [
+        Pair(tx, rx)
+        for tx in antennas(scene, "tx")
+        for rx in receivers
+        if rx.name != tx.name and share_carrier(tx.carriers, rx.carriers)
+    ]
+
+
+def share_carrier(tx: Sequence[str], rx: Sequence[str]) -> bool:
+    """Whether two devices have a carrier in common.
+
+    Args:
+        tx: Carriers of the one, by name; empty: all of the run.
+        rx: Carriers of the other.
+
+    Example:
+        >>> share_carrier(("mm",), ()), share_carrier(("mm",), ("sub6",))
+        (True, False)
+    """
+    return not tx or not rx or not set(tx).isdisjoint(rx)
 
 
 def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[Vector]]:

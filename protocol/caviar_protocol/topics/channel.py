@@ -262,20 +262,37 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
         Int32Array, array("<i4", "P", "D", unit="1", doc="index into object_names; −1 where none")
     ]
     h: tuple[ChannelMatrix, ...] = ()
-    """One matrix per carrier and pair, carriers slowest; empty unless part ``h`` is in demand."""
+    """One matrix per carrier and pair that uses it, carriers slowest; empty unless part ``h`` is in
+    demand."""
     dropped: Annotated[int, quantity("1", "paths dropped for non-finite values", ge=0)] = 0
     hf: tuple[ChannelResponse, ...] = ()
-    """One response per carrier with subcarriers and pair, carriers slowest; empty unless part ``hf`` is in
-    demand."""
+    """One response per carrier with subcarriers and pair that uses it, carriers slowest; empty unless part
+    ``hf`` is in demand."""
     taps: tuple[ChannelTaps, ...] = ()
-    """One impulse response per carrier with taps and pair, likewise; empty unless part ``taps`` is in
-    demand."""
+    """One impulse response per carrier with taps and pair that uses it, likewise; empty unless part ``taps``
+    is in demand."""
     error_bound_db: Annotated[
         Float64Array | None,
         array("<f8", "T", "R", unit="dB", doc="NMSE of H that nine of ten pairs are within; absent: unknown"),
     ] = None
     error_reference: str = ""
     """What errors are relative to: the rung and label of the channel that counts as exact; empty: unknown."""
+    used: Annotated[
+        BoolArray | None,
+        array("|b1", "C", "T", "R", unit="1", doc="both ends use the carrier; absent: all pairs use all"),
+    ] = None
+    """Whether both ends of a pair use a carrier; absent: all use all. On a carrier that it does not use a
+    pair is no user and has no matrix, response and taps, and ``a`` is 0; one that uses none has no paths."""
+
+    def uses(self, carrier: int, tx: int, rx: int) -> bool:
+        """Whether both ends of a pair use a carrier.
+
+        Args:
+            carrier: Index into ``carriers``.
+            tx: Index into ``tx``.
+            rx: Index into ``rx``.
+        """
+        return self.used is None or bool(self.used[carrier, tx, rx])
 
     def check(self) -> None:
         """``offsets`` cuts the path axis into one run for each pair."""

@@ -56,6 +56,9 @@ class WaypointCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     # A world of an earlier version ignores the field and flies there: later, and without harm.
     at_once: bool = False
     """Be there in the next frame, at rest, without the way between: to begin an episode elsewhere."""
+    # As for `at_once`: such a world heads along the course.
+    yaw: Annotated[float, quantity("rad", "counter-clockwise from +x")] | None = None
+    """Heading to turn to and to keep; absent: along the course."""
 
 
 class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag="velocity"):
@@ -69,6 +72,11 @@ class VelocityCommand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
     object: str
     """Object to be moved."""
     velocity: Annotated[tuple[float, float, float], quantity("m/s", "in world axes")]
+    # Worlds need not know both that follow: others head along the course.
+    yaw: Annotated[float, quantity("rad", "counter-clockwise from +x")] | None = None
+    """Heading to turn to and to keep; absent: along the course."""
+    yaw_rate: Annotated[float, quantity("rad/s", "counter-clockwise")] | None = None
+    """With which the heading turns, where ``yaw`` is absent; 0 keeps it."""
 
 
 # Agents choose beams of all users; which of them is served is a decision of its own.
@@ -219,8 +227,9 @@ class Action(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """Result per user; a user is one (TX, RX, carrier): carriers in the order of the channel, then
-    TX, then RX by name. A device that both transmits and receives is no user of itself.
+    """Result per user; a user is one (TX, RX, carrier) of which both devices use the carrier: carriers in the
+    order of the channel, then TX, then RX by name. A device that both transmits and receives is no user of
+    itself.
 
     ``y`` is the equivalent channel w* H f of a beam pair (paper, eq. 1) with beams of unit norm
     and without transmit power. Beam ``k`` of a panel of one polarization, with N = rows·columns elements, is

@@ -111,6 +111,16 @@ class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag=
     array: AntennaArray = AntennaArray()
     """Its elements."""
     power_dbm: Annotated[float, quantity("dBm", "transmit power; unused by a receiver")] = 0.0
+    carriers: tuple[str, ...] = ()
+    """Names of the carriers that it sends and receives on; empty: all of the run."""
+
+    def uses(self, carrier: str) -> bool:
+        """Whether it sends or receives on a carrier.
+
+        Args:
+            carrier: Name of the carrier.
+        """
+        return not self.carriers or carrier in self.carriers
 
 
 class LidarDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag="lidar"):
@@ -208,3 +218,8 @@ LEFT_GEOFENCE_PREFIX = "left-geofence/"
 OUTSIDE_GEOFENCE_PREFIX = "commanded-outside-geofence/"
 """Before the name of an object in the counts of a world's report: a place outside of its geofence was
 commanded."""
+SIMULATOR_SAYS_PREFIX = "simulator-says/"
+"""Before a kind of warning in the counts of a world's report: what the simulator behind it printed."""
+BESIDE_ROAD_PREFIX = "beside-road/"
+"""Before the name of a vehicle in the counts of a world's report: it is one rigid box, and too long for the
+bend that it is in."""

@@ -10,7 +10,8 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import threading
-from collections.abc import Coroutine, Iterable, Iterator, Sequence
+from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
@@ -29,7 +30,10 @@ from caviar_services.airsim.bridge import OVER, Bridge, Snapshot
 from caviar_services.airsim.calls import Offer, StateCalls
 from caviar_services.airsim.motion_calls import Habits, MotionCalls
 from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
+from caviar_services.airsim.sensor_calls import SensorCalls
+from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.world.scenery import scenery_triangles
 
 LOOK_S = 0.1
 """[s] between looks for orders of the broker while a client holds the world."""
@@ -54,7 +58,7 @@ class AirSimSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     it had been paused before."""
     origin_m: tuple[float, float, float] | None = None
     """Origin of AirSim's axes; unset: where the first vehicle is in the first frame."""
-    geo_origin: tuple[float, float, float] = (47.641468, -122.140165, 122.0)
+    geo_origin: tuple[float, float, float] = GEO_ORIGIN
     """Latitude [°], longitude [°] and altitude [m] there; the default is AirSim's."""
     sensors: dict[str, str] = msgspec.field(default_factory=dict)
     """Device by a further name that scripts use for it: ``sensors = { front_center = "uav/gimbal" }``."""
@@ -81,6 +85,7 @@ class AirSimAgent(Agent[AirSimSettings]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = AirSimSettings
+    uses_scenery: ClassVar[bool] = True
     inputs: ClassVar[tuple[Input, ...]] = (
         *Agent.inputs,
         *(Input(topic=topic, required=False) for topic in ("lidar", "camera", "depth", "segmentation")),
@@ -114,6 +119,7 @@ class AirSimAgent(Agent[AirSimSettings]):
     def __init__(self, settings: AirSimSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
         self._loop: _LoopThread | None = None
+        self._assets: Mapping[str, Path] = {}
         self._ends = False
 
     def prepare(self, preparation: Preparation) -> Prepared:
@@ -122,6 +128,7 @@ class AirSimAgent(Agent[AirSimSettings]):
         Raises:
             SetupError: The address is in use.
         """
+        self._assets = preparation.assets
         self._loop = _LoopThread()
         self._loop.run(self._listen(), CLOSE_S)
         host = self._server.host
@@ -136,9 +143,14 @@ class AirSimAgent(Agent[AirSimSettings]):
             settings.vehicles, settings.origin_m, settings.geo_origin, paused=settings.start == "paused"
         )
         in_sensor_axes = settings.lidar_frame == "sensor"
-        state = StateCalls(self._bridge, settings.sensors, lidar_in_sensor_axes=in_sensor_axes)
+        sensors = SensorCalls(
+            self._bridge,
+            settings.sensors,
+            lidar_in_sensor_axes=in_sensor_axes,
+            load_scenery=lambda: scenery_triangles(self._assets),
+        )
         motion = MotionCalls(self._bridge, settings.habits)
-        offer = Offer({**state.offered(), **motion.offered()})
+        offer = Offer({**StateCalls(self._bridge).offered(), **sensors.offered(), **motion.offered()})
         self._server = RpcServer(offer.handle, *address_of(settings.listen))
         await self._server.start()
 

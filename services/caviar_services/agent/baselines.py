@@ -16,14 +16,14 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.messages import Input
-from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.beams import best_pairs, straight_beams
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.base import User, Users, channels_of, require_channel
-from caviar_services.link.beam_sweep import best_pairs, sweep_users
+from caviar_services.link.beam_sweep import sweep_users
 from caviar_services.service import Frame, RunInfo
 
 

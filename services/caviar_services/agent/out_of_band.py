@@ -19,11 +19,11 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.space.beams import beam_gains, best_pairs
 from caviar_protocol.topics import AntennaArray
 from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
 from caviar_services.agent.sweeps import used_elements
 from caviar_services.link.base import User
-from caviar_services.link.beam_sweep import best_pairs, sweep
 from caviar_services.service import Preparation, Prepared, RunInfo
 
 Axes = tuple[
@@ -89,7 +89,7 @@ class OutOfBandAgent(PilotAgent[OutOfBandSettings]):
             if matrix is None:
                 continue
             if index == aid:
-                best = best_pairs(sweep(matrix, user.tx.array, user.rx.array)[None], 1)
+                best = best_pairs(beam_gains(matrix, user.tx.array, user.rx.array)[None], 1)
                 yield Measured(index, int(best.tx_beam[0, 0]), int(best.rx_beam[0, 0]))
                 continue
             listed = best_pairs(self._spectrum(user, matrix)[None], self.settings.candidates)
@@ -106,7 +106,7 @@ class OutOfBandAgent(PilotAgent[OutOfBandSettings]):
         of_rx = _elements(user.rx.array, settings.rx_elements)
         kept = np.ix_(of_rx, _elements(user.tx.array, settings.tx_elements))
         seen[kept] = matrix[kept]
-        return sweep(seen, user.tx.array, user.rx.array)
+        return beam_gains(seen, user.tx.array, user.rx.array)
 
 
 def _elements(array: AntennaArray, axes: tuple[int, int] | None) -> Int64Array:

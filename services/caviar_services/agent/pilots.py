@@ -21,11 +21,11 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
 from caviar_protocol.messages import Input
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.link.base import User, Users, channels_of, require_channel
-from caviar_services.link.beam_sweep import sweep
 from caviar_services.link.link_budget import BOLTZMANN, transmit_power
 from caviar_services.service import Frame, StepResult
 
@@ -149,7 +149,7 @@ class Sounding:
             return None
         tx_beams, rx_beams = zip(*pairs, strict=True)
         if len(pairs) > 1:
-            abs_y = sweep(matrix, user.tx.array, user.rx.array)[list(tx_beams), list(rx_beams)]
+            abs_y = beam_gains(matrix, user.tx.array, user.rx.array)[list(tx_beams), list(rx_beams)]
             best = int(self.measured(user, abs_y).argmax())
         else:
             best = 0

@@ -3,7 +3,7 @@
 A policy takes parts of the observation (`caviar_protocol.observations`) as inputs of their names, each with
 one row, Shape ``[1, …]``, and gives ``action``: for each place of a user the index ``tx_beam·Nr + rx_beam``
 of a pair of beams, Shape ``[1]`` or ``[1, U]``. What it observes, and the codebooks that it was trained for,
-stand on its card, in the metadata of the file.
+stand on its card, in the metadata of the file. Of a grid or a picture the model's input has the size.
 """
 
 from __future__ import annotations
@@ -13,21 +13,24 @@ import hashlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from caviar_protocol.errors import AssetError, PayloadError, ScenarioError, SetupError
+from caviar_protocol.errors import AssetError, CaviarError, PayloadError, ScenarioError, SetupError
 from caviar_protocol.fields import DigestOrNone as Digest
 from caviar_protocol.host import install_command
-from caviar_protocol.observations import KnownDevices, Moment, Observer, Users
+from caviar_protocol.messages import Input
+from caviar_protocol.observations import KnownDevices, Moment, Observer, Place, Users, inputs_of
 from caviar_protocol.policies import DECISION, NEXT, REFUSED
+from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
+from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 CARD_KEY = "caviar.card"
@@ -51,6 +54,8 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Parts of the observation, as in `caviar_protocol.observations.PARTS`."""
     codebooks: tuple[tuple[int, int], ...]
     """Beams of the transmitter and of the receiver, of each place."""
+    transmitters: tuple[str, ...] = ("*",)
+    """Those that it chooses for, as names with ``*`` and ``?``."""
     environment: str = ""
     """Of gymnasium, that it was trained in."""
     scenario: str = ""
@@ -157,18 +162,23 @@ class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     """``file:`` and the path of the ONNX file, relative to the folder of the scenario. The agent gets it from
     the broker, and looks for it on its own machine where the broker has none."""
     observe: tuple[str, ...] = ()
-    """Parts of the observation; empty: those of the policy's card. Only for a file without a card."""
+    """Parts of the observation; empty: those of the policy's card. For a file without a card, for one that
+    only the agent's own machine has, and for parts that a policy to come observes (``caviar swap``)."""
+    others: Literal["", "los-beam", "random"] = ""
+    """Agent that chooses for the users of transmitters that the policy was not trained for; empty: they have
+    no beams."""
     sha256: Digest = ""
     """SHA-256 of the file; another file is refused. Empty: of the one that is there."""
     earlier: tuple[Digest, ...] = ()
-    """SHA-256 of the policies that the agent was given since (``caviar swap``). Written by the broker."""
+    """SHA-256 of the policies that the agent was given since (``caviar policy swap``), by the broker."""
 
 
 class Served(NamedTuple):
-    """A policy that fits the scenario, and what it observes."""
+    """A policy that fits the scenario, what it observes, and whom it serves."""
 
     model: PolicyModel
     observer: Observer
+    places: Users
 
 
 class PolicyAgent(Agent[PolicySettings]):
@@ -185,8 +195,7 @@ class PolicyAgent(Agent[PolicySettings]):
     Settings: ClassVar[type[msgspec.Struct]] = PolicySettings
     packages: ClassVar[tuple[str, ...]] = ("onnxruntime",)
     _served: Served
-    _places: Users
-    _known: KnownDevices
+    _producers: Mapping[str, tuple[str, ...]]
 
     def __init__(self, settings: PolicySettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -195,6 +204,19 @@ class PolicyAgent(Agent[PolicySettings]):
         self._loaded: dict[str, Served] = {}
         self._refused: dict[str, str] = {}
         self._asked: set[str] = set()
+
+    @classmethod
+    def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
+        """What the policy's sensors need, where its file is on this machine or ``observe`` names them."""
+        observe = settings.get("observe")
+        file = Path(str(settings.get("file", "")).removeprefix("file:"))
+        if not observe and file.is_file():
+            try:
+                card = PolicyModel(file).card
+            except CaviarError:
+                return ()  # it is refused where the agent prepares
+            observe = card.observe if card else ()
+        return inputs_of(observe) if isinstance(observe, list | tuple) else ()
 
     @property
     def own_files(self) -> Sequence[str]:
@@ -205,8 +227,9 @@ class PolicyAgent(Agent[PolicySettings]):
         """Load the policy, hold it against the scenario, and run it once."""
         prepared = super().prepare(preparation)
         self._paths = dict(preparation.files)
-        self._known = KnownDevices(self.run.devices)
-        self._places = Users(self._known, self.settings.users, self.settings.except_users)
+        self._producers = preparation.producers
+        other = self.settings.others
+        self._baseline: Any = load("agent", other)(AgentSettings(), self.run) if other else None
         path = Path(self.settings.file.removeprefix("file:"))
         self._served = served = self._load(
             self._paths.get(self.settings.sha256, path), f"policy {path.name}", self.settings.sha256
@@ -236,24 +259,30 @@ class PolicyAgent(Agent[PolicySettings]):
         if not observe:
             raise ScenarioError(
                 f"{called} has no card that says what it observes; write "
-                f"observe = {list(model.inputs)!r} beside it, or export it with caviar export-policy",
+                f"observe = {list(model.inputs)!r} beside it, or export it with caviar policy export",
                 key=key,
             )
-        sizes = tuple((place.tx.size, place.rx.size) for place in self._places.places)
+        known = KnownDevices(self.run.devices, _grids(model, called, key))
+        transmitters = card.transmitters if card else ("*",)
+        places = Users(known, self.settings.users, self.settings.except_users, transmitters)
+        sizes = tuple((place.tx.size, place.rx.size) for place in places.places)
         if card is not None and card.codebooks != sizes:
             raise ScenarioError(
                 f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
                 key=key,
             )
-        observer = Observer(self._known, self._places, observe)
-        if observer.inputs:
-            topics = ", ".join(sorted(i.topic for i in observer.inputs))
-            raise ScenarioError(
-                f"{called} observes {', '.join(observe)}, which needs {topics}: this agent "
-                "takes the scene and the link alone; write an agent of your own with these inputs",
-                key=key,
-            )
+        observer = Observer(known, places, observe)
+        given = {entry.topic for entry in self.inputs}
+        for entry in observer.inputs:
+            wanted = ".".join((entry.topic, *entry.parts))
+            if entry.topic not in given:
+                raise ScenarioError(
+                    f"{called} observes {', '.join(observe)}, which needs {wanted}; the agent did not ask "
+                    f"for that when it joined: write observe = {list(observe)!r} beside the file, or start "
+                    f"the agent with --inputs {wanted}",
+                    key=key,
+                )
         _check_shapes(model, observer, called, key)
         # Buffers are made at the first run, which would else be late.
         try:
@@ -261,25 +290,8 @@ class PolicyAgent(Agent[PolicySettings]):
         except Exception as error:  # of ONNX Runtime, whose exceptions have no common base
             reason = str(error).partition("\n")[0]
             raise ScenarioError(f"{called} cannot be run ({reason}); export it again", key=key) from error
-        self._check_action(action, called, key)
-        return Served(model, observer)
-
-    def _check_action(self, action: NDArray[np.int64], called: str, key: str) -> None:
-        """Refuse a model whose action is none: before it serves, while the run still has another."""
-        places = self._places.places
-        if len(action) < len(places):
-            raise ScenarioError(
-                f"{called} gives {len(action)} index(es), and the scenario has {len(places)} user(s); give "
-                "one for each",
-                key=key,
-            )
-        for number, (place, index) in enumerate(zip(places, action.tolist(), strict=False)):
-            if not 0 <= index < place.beam_pairs:
-                raise ScenarioError(
-                    f"{called} chooses pair {index} of {place.beam_pairs} for place {number} where all that "
-                    "it observes is 0; it gives indices from 0 on",
-                    key=key,
-                )
+        _check_action(action, places.places, called, key)
+        return Served(model, observer, places)
 
     def wanted_files(self, decisions: Mapping[str, str]) -> Sequence[str]:
         """The policy that it is to change to, once."""
@@ -337,27 +349,67 @@ class PolicyAgent(Agent[PolicySettings]):
         return self._loaded[digest]
 
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
-        """The policy's choice for each user, the same on every carrier."""
-        users = self._places.present(scene)
+        """The policy's choice for each user, the same on every carrier, and that of ``others``."""
+        model, observer, places = self._served
+        users = places.present(scene)
         moment = Moment(frame, scene, frame.only("link", Link), users)
-        model, observer = self._served
+        if self._baseline is not None:
+            served = {(pair.tx.name, pair.rx.name) for _, pair in users}
+            left = [pair for pair in pairs if (pair.tx.name, pair.rx.name) not in served]
+            yield from self._baseline.choose(frame, scene, left)
         action = model.act(observer.read(moment)).tolist()
         for place, pair in users:
-            size = self._places.places[place].beam_pairs
+            size = places.places[place].beam_pairs
             index = action[place] if place < len(action) else -1
             if not 0 <= index < size:
                 raise PayloadError(
                     f"the policy chose pair {index} of {size} for {pair.rx.name}; it gives one index for "
-                    f"each of {len(self._places)} places, from 0 on"
+                    f"each of {len(places)} places, from 0 on"
                 )
             tx_beam, rx_beam = divmod(int(index), pair.rx.array.size)
             yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
+
+
+def _check_action(action: NDArray[np.int64], places: Sequence[Place], called: str, key: str) -> None:
+    """Refuse a model whose action is none: before it serves, while the run still has another."""
+    if len(action) < len(places):
+        raise ScenarioError(
+            f"{called} gives {len(action)} index(es), and the scenario has {len(places)} user(s); give "
+            "one for each",
+            key=key,
+        )
+    for number, (place, index) in enumerate(zip(places, action.tolist(), strict=False)):
+        if not 0 <= index < place.beam_pairs:
+            raise ScenarioError(
+                f"{called} chooses pair {index} of {place.beam_pairs} for place {number} where all that "
+                "it observes is 0; it gives indices from 0 on",
+                key=key,
+            )
 
 
 def _reason(text: str) -> str:
     """What a refusal says: its text has what stands in the file, which may be anything of any length."""
     line = "".join(c if c.isprintable() else "?" for c in text.partition("\n")[0][: MAX_REASON + 1])
     return line if len(line) <= MAX_REASON else line[:MAX_REASON] + "…"
+
+
+def _grids(model: PolicyModel, called: str, key: str) -> Mapping[str, ServiceSpec]:
+    """The LIDAR's settings as far as a model knows them: its input has the size of the grid, which a run does
+    not tell its agents."""
+    for name, shape in model.inputs.items():
+        if name.partition(":")[0] == "lidar_grid":
+            cells = shape[-3:]
+            if len(shape) < 4 or not all(isinstance(size, int) for size in cells):
+                raise ScenarioError(
+                    f"{called} takes {name!r} of shape {list(shape)}; export it with the numbers of cells "
+                    "along x, y, z as its last three",
+                    key=key,
+                )
+            lidar = ServiceSpec(
+                role="sensors", use="lidar", budget_ms=1.0, settings={"grid": {"cells": cells}}
+            )
+            return {"lidar": lidar}
+    return {}
 
 
 def _codebooks(sizes: Sequence[tuple[int, int]]) -> str:

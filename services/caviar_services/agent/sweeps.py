@@ -19,11 +19,12 @@ import numpy as np
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import Complex128Array, Int64Array, quantity
+from caviar_protocol.space.beams import beam_gains, best_pairs
 from caviar_protocol.topics import AntennaArray
 from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.base import User
-from caviar_services.link.beam_sweep import best_pairs, sweep, sweep_users
+from caviar_services.link.beam_sweep import sweep_users
 from caviar_services.service import RunInfo
 
 
@@ -203,7 +204,7 @@ def _descend(
             rx_beams = children(before.rx.array, rx.array)[rx_beam]
             sounding.count(user, len(tx_beams) * len(rx_beams))
         heard = matrix[np.ix_(rx.elements, tx.elements)] * rx.turn[:, None] * tx.turn
-        abs_y = sweep(heard, tx.array, rx.array)[np.ix_(tx_beams, rx_beams)]
+        abs_y = beam_gains(heard, tx.array, rx.array)[np.ix_(tx_beams, rx_beams)]
         best = best_pairs(sounding.measured(user, abs_y, str(number))[None], 1)
         tx_beam, rx_beam = int(tx_beams[best.tx_beam[0, 0]]), int(rx_beams[best.rx_beam[0, 0]])
         before = level

@@ -121,11 +121,13 @@ class Vehicle:
         self.api_enabled, self.armed, self.landed = False, False, True
         self.home: Vector | None = None
         """Where it was in the first frame [m]."""
+        self.home_yaw = 0.0
+        """And how it headed [rad]."""
         self.flown: Flown | None = None
         """In the newest frame; None: it is not in the scene."""
         self.acceleration: Vector = (0.0, 0.0, 0.0)
         """Mean since the frame before [m/s²]."""
-        self._place: Vector | None = None
+        self._place: tuple[Vector, float] | None = None
         self._placed: asyncio.Future[None] | None = None
         self._manoeuvre: Manoeuvre = Hover(object_name)
         self._done: asyncio.Future[bool] | None = None
@@ -141,14 +143,14 @@ class Vehicle:
         self._done = asyncio.get_running_loop().create_future()
         return self._done
 
-    def put(self, position: Vector) -> asyncio.Future[None]:
-        """Be at a position [m], at rest, in the frame after the next command.
+    def put(self, position: Vector, yaw: float) -> asyncio.Future[None]:
+        """Be at a position [m] with a yaw [rad], at rest, in the frame after the next command.
 
         Returns:
             Done once a frame shows it there.
         """
         self.begin(Hover(self.object))
-        self._place, self._placed = position, asyncio.get_running_loop().create_future()
+        self._place, self._placed = (position, yaw), asyncio.get_running_loop().create_future()
         return self._placed
 
     def reset(self) -> None:
@@ -173,7 +175,7 @@ class Vehicle:
         yaw = euler_from_quaternion(pose.orientation)[0]
         self.flown = Flown(snapshot.t_ns, pose.position, (x, y, z), yaw)
         if self.home is None:
-            self.home = pose.position
+            self.home, self.home_yaw = pose.position, yaw
         self.acceleration = (0.0, 0.0, 0.0)
         if before is not None and before.t_ns < snapshot.t_ns:
             seconds = (snapshot.t_ns - before.t_ns) / 1e9
@@ -189,8 +191,8 @@ class Vehicle:
         if self.flown is None:
             return None
         if self._place is not None:
-            place, self._place = self._place, None
-            return WaypointCommand(object=self.object, position=place, speed=1.0, at_once=True)
+            (place, yaw), self._place = self._place, None
+            return WaypointCommand(object=self.object, position=place, speed=1.0, at_once=True, yaw=yaw)
         return self._manoeuvre.fly(self.flown)
 
     def _finish(self, result: bool) -> None:

@@ -1,11 +1,11 @@
-"""AirSim's calls by name: state, sensors, and the clock. `motion_calls` has those that fly.
+"""AirSim's calls by name: state, and the clock. `motion_calls` has those that fly, `sensor_calls` those that
+look and measure.
 
 Names, parameters and results are those that the Python client 1.8.1 sends and expects.
 """
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import logging
 import math
@@ -13,20 +13,16 @@ import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Any
 
-from caviar_protocol.space.coordinates import Pose, Vector
+from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import object_pose
-from caviar_protocol.topics import CameraDevice, LidarDevice, LidarScan
 from caviar_services.airsim.bridge import Bridge, Snapshot, Vehicle, boxes_overlap
-from caviar_services.airsim.images import image_response
-from caviar_services.airsim.rpc import CallError, Compact, Params
+from caviar_services.airsim.rpc import CallError, Params
 from caviar_services.airsim.wire import (
     NOWHERE,
     Map,
     NedFrame,
     flag,
     number,
-    sensor_points,
-    table,
     text,
     vector_map,
 )
@@ -34,9 +30,23 @@ from caviar_services.airsim.wire import (
 VERSION = 1
 """Of the interface, as the client 1.8.1 has it."""
 LANDED, FLYING = 0, 1
-MOST_IMAGES = 64
-"""Pictures of a call."""
 MOST_FRAMES = 10**9
+
+MOST_NAMED = 1000
+"""Calls of which the log says that they are refused, or without effect."""
+
+_UNSEEN = "there is no view to draw in"
+_CLEAR = "cameras of a run see no weather"
+WITHOUT_EFFECT = {
+    **dict.fromkeys(("simSetTraceLine", "simFlushPersistentMarkers"), _UNSEEN),
+    **dict.fromkeys(("simPlotPoints", "simPlotLineStrip", "simPlotLineList", "simPlotArrows"), _UNSEEN),
+    **dict.fromkeys(("simPlotStrings", "simPlotTransforms", "simPlotTransformsWithNames"), _UNSEEN),
+    **dict.fromkeys(("simEnableWeather", "simSetWeatherParameter"), _CLEAR),
+    "simPrintLogMessage": _UNSEEN,
+    "simSetWind": "the wind is that of the world's settings",
+    "simSetCameraPose": "cameras stay as the scenario mounts them",
+}
+"""Calls that are accepted and do nothing, and why: scripts go on without what they ask for."""
 
 Call = Callable[..., Awaitable[object]]
 
@@ -55,6 +65,7 @@ class Offer:
 
     def __init__(self, calls: Mapping[str, Call]) -> None:
         self.calls = dict(sorted(calls.items()))
+        self._named: set[str] = set()
 
     async def handle(self, method: str, params: Params) -> object:
         """Answer a call.
@@ -62,6 +73,17 @@ class Offer:
         Raises:
             CallError: It is not offered, has too many or too few parameters, or cannot be done.
         """
+        if method in WITHOUT_EFFECT:
+            self._name(method, f"is accepted and without effect: {WITHOUT_EFFECT[method]}")
+            return None
+        try:
+            return await self._answer(method, params)
+        except CallError as error:
+            # The client's `join` shows no error of a motion call, so that the log has to.
+            self._name(method, f"is refused: {error}")
+            raise
+
+    async def _answer(self, method: str, params: Params) -> object:
         call = self.calls.get(method)
         if call is None:
             raise CallError(f"{method[:80]!r} is not offered here; offered: {', '.join(self.calls)}")
@@ -72,21 +94,22 @@ class Offer:
             raise CallError(f"{method} takes ({names}), and {len(params)} values came: {error}") from None
         return await call(*params)
 
+    def _name(self, method: str, words: str) -> None:
+        if method not in self._named and len(self._named) < MOST_NAMED:
+            self._named.add(method)
+            shown = words.partition("; offered: ")[0]
+            _log.warning("a script's call %.80r %s; this is said once", method, shown)
+
 
 class StateCalls:
     """Calls about the connection, the clock, and where things are.
 
     Args:
         bridge: Of the run.
-        sensors: Devices by further names that clients use for them.
-        lidar_in_sensor_axes: Whether points are in axes of the sensor, and not of the vehicle's start.
     """
 
-    def __init__(
-        self, bridge: Bridge, sensors: Mapping[str, str], *, lidar_in_sensor_axes: bool = False
-    ) -> None:
-        self._bridge, self._sensors = bridge, sensors
-        self._lidar_in_sensor_axes = lidar_in_sensor_axes
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
 
     def offered(self) -> dict[str, Call]:
         """The calls, by name."""
@@ -102,9 +125,6 @@ class StateCalls:
             "simGetObjectPose": self.object_pose,
             "simListSceneObjects": self.objects,
             "simGetCollisionInfo": self.collision,
-            "simGetImage": self.image,
-            "simGetImages": self.images,
-            "getLidarData": self.lidar,
             "simPause": self.pause,
             "simIsPaused": self.is_paused,
             "simContinueForTime": self.continue_for_time,
@@ -164,7 +184,7 @@ class StateCalls:
         now, ned = await self._bridge.newest(), await self._bridge.ned()
         return {
             "collision": _collision(now, vehicle, ned),
-            "kinematics_estimated": _kinematics(now, vehicle, ned),
+            "kinematics_estimated": kinematics_of(now, vehicle, ned),
             "gps_location": ned.geo_point(flown.position),
             "timestamp": now.t_ns,
             "landed_state": LANDED if vehicle.landed else FLYING,
@@ -177,7 +197,7 @@ class StateCalls:
     async def kinematics(self, vehicle_name: object = "") -> Map:
         """AirSim's ``KinematicsState``."""
         vehicle, _ = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
-        return _kinematics(await self._bridge.newest(), vehicle, await self._bridge.ned())
+        return kinematics_of(await self._bridge.newest(), vehicle, await self._bridge.ned())
 
     async def vehicle_pose(self, vehicle_name: object = "") -> Map:
         """AirSim's ``Pose`` of a vehicle."""
@@ -203,103 +223,6 @@ class StateCalls:
         vehicle, _ = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
         return _collision(await self._bridge.newest(), vehicle, await self._bridge.ned())
 
-    # --- sensors --------------------------------------------------------------------------------------
-
-    async def image(
-        self, camera_name: object, image_type: object, vehicle_name: object = "", external: object = False
-    ) -> bytes:
-        """One picture as PNG."""
-        request = {"camera_name": camera_name, "image_type": image_type, "compress": True}
-        (found,) = await self._images([request], vehicle_name, external)
-        data: bytes = found["image_data_uint8"]
-        return data
-
-    async def images(self, requests: object, vehicle_name: object = "", external: object = False) -> Compact:
-        """AirSim's ``ImageResponse`` for each ``ImageRequest``, all of one frame."""
-        return Compact(await self._images(requests, vehicle_name, external))
-
-    async def _images(self, requests: object, vehicle_name: object, external: object) -> list[Map]:
-        vehicle = self._bridge.vehicle(text(vehicle_name, "vehicle_name"))
-        if not isinstance(requests, list) or len(requests) > MOST_IMAGES:
-            raise CallError(f"requests is no list of at most {MOST_IMAGES} ImageRequest")
-        now, ned = await self._bridge.newest(), await self._bridge.ned()
-        wanted = []
-        for entry in requests:
-            request = table(entry, "ImageRequest")
-            name = text(request.get("camera_name"), "camera_name")
-            kind = request.get("image_type")
-            if isinstance(kind, bool) or not isinstance(kind, int):
-                raise CallError(f"image_type is {kind!r:.80}; give an ImageType, a whole number")
-            device = self._device(now, vehicle, name, CameraDevice, bool(external))
-            as_float = bool(request.get("pixels_as_float", False))
-            wanted.append((name, device, kind, as_float, bool(request.get("compress", True))))
-
-        def made() -> list[Map]:
-            return [
-                {
-                    **image_response(now.images, device, kind, as_float, compress, ned.pose),
-                    "camera_name": name,
-                    "time_stamp": now.t_ns,
-                }
-                for name, device, kind, as_float, compress in wanted
-            ]
-
-        # A thread, as a PNG takes milliseconds in which frames and other clients would wait.
-        return await asyncio.to_thread(made)
-
-    async def lidar(self, lidar_name: object = "", vehicle_name: object = "") -> Compact:
-        """AirSim's ``LidarData``: the scan of the newest frame."""
-        vehicle = self._bridge.vehicle(text(vehicle_name, "vehicle_name"))
-        now, ned = await self._bridge.newest(), await self._bridge.ned()
-        device = self._device(now, vehicle, text(lidar_name, "lidar_name"), LidarDevice)
-        if not now.lidars:
-            raise CallError(
-                "there is no product 'lidar' in this frame; it needs a service of the run with role "
-                "'sensors' and use 'lidar'"
-            )
-        scan = next((scan for lidar in now.lidars for scan in lidar.scans if scan.sensor == device), None)
-        if scan is None:
-            raise CallError(f"LIDAR {device!r} made no scan in this frame")
-        return Compact(await asyncio.to_thread(self._lidar_data, now, ned, scan))
-
-    def _lidar_data(self, now: Snapshot, ned: NedFrame, scan: LidarScan) -> Map:
-        points = sensor_points(scan.points) if self._lidar_in_sensor_axes else ned.points(scan.in_world())
-        return {
-            "point_cloud": points,
-            "time_stamp": now.t_ns,
-            "pose": ned.pose(Pose(scan.position, scan.orientation)),
-            "segmentation": scan.object.tolist(),
-        }
-
-    def _device(
-        self,
-        now: Snapshot,
-        vehicle: Vehicle,
-        name: str,
-        kind: type[CameraDevice | LidarDevice],
-        external: bool = False,
-    ) -> str:
-        """Name of the device that a client means: an alias, its name with or without the vehicle, or its
-        number on the vehicle."""
-        devices = [device for device in now.scene.devices if isinstance(device, kind)]
-        own = sorted(device.name for device in devices if device.parent == vehicle.object)
-        known = {device.name for device in devices}
-        if not external:
-            if not name and own:
-                return own[0]
-            if name.isdecimal() and int(name) < len(own):
-                return own[int(name)]
-        for candidate in (self._sensors.get(name, name), f"{vehicle.object}/{name}"):
-            if candidate in known:
-                return candidate
-        called = "camera" if kind is CameraDevice else "LIDAR"
-        numbered = [f"{i} ({device})" for i, device in enumerate(own)]
-        others = sorted(known - set(own)) + [k for k, v in self._sensors.items() if v in known]
-        raise CallError(
-            f"there is no {called} {name!r} on vehicle {vehicle.name!r}; there are: "
-            f"{', '.join([*numbered, *others]) or 'none'}; settings.sensors of the agent gives further names"
-        )
-
 
 _NO_REMOTE_CONTROL: Map = {
     "timestamp": 0,
@@ -316,7 +239,8 @@ def _row(table: Iterable[Any]) -> Vector:
     return (x, y, z)
 
 
-def _kinematics(now: Snapshot, vehicle: Vehicle, ned: NedFrame) -> Map:
+def kinematics_of(now: Snapshot, vehicle: Vehicle, ned: NedFrame) -> Map:
+    """AirSim's ``KinematicsState`` of a vehicle that is in the scene."""
     scene = now.scene
     index = scene.names.index(vehicle.object)
     turning = scene.angular_velocity

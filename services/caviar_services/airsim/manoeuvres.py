@@ -26,9 +26,6 @@ LANDED_NS = 500_000_000
 SINKS_M = 0.01
 """[m] by which it has to get lower to count as sinking."""
 LANDED_FRAMES = 2
-DRIFT_M_S = 0.1
-"""[m/s] with which a vehicle turns that heads where it moves: twice what the world ``flight`` takes for
-hovering, and a few centimetres a turn."""
 Command = WaypointCommand | VelocityCommand
 
 
@@ -48,6 +45,18 @@ class Flown(NamedTuple):
 def deadline(now_ns: int, timeout_s: float) -> float:
     """When a time is up that begins now [ns]; of AirSim's 3·10³⁸ s, never."""
     return now_ns + timeout_s * 1e9 if timeout_s < 1e9 else math.inf
+
+
+class Heading(NamedTuple):
+    """Where a vehicle heads while it moves; of neither, where it moves to."""
+
+    yaw: float | None = None
+    """Counter-clockwise from east [rad]."""
+    rate: float | None = None
+    """Counter-clockwise [rad/s]."""
+
+
+ALONG = Heading()
 
 
 class Manoeuvre(ABC):
@@ -81,7 +90,7 @@ class Manoeuvre(ABC):
         if not self._begun:
             self._begun = True
             self.begin(now)
-        return self.command(now) if self.result is None else self.rest()
+        return self.command(now) if self.result is None else self.rest(now)
 
     @abstractmethod
     def begin(self, now: Flown) -> None:
@@ -95,7 +104,7 @@ class Manoeuvre(ABC):
     def command(self, now: Flown) -> Command:
         """What the vehicle does until the next frame."""
 
-    def rest(self) -> Command:
+    def rest(self, now: Flown) -> Command:
         """What it does once the manoeuvre is done: brake, and stay."""
         return VelocityCommand(object=self.name, velocity=(0.0, 0.0, 0.0))
 
@@ -112,7 +121,7 @@ class Hover(Manoeuvre):
 
     def command(self, now: Flown) -> Command:
         """See `Manoeuvre`."""
-        return self.rest()
+        return self.rest(now)
 
 
 class FlyPath(Manoeuvre):
@@ -124,6 +133,7 @@ class FlyPath(Manoeuvre):
         speed: At most [m/s].
         reach: So near a point counts as reached [m].
         timeout_s: Simulated time in which the last one has to be reached [s].
+        yaw: Heading on the way; None: along it.
 
     Example:
         >>> path = FlyPath("uav", [(0.0, 0.0, 5.0), (9.0, 0.0, 5.0)], speed=3.0, reach=0.5)
@@ -132,9 +142,16 @@ class FlyPath(Manoeuvre):
     """
 
     def __init__(
-        self, name: str, points: Sequence[Vector], speed: float, reach: float, timeout_s: float = math.inf
+        self,
+        name: str,
+        points: Sequence[Vector],
+        speed: float,
+        reach: float,
+        timeout_s: float = math.inf,
+        yaw: float | None = None,
     ) -> None:
         super().__init__(name)
+        self._yaw = yaw
         self._points, self._speed, self._reach, self._timeout_s = list(points), speed, reach, timeout_s
         self._until = math.inf
         self._moved_ns = 0
@@ -157,13 +174,11 @@ class FlyPath(Manoeuvre):
 
     def command(self, now: Flown) -> Command:
         """See `Manoeuvre`."""
-        return WaypointCommand(object=self.name, position=self._points[0], speed=self._speed)
+        return WaypointCommand(object=self.name, position=self._points[0], speed=self._speed, yaw=self._yaw)
 
-    def rest(self) -> Command:
+    def rest(self, now: Flown) -> Command:
         """Stay at the last point, or where it failed."""
-        if not self.result:
-            return super().rest()
-        return WaypointCommand(object=self.name, position=self._points[0], speed=self._speed)
+        return self.command(now) if self.result else super().rest(now)
 
     def _drop_reached(self, now: Flown) -> None:
         while len(self._points) > 1 and math.dist(now.position, self._points[0]) <= self._reach:
@@ -179,6 +194,7 @@ class FlyVelocity(Manoeuvre):
         duration_s: Simulated time [s]; the vehicle brakes in the first frame at its end.
         height: Height to be kept or reached instead of the vertical velocity [m].
         climb: Vertical speed at most, on the way to it [m/s].
+        heading: Meanwhile.
     """
 
     def __init__(
@@ -188,8 +204,10 @@ class FlyVelocity(Manoeuvre):
         duration_s: float,
         height: float | None = None,
         climb: float = 0.0,
+        heading: Heading = ALONG,
     ) -> None:
         super().__init__(name)
+        self._heading = heading
         self._velocity, self._duration_s = velocity, duration_s
         self._height, self._climb = height, climb
         self._until = math.inf
@@ -208,7 +226,8 @@ class FlyVelocity(Manoeuvre):
         if self._height is not None:
             # A time constant of 1 s: limits of acceleration make it overshoot by little.
             z = max(-self._climb, min(self._climb, self._height - now.position[2]))
-        return VelocityCommand(object=self.name, velocity=(x, y, z))
+        yaw, rate = self._heading
+        return VelocityCommand(object=self.name, velocity=(x, y, z), yaw=yaw, yaw_rate=rate)
 
 
 class Land(Manoeuvre):
@@ -248,10 +267,7 @@ class Land(Manoeuvre):
 
 
 class Turn(Manoeuvre):
-    """Turn to a yaw.
-
-    No command of the protocol turns an object: it heads where it moves. So the vehicle brakes, and drifts
-    where it has to head.
+    """Brake, and turn to a yaw.
 
     Args:
         name: Of the object that is flown.
@@ -277,7 +293,4 @@ class Turn(Manoeuvre):
 
     def command(self, now: Flown) -> Command:
         """See `Manoeuvre`."""
-        if math.hypot(*now.velocity[:2]) > 2 * DRIFT_M_S:
-            return self.rest()
-        velocity = (DRIFT_M_S * math.cos(self._yaw), DRIFT_M_S * math.sin(self._yaw), 0.0)
-        return VelocityCommand(object=self.name, velocity=velocity)
+        return VelocityCommand(object=self.name, velocity=(0.0, 0.0, 0.0), yaw=self._yaw)

@@ -14,11 +14,22 @@ from caviar_protocol.arrays import quantity
 from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 from caviar_services.airsim.bridge import Bridge, Vehicle
 from caviar_services.airsim.calls import Call
-from caviar_services.airsim.manoeuvres import Flown, FlyPath, FlyVelocity, Hover, Land, Manoeuvre, Turn
+from caviar_services.airsim.manoeuvres import (
+    ALONG,
+    Flown,
+    FlyPath,
+    FlyVelocity,
+    Heading,
+    Hover,
+    Land,
+    Manoeuvre,
+    Turn,
+)
 from caviar_services.airsim.rpc import CallError
 from caviar_services.airsim.wire import (
     LEVEL,
     flag,
+    ned_yaw,
     number,
     quaternion_map,
     table,
@@ -31,6 +42,8 @@ MOST_POINTS = 10_000
 """Of a path."""
 FASTEST = 1000.0
 """[m/s]"""
+FORWARD_ONLY = 1
+"""Of AirSim's ``DrivetrainType``: the vehicle heads along its way."""
 LEAST_MARGIN = math.radians(0.1)
 SAME_YAW = math.radians(1.0)
 
@@ -74,7 +87,10 @@ class MotionCalls:
             "moveOnPath": self.move_on_path,
             "moveByVelocity": self.move_by_velocity,
             "moveByVelocityZ": self.move_by_velocity_z,
+            "moveByVelocityBodyFrame": self.move_by_velocity_body,
+            "moveByVelocityZBodyFrame": self.move_by_velocity_z_body,
             "rotateToYaw": self.rotate_to_yaw,
+            "rotateByYawRate": self.rotate_by_yaw_rate,
             "simSetVehiclePose": self.set_vehicle_pose,
             "simSetObjectPose": self.set_object_pose,
             "reset": self.reset,
@@ -94,9 +110,10 @@ class MotionCalls:
         return self._vehicle(vehicle_name).api_enabled
 
     async def arm(self, arm: object, vehicle_name: object = "") -> bool:
-        """Arm or disarm a vehicle that is taken over."""
+        """Arm or disarm a vehicle that is taken over; of another one False, as in AirSim after a reset."""
         vehicle = self._vehicle(vehicle_name)
-        self._require_control(vehicle, "armDisarm")
+        if not vehicle.api_enabled:
+            return False
         vehicle.armed = flag(arm, "arm")
         return True
 
@@ -147,9 +164,10 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly to a point, and stop there."""
-        vehicle, _ = await self._ready("moveToPosition", vehicle_name, yaw_mode)
+        vehicle, flown = await self._ready("moveToPosition", vehicle_name)
         point = await self._point((number(x, "x"), number(y, "y"), number(z, "z")))
-        return await self._flown(vehicle, self._path(vehicle, [point], velocity, timeout_sec))
+        heading = self._heading(flown, drivetrain, yaw_mode)
+        return await self._flown(vehicle, self._path(vehicle, [point], velocity, timeout_sec, heading))
 
     async def move_to_z(
         self,
@@ -162,9 +180,10 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly up or down to a height."""
-        vehicle, flown = await self._ready("moveToZ", vehicle_name, yaw_mode)
+        vehicle, flown = await self._ready("moveToZ", vehicle_name)
         (_, _, height), (east, north, _) = await self._point((0.0, 0.0, number(z, "z"))), flown.position
-        path = self._path(vehicle, [(east, north, height)], velocity, timeout_sec)
+        heading = self._heading(flown, 0, yaw_mode)
+        path = self._path(vehicle, [(east, north, height)], velocity, timeout_sec, heading)
         return await self._flown(vehicle, path)
 
     async def move_on_path(
@@ -179,11 +198,12 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Fly from point to point, and stop at the last one."""
-        vehicle, _ = await self._ready("moveOnPath", vehicle_name, yaw_mode)
+        vehicle, flown = await self._ready("moveOnPath", vehicle_name)
         if not isinstance(path, list) or not 0 < len(path) <= MOST_POINTS:
             raise CallError(f"path is no list of 1 to {MOST_POINTS} Vector3r")
         points = [await self._point(vector(point, f"path[{i}]")) for i, point in enumerate(path)]
-        return await self._flown(vehicle, self._path(vehicle, points, velocity, timeout_sec))
+        heading = self._heading(flown, drivetrain, yaw_mode)
+        return await self._flown(vehicle, self._path(vehicle, points, velocity, timeout_sec, heading))
 
     async def move_by_velocity(
         self,
@@ -196,9 +216,11 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Keep a velocity for a time, then brake."""
-        vehicle, _ = await self._ready("moveByVelocity", vehicle_name, yaw_mode)
+        vehicle, flown = await self._ready("moveByVelocity", vehicle_name)
         velocity = await self._velocity(vx, vy, vz)
-        return await self._flown(vehicle, FlyVelocity(vehicle.object, velocity, _duration(duration)))
+        heading = self._heading(flown, drivetrain, yaw_mode)
+        manoeuvre = FlyVelocity(vehicle.object, velocity, _duration(duration), heading=heading)
+        return await self._flown(vehicle, manoeuvre)
 
     async def move_by_velocity_z(
         self,
@@ -211,12 +233,40 @@ class MotionCalls:
         vehicle_name: object = "",
     ) -> bool:
         """Keep a horizontal velocity and a height for a time, then brake."""
-        vehicle, _ = await self._ready("moveByVelocityZ", vehicle_name, yaw_mode)
+        vehicle, flown = await self._ready("moveByVelocityZ", vehicle_name)
         velocity = await self._velocity(vx, vy, 0.0)
         _, _, height = await self._point((0.0, 0.0, number(z, "z")))
-        climb = self._habits.climb_m_s
-        manoeuvre = FlyVelocity(vehicle.object, velocity, _duration(duration), height, climb)
+        climb, heading = self._habits.climb_m_s, self._heading(flown, drivetrain, yaw_mode)
+        manoeuvre = FlyVelocity(vehicle.object, velocity, _duration(duration), height, climb, heading)
         return await self._flown(vehicle, manoeuvre)
+
+    async def move_by_velocity_body(
+        self,
+        vx: object,
+        vy: object,
+        vz: object,
+        duration: object,
+        drivetrain: object = 0,
+        yaw_mode: object = None,
+        vehicle_name: object = "",
+    ) -> bool:
+        """Keep a velocity that is given forward and to the right of the heading at the beginning."""
+        north, east = await self._from_body(vx, vy, vehicle_name)
+        return await self.move_by_velocity(north, east, vz, duration, drivetrain, yaw_mode, vehicle_name)
+
+    async def move_by_velocity_z_body(
+        self,
+        vx: object,
+        vy: object,
+        z: object,
+        duration: object,
+        drivetrain: object = 0,
+        yaw_mode: object = None,
+        vehicle_name: object = "",
+    ) -> bool:
+        """The same, with a height."""
+        north, east = await self._from_body(vx, vy, vehicle_name)
+        return await self.move_by_velocity_z(north, east, z, duration, drivetrain, yaw_mode, vehicle_name)
 
     async def rotate_to_yaw(
         self, yaw: object, timeout_sec: object = 3e38, margin: object = 5, vehicle_name: object = ""
@@ -228,12 +278,19 @@ class MotionCalls:
         turn = Turn(vehicle.object, math.pi / 2 - heading, near, _timeout(timeout_sec))
         return await self._flown(vehicle, turn)
 
+    async def rotate_by_yaw_rate(self, yaw_rate: object, duration: object, vehicle_name: object = "") -> bool:
+        """Brake, and turn for a time with a rate [°/s], clockwise."""
+        vehicle, _ = await self._ready("rotateByYawRate", vehicle_name)
+        heading = Heading(rate=-math.radians(number(yaw_rate, "yaw_rate", -1e4, 1e4)))
+        manoeuvre = FlyVelocity(vehicle.object, (0.0, 0.0, 0.0), _duration(duration), heading=heading)
+        return await self._flown(vehicle, manoeuvre)
+
     # --- places ---------------------------------------------------------------------------------------
 
     async def set_vehicle_pose(
         self, pose: object, ignore_collision: object = True, vehicle_name: object = ""
     ) -> None:
-        """Be at a pose, at rest; parts that are not-a-number stay as they are.
+        """Be at a pose, at rest; parts that are not-a-number, and an orientation of zeros, stay as they are.
 
         A world that is paused has the vehicle there in its next frame, and the call returns before that.
         """
@@ -244,28 +301,26 @@ class MotionCalls:
         )
         position = wanted.position if given["position"] else flown.position
         yaw, pitch, roll = euler_from_quaternion(wanted.orientation)
-        placed = vehicle.put(position)
+        placed = vehicle.put(position, yaw if given["orientation"] else flown.yaw)
         if given["orientation"] and (abs(pitch) > SAME_YAW or abs(roll) > SAME_YAW):
             self._note("attitude", "a pose has pitch or roll, which worlds of this run do not set")
         if self._bridge.gate.is_open:
             await placed
-        if given["orientation"] and abs(math.remainder(yaw - flown.yaw, math.tau)) > SAME_YAW:
-            turn = vehicle.begin(Turn(vehicle.object, yaw, SAME_YAW))
-            if self._bridge.gate.is_open:
-                await turn
 
     async def set_object_pose(self, object_name: object, pose: object, teleport: object = True) -> bool:
-        """Put a vehicle at a pose; no other object is moved by commands."""
+        """Put a vehicle at a pose; False for any other object, as no command moves it."""
         name = text(object_name, "object_name")
         for vehicle in self._bridge.vehicles.values():
             if name in (vehicle.name, vehicle.object):
                 await self.set_vehicle_pose(pose, True, vehicle.name)
                 return True
         vehicles = ", ".join(self._bridge.vehicles)
-        raise CallError(
-            f"object {name!r} cannot be put anywhere: worlds of this run move it themselves; vehicles can: "
-            f"{vehicles}"
+        self._note(
+            "object",
+            f"simSetObjectPose of {name!r:.80} returns False: worlds of this run move their objects "
+            f"themselves; vehicles can be put somewhere: {vehicles}",
         )
+        return False
 
     async def reset(self) -> None:
         """Begin the next episode; in the last one, put all vehicles where they started."""
@@ -274,7 +329,7 @@ class MotionCalls:
         for vehicle in self._bridge.vehicles.values():
             vehicle.reset()
             if now.is_last_episode and vehicle.home is not None:
-                placed.append(vehicle.put(vehicle.home))
+                placed.append(vehicle.put(vehicle.home, vehicle.home_yaw))
         if not self._bridge.gate.is_open:
             self._bridge.gate.let(frames=1)
         if now.is_last_episode:
@@ -294,18 +349,33 @@ class MotionCalls:
                 "first"
             )
 
-    async def _ready(
-        self, method: str, vehicle_name: object, yaw_mode: object = None
-    ) -> tuple[Vehicle, Flown]:
+    async def _ready(self, method: str, vehicle_name: object) -> tuple[Vehicle, Flown]:
         """A vehicle that may fly, and where it is."""
         vehicle, flown = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
         self._require_control(vehicle, method)
         if not vehicle.armed:
             raise CallError(f"{method}: vehicle {vehicle.name!r} is not armed; call armDisarm(True) first")
-        mode = yaw_mode if isinstance(yaw_mode, dict) else {}
-        if mode.get("yaw_or_rate") or mode.get("is_rate") is False:
-            self._note("yaw", "a call has a yaw_mode; vehicles of this run head where they move")
         return vehicle, flown
+
+    def _heading(self, flown: Flown, drivetrain: object, yaw_mode: object) -> Heading:
+        """Of AirSim's ``DrivetrainType`` and ``YawMode``: along the way, to a yaw, or turning with a rate."""
+        if drivetrain == FORWARD_ONLY:
+            return ALONG
+        mode = yaw_mode if isinstance(yaw_mode, dict) else {}
+        degrees = number(mode.get("yaw_or_rate", 0.0), "yaw_mode.yaw_or_rate", -1e6, 1e6)
+        if mode.get("is_rate", True):
+            return Heading(rate=-math.radians(degrees)) if degrees else Heading(yaw=flown.yaw)
+        return Heading(yaw=math.pi / 2 - math.radians(degrees))
+
+    async def _from_body(self, vx: object, vy: object, vehicle_name: object) -> tuple[float, float]:
+        """Northward and eastward parts [m/s] of a velocity forward and to the right."""
+        _, flown = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
+        forward, right = (number(v, k, -FASTEST, FASTEST) for v, k in ((vx, "vx"), (vy, "vy")))
+        yaw = ned_yaw(flown.yaw)
+        return (
+            forward * math.cos(yaw) - right * math.sin(yaw),
+            forward * math.sin(yaw) + right * math.cos(yaw),
+        )
 
     async def _flown(self, vehicle: Vehicle, manoeuvre: Manoeuvre) -> bool:
         done = vehicle.begin(manoeuvre)
@@ -313,9 +383,18 @@ class MotionCalls:
             vehicle.landed = False
         return await done
 
-    def _path(self, vehicle: Vehicle, points: list[Vector], velocity: object, timeout_sec: object) -> FlyPath:
-        speed = number(velocity, "velocity", 1e-3, FASTEST)
-        return FlyPath(vehicle.object, points, speed, self._habits.reach_m, _timeout(timeout_sec))
+    def _path(
+        self,
+        vehicle: Vehicle,
+        points: list[Vector],
+        velocity: object,
+        timeout_sec: object,
+        heading: Heading = ALONG,
+    ) -> FlyPath:
+        speed, reach = number(velocity, "velocity", 1e-3, FASTEST), self._habits.reach_m
+        if heading.rate is not None:
+            self._note("yaw", "a vehicle on its way to points turns with no rate; it heads along the way")
+        return FlyPath(vehicle.object, points, speed, reach, _timeout(timeout_sec), heading.yaw)
 
     async def _point(self, point: Vector) -> Vector:
         return (await self._bridge.ned()).point_to_enu(point)
@@ -338,12 +417,14 @@ _SOMEWHERE = {"position": vector_map((0.0, 0.0, 0.0)), "orientation": quaternion
 
 
 def _with_known(pose: Mapping[str, Any]) -> dict[str, Mapping[str, Any] | None]:
-    """Position and orientation of a pose; None for one of which a part is not a number."""
+    """Position and orientation of a pose; None for one of which a part is not a number, and for an
+    orientation of zeros."""
     found: dict[str, Mapping[str, Any] | None] = {}
     for key in ("position", "orientation"):
         parts = table(pose.get(key), f"pose.{key}")
         unknown = any(isinstance(part, float) and math.isnan(part) for part in parts.values())
-        found[key] = None if unknown else parts
+        nothing = key == "orientation" and not any(parts.values())
+        found[key] = None if unknown or nothing else parts
     return found
 
 

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array
-from caviar_protocol.space.coordinates import Pose, Vector
+from caviar_protocol.space.coordinates import Pose, Vector, unrotated
 from caviar_protocol.space.engine_axes import NED, Motion
 from caviar_services.airsim.rpc import CallError
 
 EARTH_RADIUS_M = 6_378_137.0
 """[m] of the sphere on which geographic positions lie: the equator of WGS 84."""
+GEO_ORIGIN = (47.641468, -122.140165, 122.0)
+"""Latitude [°], longitude [°] and altitude [m] of the origin, as AirSim's settings have it by default."""
 FAR = 1e6
 """[m, m/s] beyond which a number is taken for a mistake."""
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -183,12 +185,13 @@ class NedFrame:
             angular_velocity: [rad/s], in ENU.
             acceleration: [m/s²], in ENU.
         """
-        # Angular velocities of AirSim are in body axes; of what turns about the vertical alone both are one.
         motion = NED.motion_from_enu(Motion(velocity, angular_velocity))
+        # Angular velocities of AirSim are in body axes.
+        there = NED.from_enu(Pose(self._from_origin(pose.position), pose.orientation))
         return {
             **self.pose(pose),
             "linear_velocity": vector_map(motion.velocity),
-            "angular_velocity": vector_map(motion.angular_velocity),
+            "angular_velocity": vector_map(unrotated(there.orientation, motion.angular_velocity)),
             "linear_acceleration": vector_map(self.velocity(acceleration)),
             "angular_acceleration": vector_map((0.0, 0.0, 0.0)),
         }
@@ -209,6 +212,21 @@ class NedFrame:
             "longitude": longitude + math.degrees(east / (EARTH_RADIUS_M * math.cos(math.radians(latitude)))),
             "altitude": altitude + up,
         }
+
+    def from_geo_point(self, point: object, name: str) -> Vector:
+        """The position in ENU [m] of AirSim's ``GeoPoint``.
+
+        Raises:
+            CallError: It is none.
+        """
+        parts = table(point, name)
+        latitude, longitude, altitude = (
+            number(parts.get(key), f"{name}.{key}") for key in ("latitude", "longitude", "altitude")
+        )
+        at, along, above = self.geo_origin
+        east = math.radians(longitude - along) * EARTH_RADIUS_M * math.cos(math.radians(at))
+        north = math.radians(latitude - at) * EARTH_RADIUS_M
+        return self._to_origin((east, north, altitude - above))
 
     def _from_origin(self, position: Vector) -> Vector:
         (x, y, z), (a, b, c) = position, self.origin

@@ -10,8 +10,9 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
+import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import (
@@ -20,6 +21,7 @@ from caviar_protocol.arrays import (
     Float64Array,
     Int64Array,
 )
+from caviar_protocol.errors import PayloadError, suggestion
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
@@ -27,10 +29,12 @@ from caviar_protocol.topics import (
     Channel,
     ChannelMatrix,
     ChannelOptions,
+    ChannelResponse,
+    ChannelTaps,
     Scene,
 )
 from caviar_protocol.topics.channel import INSIDE_PREFIX, Cause
-from caviar_protocol.topics.scene import Device
+from caviar_protocol.topics.scene import AntennaDevice, Device
 from caviar_services.channel.arrays.channel_matrices import (
     Located,
     Matrices,
@@ -44,6 +48,8 @@ from caviar_services.channel.arrays.channel_matrices import (
 from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+
+Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,6 +307,66 @@ def _order(
     return np.lexsort(keys[::-1]).astype(np.int64)
 
 
+def restricted(
+    channel: Channel, transmitters: Sequence[AntennaDevice], receivers: Sequence[AntennaDevice]
+) -> Channel:
+    """The product without what its devices do not use: those that name carriers have no others.
+
+    Args:
+        channel: As a model makes it, for all pairs on all carriers, or restricted already.
+        transmitters: Devices in the order of `Channel.tx`.
+        receivers: Devices in the order of `Channel.rx`.
+
+    Raises:
+        PayloadError: A device names a carrier that the run does not have.
+    """
+    devices = (*transmitters, *receivers)
+    if channel.used is not None or not any(device.carriers for device in devices):
+        return channel
+    names = [carrier.name for carrier in channel.carriers]
+    for device in devices:
+        if unknown := [name for name in device.carriers if name not in names]:
+            raise PayloadError(
+                f"device {device.name!r} uses the carrier {unknown[0]!r}; {suggestion(unknown[0], names)}"
+            )
+    used: BoolArray = np.array(
+        [[[t.uses(name) and r.uses(name) for r in receivers] for t in transmitters] for name in names], bool
+    ).reshape(len(names), len(transmitters), len(receivers))
+    if used.all():
+        return channel
+    pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
+    on_path = used.reshape(len(names), -1)[:, pair]
+    kept = on_path.any(0)
+    # Names, depth and offsets are those of the paths that are left, as if no others had been found.
+    objects, types = channel.objects[kept], channel.interactions[kept]
+    occurring = np.unique(objects[objects >= 0])
+    index = np.full(len(channel.object_names) + 1, -1, np.int32)
+    index[occurring] = np.arange(len(occurring))
+    depth = int((types != 0).sum(1).max(initial=0))
+
+    def used_alone(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+        return tuple(part for part in parts if used[part.carrier, part.tx, part.rx])
+
+    return msgspec.structs.replace(
+        channel,
+        used=used,
+        offsets=np.searchsorted(pair[kept], np.arange(len(channel.offsets))).astype(np.int64),
+        object_names=tuple(channel.object_names[i] for i in occurring.tolist()),
+        id=channel.id[kept],
+        a=np.where(on_path, channel.a, 0.0)[:, kept],
+        tau=channel.tau[kept],
+        aod=channel.aod[kept],
+        aoa=channel.aoa[kept],
+        doppler=channel.doppler[:, kept],
+        interactions=types[:, :depth],
+        points=channel.points[kept, :depth],
+        objects=index[objects[:, :depth]],
+        h=used_alone(channel.h),
+        hf=used_alone(channel.hf),
+        taps=used_alone(channel.taps),
+    )
+
+
 class Surroundings(Protocol):
     """What a channel model knows about places; in the state of the last frame."""
 
@@ -354,6 +420,8 @@ def _users_without_path(channel: Channel) -> Int64Array:
     reached: BoolArray = np.zeros((len(channel.carriers), len(paths)), np.bool_)
     carrier, path = np.nonzero(channel.a)
     reached[carrier, np.repeat(np.arange(len(paths)), paths)[path]] = True
+    if channel.used is not None:
+        reached |= ~channel.used.reshape(reached.shape)
     lacking: Int64Array = np.count_nonzero(~reached, axis=0)
     return lacking
 

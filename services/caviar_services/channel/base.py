@@ -29,7 +29,7 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
 from caviar_protocol.topics.scene import Device, Panel
 from caviar_services.channel.arrays.channel_matrices import Matrices, check_size, empty_parts
-from caviar_services.channel.assemble import Product, assemble, outage_counts
+from caviar_services.channel.assemble import Product, assemble, outage_counts, restricted
 from caviar_services.channel.batch import ChannelBatch
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
@@ -282,7 +282,7 @@ class ChannelModel(Service[S]):
             sent, taken = (sum(end.array.size for end in ends) for ends in (transmitters, receivers))
             check_size(self.wideband, self.run.carriers, sent, taken)
         made = self.model(frame, scene, transmitters, receivers)
-        channel = made.channel
+        channel = restricted(made.channel, transmitters, receivers)
         return StepResult(
             products={"channel": channel},
             fidelity=self.rung,
@@ -449,6 +449,7 @@ class PathModel(ChannelModel[S]):
             rounds_h=self.rounds_h,
         )
         channel, dropped = assemble(product, tx, rx, found.table, found.los, found.matrices)
+        channel = restricted(channel, transmitters, receivers)
         # A passive channel brings no more than was sent: above 1, far-field gains are used in the near field.
         if np.abs(channel.a).max(initial=0.0) > 1:
             _refuse_amplified(channel)

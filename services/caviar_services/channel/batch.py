@@ -105,11 +105,13 @@ class SameChannels(ChannelBatch):
             ends = product.offsets.tolist()
             for pair in range(pairs):
                 has_path[0, k, pair] = product.a[:, ends[pair] : ends[pair + 1]].any(axis=1)
-        # Carrier by carrier, then pair by pair.
-        h = [
-            np.array([[product.h[c * pairs + pair].h for c in range(carriers)] for product in products])[None]
-            for pair in range(pairs)
-        ]
+        receivers = len(first.rx)
+        made = [{(m.carrier, m.tx * receivers + m.rx): m.h for m in product.h} for product in products]
+        h = []
+        for pair in range(pairs):
+            # A pair has no matrix on a carrier that it does not use, and no user who looks at it.
+            blank = np.zeros(next((m.shape for (_, p), m in made[0].items() if p == pair), (1, 1)), complex)
+            h.append(np.array([[one.get((c, pair), blank) for c in range(carriers)] for one in made])[None])
         return BatchChannels(h, has_path, np.array([product.los.reshape(-1) for product in products]))
 
     def _product(self, at: SceneAt) -> Channel:

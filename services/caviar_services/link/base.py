@@ -184,7 +184,9 @@ def users_of(scene: Scene, carriers: Sequence[Carrier]) -> Users:
         ['bs → car.1/rx on mmwave', 'bs → truck.2/rx on mmwave']
     """
     pairs = pairs_of(scene)
-    return Users(User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs)
+    return Users(
+        User(pair.tx, pair.rx, carrier) for carrier in carriers for pair in pairs if pair.uses(carrier.name)
+    )
 
 
 def require_channel(frame: Frame) -> Channel:

@@ -15,7 +15,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array, quantity
 from caviar_protocol.cell.rates import shannon
-from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.beams import BeamPairs, best_pairs, straight_beams
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Channel, Scene
@@ -28,7 +28,7 @@ from caviar_services.link.base import (
     choices_of,
     require_channel,
 )
-from caviar_services.link.beam_sweep import Pairs, Swept, best_pairs, sweep_users
+from caviar_services.link.beam_sweep import Swept, sweep_users
 from caviar_services.link.link_budget import LinkBudget
 from caviar_services.service import Frame
 
@@ -201,12 +201,14 @@ def _azimuths(directions: Sequence[Vector]) -> list[float]:
     return [math.atan2(y, x) for x, y, _ in directions]
 
 
-def _listed(swept: Sequence[Swept], users: int, k: int) -> Pairs:
+def _listed(swept: Sequence[Swept], users: int, k: int) -> BeamPairs:
     """The best pairs of all users, Shape ``[U, k]``; −1 and |y| 0 where a user has fewer."""
     found = [best_pairs(group.abs_y, k) for group in swept]
     if len(swept) == 1 and found[0].abs_y.shape == (users, k):
         return found[0]  # all users in their order
-    listed = Pairs(np.full((users, k), -1, np.int32), np.full((users, k), -1, np.int32), np.zeros((users, k)))
+    listed = BeamPairs(
+        np.full((users, k), -1, np.int32), np.full((users, k), -1, np.int32), np.zeros((users, k))
+    )
     for group, pairs in zip(swept, found, strict=True):
         length = pairs.abs_y.shape[1]
         listed.tx_beam[group.users, :length] = pairs.tx_beam

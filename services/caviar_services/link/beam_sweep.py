@@ -1,8 +1,7 @@
 """Sweep of DFT codebooks, and what beam pairs get over the band.
 
 Each end has one RF chain and the DFT codebook of its array (paper, section 2.1). Every beam pair of every
-user is swept each frame (eq. 1). The sweep is a Fourier transform of H; the codebook as vectors is in
-`caviar_services.antenna_arrays`.
+user is swept each frame (eq. 1, `caviar_protocol.space.beams.beam_gains`).
 
 Over the band and the slots of a frame the equivalent channel (eq. 1) of a pair of beams w and f is
 
@@ -14,146 +13,22 @@ with the phases r_p and t_p of the elements on path p: two numbers a path instea
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array
+from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.multipath import subcarrier_weights
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_protocol.topics.scene import AntennaArray
 from caviar_services.antenna_arrays import dft_beam, steering_vector
 from caviar_services.link.base import Users
-
-SORTED_WHOLE = 256
-"""Pairs up to which sorting all of them is faster than looking for the best first."""
-SMALL = 32
-"""Elements along an axis up to which a product of matrices is faster than a fast transform. From 64 on it
-would be shared out to threads too, which on a busy machine wait for each other ten times as long."""
-
-
-class Pairs(NamedTuple):
-    """Beam pairs of U users, best first, Shape ``[U, k]`` each."""
-
-    tx_beam: Int32Array
-    rx_beam: Int32Array
-    abs_y: Float64Array
-
-
-def sweep(h: Complex128Array, tx: AntennaArray, rx: AntennaArray) -> Float64Array:
-    """Compute |y| of every pair of DFT beams.
-
-    y = w* H f (paper, eq. 1) with the beams of `antenna_arrays.dft_codebook`. Both conj(w) and f have
-    entries exp(−j2πkn/N)/sqrt(N), so the product over all pairs is a Fourier transform over the
-    columns and rows of both arrays, and no codebook of N² entries has to be formed. Of several panels or
-    polarizations each block is transformed by itself.
-
-    Args:
-        h: Channel matrices, Shape ``[..., Nr, Nt]``.
-        tx: Array of the transmitter, of Nt elements.
-        rx: Array of the receiver, of Nr elements.
-
-    Returns:
-        |y| by TX beam and RX beam, Shape ``[..., Nt, Nr]``.
-
-    Example:
-        >>> uniform = AntennaArray(rows=1, columns=4)
-        >>> abs_y = sweep(np.ones((4, 4), np.complex128), uniform, uniform)  # in phase: towards boresight
-        >>> round(float(abs_y[0, 0]), 6), round(float(abs_y[1, 1]), 6)
-        (4.0, 0.0)
-    """
-    # Elements are numbered panel by panel, column by column (`antenna_arrays.element_positions`): so the axes
-    # of the grid come out of a reshape, and the transform of one axis after the other is that of all.
-    leading, grid = h.shape[:-2], _grid(tx, rx)
-    y = h.reshape((*leading, *grid.shape))  # one element at each end: an array without axes
-    for axis, size in grid.axes:
-        if size > SMALL:
-            y = np.fft.fft(y, axis=axis, out=np.empty(y.shape, np.complex128))  # it looks long for a type
-        else:
-            y = (y.swapaxes(axis, -1) @ _fourier(size)).swapaxes(axis, -1)
-    magnitude: Float64Array = np.abs(y.reshape(*leading, rx.size, tx.size).swapaxes(-1, -2))
-    if grid.scale != 1.0:
-        magnitude *= grid.scale
-    return magnitude
-
-
-class _Grid(NamedTuple):
-    """How H is transformed."""
-
-    shape: tuple[int, ...]
-    """By panels, columns and rows of RX, then of TX, without those that are 1."""
-    axes: tuple[tuple[int, int], ...]
-    """Axes of it, from the last one on, and their sizes, of columns and rows."""
-    scale: float
-    """What the fast transforms among them lack to be unitary."""
-
-
-@lru_cache(maxsize=256)
-def _grid(tx: AntennaArray, rx: AntennaArray) -> _Grid:
-    sizes: list[tuple[int, bool]] = []
-    for array in (rx, tx):
-        panels = array.size // (array.columns * array.rows)
-        sizes += [(panels, False), (array.columns, True), (array.rows, True)]
-    kept = [(size, transformed) for size, transformed in sizes if size > 1]
-    axes = [(n - len(kept), size) for n, (size, transformed) in enumerate(kept) if transformed]
-    scale = math.prod(1 / math.sqrt(size) for _, size in axes if size > SMALL)
-    return _Grid(tuple(size for size, _ in kept), tuple(axes), scale)
-
-
-@lru_cache(maxsize=SMALL)
-def _fourier(size: int) -> Complex128Array:
-    """The unitary Fourier matrix, entries exp(−j2πkn/N)/sqrt(N)."""
-    n = np.arange(size)
-    matrix: Complex128Array = np.exp(-2j * np.pi * (np.outer(n, n) % size) / size) / np.sqrt(size)
-    return matrix
-
-
-def best_pairs(abs_y: Float64Array, k: int) -> Pairs:
-    """Find the pairs of beams with the greatest |y|.
-
-    The first one is eq. (2) of the paper. Of equal ones the lowest pair index
-    ``tx_beam·Nr + rx_beam`` comes first.
-
-    Args:
-        abs_y: |y| of all pairs, Shape ``[U, Nt, Nr]``.
-        k: Number of pairs; all of them where there are fewer.
-
-    Example:
-        >>> best_pairs(np.array([[[1.0, 3.0], [2.0, 0.0]]]), 2).abs_y
-        array([[3., 2.]])
-    """
-    flat = abs_y.reshape(len(abs_y), -1)
-    k = min(k, flat.shape[1])
-    if flat.shape[1] <= SORTED_WHOLE:
-        order = (-flat).argsort(-1, "stable")[:, :k]
-    else:
-        order = np.array([_best_of_many(row, k) for row in flat])
-    tx_beam, rx_beam = order.astype(np.int32), np.zeros(order.shape, np.int32)
-    if abs_y.shape[2] > 1:
-        tx_beam, rx_beam = np.divmod(tx_beam, np.int32(abs_y.shape[2]))
-    if len(flat) > 1:
-        # `take` on one flat axis: `take_along_axis` forms index arrays of all axes first.
-        order = order + np.arange(0, flat.size, flat.shape[1])[:, None]
-    return Pairs(tx_beam, rx_beam, flat.take(order))
-
-
-def _best_of_many(flat: Float64Array, k: int) -> Int64Array:
-    """Indices of the ``k`` greatest, found without sorting all."""
-    # A partition is linear in the number of pairs; only what reaches the k-th is sorted, equal ones included,
-    # so that the order among them is that of a stable sort of all.
-    threshold = np.partition(flat, flat.size - k)[flat.size - k]
-    candidates = np.flatnonzero(flat >= threshold)
-    order: Int64Array = candidates[np.argsort(-flat[candidates], kind="stable")][:k]
-    return order
 
 
 class Swept(msgspec.Struct, frozen=True):
@@ -189,7 +64,7 @@ def sweep_users(users: Users, h: Sequence[Complex128Array | None]) -> list[Swept
     for found in groups.values():
         first = users[found[0]]
         stacked = np.array([h[u] for u in found])
-        swept.append(Swept(found, sweep(stacked, first.tx.array, first.rx.array)))
+        swept.append(Swept(found, beam_gains(stacked, first.tx.array, first.rx.array)))
     return swept
 
 

@@ -17,13 +17,12 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon
-from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.beams import beam_gains, straight_beams
 from caviar_protocol.space.scene import antennas, directions
 from caviar_protocol.topics import Carrier, Link
 from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import BatchLink, LinkBatch, User, Users
 from caviar_services.link.beam_scores import RewardKind, Scored, SweepingLink, SweepSettings
-from caviar_services.link.beam_sweep import sweep
 from caviar_services.link.interference import Interferers
 from caviar_services.link.link_budget import LinkBudget
 from caviar_services.service import Frame, StepResult
@@ -238,7 +237,7 @@ def _places(at: SceneAt, users: Users, carriers: Sequence[Carrier]) -> list[tupl
 def _swept(found: BatchChannels, user: User, pair: int, carrier: int) -> Float64Array:
     """|y| of all beam pairs of a user, Shape ``[M, K, Nt·Nr]``."""
     h = np.ascontiguousarray(found.h[pair][:, :, carrier])
-    abs_y = sweep(h, user.tx.array, user.rx.array)
+    abs_y = beam_gains(h, user.tx.array, user.rx.array)
     return abs_y.reshape(*h.shape[:2], -1)
 
 

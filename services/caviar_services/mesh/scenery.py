@@ -1,8 +1,9 @@
 """Scenery as a world announces it: a scene description in XML and the meshes it names.
 
 The description is that of Mitsuba and Sionna RT. Renderers know only the materials of their own
-variant, so it is read here as plain XML: which meshes there are, where they stand, and of which
-material of Recommendation ITU-R P.2040 they are.
+variant, and name no file or line of the user's in their errors, so it is read here as plain XML: which
+meshes there are, where they stand, and of which material of Recommendation ITU-R P.2040 they are. The ray
+tracer is given triangles, and its materials one by one (`RadioBsdf`); the description itself it never sees.
 """
 
 from __future__ import annotations
@@ -26,6 +27,18 @@ from caviar_protocol.space.ply import read_ply
 from caviar_services.mesh.shapes import Mesh, ply
 
 
+class RadioBsdf(NamedTuple):
+    """A material that the ray tracer has constants of."""
+
+    name: str
+    """Its id without a leading ``mat-``; without Blender's number, unless the file gives the copy other
+    properties than the original."""
+    xml: str
+    """Mitsuba's element, without colours."""
+    place: str
+    """Where it stands, for messages: file, line and id."""
+
+
 @dataclass(frozen=True, eq=False)
 class SceneryShape:
     """One mesh of the scenery."""
@@ -46,6 +59,8 @@ class SceneryShape:
     """Type of that material in the description (``diffuse``); empty where it has none."""
     place: str = ""
     """Where it stands, for messages: file, line and name."""
+    radio: RadioBsdf | None = None
+    """Its material for radio waves; None where it has no constants."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +69,9 @@ class Scenery:
 
     file: Path
     shapes: tuple[SceneryShape, ...]
+    files: Mapping[str, str]
+    """Every file that the description names, textures too, relative to its folder; with the place that names
+    it, for messages."""
 
 
 def world_mesh(shape: SceneryShape) -> Mesh:
@@ -68,7 +86,7 @@ def world_mesh(shape: SceneryShape) -> Mesh:
     Raises:
         AssetError: The file is no mesh, or a vertex is not finite; names the shape.
     """
-    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file}")
+    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
     return Mesh(vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3], faces.astype(np.int32))
 
 
@@ -180,28 +198,27 @@ def read_scenery(file: Path, called: str = "") -> Scenery:
 
     Raises:
         AssetError: The XML is broken, a shape is of another type than ``ply``, a mesh is missing, an id
-            occurs twice, or ITU-R P.2040 has no such material; names file, line, shape or material, and the
-            remedy.
+            occurs twice, a name is that of two different materials, or ITU-R P.2040 has no such material;
+            names file, line, shape or material, and the remedy.
     """
     called = called or str(file)
     root, lines = _parse(file, called)
     _check_ids(called, root, lines)
-    # Mitsuba's parameters of a description, which users refer to as $name.
-    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
+    _fill_in_defaults(called, root, lines)
+    files = _files(called, root, lines)
     materials = {b.get("id", ""): b for b in root.findall("bsdf")}
-    for element in (*root.findall("bsdf"), *root.findall("shape/bsdf")):
-        _check_material(f"{called}:{lines[element]}: material {element.get('id', '')!r}", element, defaults)
+    radio = _radio_bsdfs(called, root, lines)
     shapes: dict[str, SceneryShape] = {}
     for element in root.findall("shape"):
         given = element.get("id") or element.get("name") or ""
         where = f"{called}:{lines[element]}: shape {given!r}"
-        shape = _shape(where, file.parent, element, defaults, materials)
+        shape = _shape(where, file.parent, element, materials, radio)
         if shape.name in shapes:
             raise AssetError(
                 f"{where}: another shape is named {shape.name!r}, too; give each an id of its own"
             )
         shapes[shape.name] = shape
-    return Scenery(file, tuple(shapes.values()))
+    return Scenery(file, tuple(shapes.values()), files)
 
 
 # Line of each element's start tag, from 1.
@@ -250,19 +267,103 @@ def _check_ids(called: str, root: ElementTree.Element, lines: _Lines) -> None:
             )
 
 
-def _check_material(where: str, bsdf: ElementTree.Element, defaults: Mapping[str, str]) -> None:
-    """Refuse a material that is to be one of ITU-R P.2040 and is none."""
-    name = _resolved(where, _itu_material(bsdf), defaults)
-    if name and name not in ITU_MATERIALS:
-        raise AssetError(f"{where}: ITU-R P.2040 has no material {name!r}; {suggestion(name, ITU_MATERIALS)}")
+def _fill_in_defaults(called: str, root: ElementTree.Element, lines: _Lines) -> None:
+    """Put Mitsuba's parameters of a description in place of every ``$name``."""
+    defaults = {d.get("name", ""): d.get("value", "") for d in root.iter("default")}
+    for owner in root:
+        for element in owner.iter():
+            for key, value in element.items():
+                for name in re.findall(r"\$(\w+)", value) if element.tag != "default" else ():
+                    if name not in defaults:
+                        raise AssetError(
+                            f"{called}:{lines[element]}: {owner.tag} {owner.get('id', '')!r} uses ${name}, "
+                            "for which there is no <default>; add one"
+                        )
+                    value = value.replace(f"${name}", defaults[name], 1)
+                element.set(key, value)
+
+
+def _files(called: str, root: ElementTree.Element, lines: _Lines) -> dict[str, str]:
+    """Every file that a description names, with the place that names it."""
+    files: dict[str, str] = {}
+    for owner in root.iter():
+        for named in owner.findall("string[@name='filename']"):
+            where = f"{called}:{lines[named]}: <{owner.tag}> {owner.get('id', '')}".rstrip()
+            name = named.get("value", "")
+            path = PurePosixPath(name)
+            # Other services get the files under these names, below a folder of their own.
+            if not path.parts or path.is_absolute() or ".." in path.parts:
+                raise AssetError(
+                    f"{where} names {name!r}; files of scenery lie beside the XML or below its folder: "
+                    "move the file there and write its relative path"
+                )
+            files.setdefault(str(path), where)
+        if owner.tag == "include":
+            raise AssetError(
+                f"{called}:{lines[owner]}: <include> does not travel; write its content into this file"
+            )
+    return files
+
+
+def _radio_bsdfs(
+    called: str, root: ElementTree.Element, lines: _Lines
+) -> dict[ElementTree.Element, RadioBsdf]:
+    """The materials that have radio constants, under names of which each is that of one material."""
+    found: dict[ElementTree.Element, RadioBsdf] = {}
+    known: dict[str, RadioBsdf] = {}
+    bsdfs = [*root.findall("bsdf"), *root.findall("shape/bsdf")]
+    # Originals come before the copies that Blender numbers, which mostly differ in colour alone.
+    for bsdf in sorted(bsdfs, key=lambda bsdf: _COPY.search(bsdf.get("id", "")) is not None):
+        given, itu = bsdf.get("id", ""), _itu_material(bsdf)
+        place = f"{called}:{lines[bsdf]}: material {given!r}"
+        if itu and itu not in ITU_MATERIALS:
+            raise AssetError(
+                f"{place}: ITU-R P.2040 has no material {itu!r}; {suggestion(itu, ITU_MATERIALS)}"
+            )
+        if not itu and not bsdf.get("type", "").endswith("radio-material"):
+            continue
+        # Sionna RT leaves the prefix out of the names of materials, too.
+        name = given.removeprefix("mat-") or (f"itu_{itu}" if itu else f"material of line {lines[bsdf]}")
+        xml = _radio_xml(bsdf, itu, root.get("version", "2.1.0"))
+        names = _COPY.sub("", name), name
+        fits = next((n for n in names if known.setdefault(n, RadioBsdf(n, xml, place)).xml == xml), None)
+        if fits is None:
+            other = known[name].place.removeprefix(f"{called}:")
+            raise AssetError(
+                f"{place} and that of line {other} are both {name!r} to the ray tracer, with other "
+                "properties; give one of them another id"
+            )
+        found[bsdf] = known[fits]
+    return found
+
+
+# The number of a copy: itu_concrete.001.
+_COPY = re.compile(r"\.\d{3,}$")
+
+
+def _radio_xml(bsdf: ElementTree.Element, itu: str, version: str) -> str:
+    """Mitsuba's element of a material with radio constants, without id and colours."""
+    kind = bsdf.get("type", "")
+    made = ElementTree.Element("bsdf", version=version, type="itu-radio-material" if itu else kind)
+    # Of a material for cameras, whose id says what it is made of, the thickness alone is for radio waves.
+    cameras = itu and kind != "itu-radio-material"
+    for part in bsdf:
+        name = part.get("name")
+        if name == "thickness" if cameras else part.tag != "rgb" and not (itu and name == "type"):
+            made.append(part)
+    if itu:
+        ElementTree.SubElement(made, "string", name="type", value=itu)
+    for part in made.iter():
+        part.tail = part.text = None
+    return ElementTree.tostring(made, "unicode")
 
 
 def _shape(
     where: str,
     folder: Path,
     element: ElementTree.Element,
-    defaults: Mapping[str, str],
     materials: Mapping[str, ElementTree.Element],
+    radio: Mapping[ElementTree.Element, RadioBsdf],
 ) -> SceneryShape:
     given = element.get("id") or element.get("name") or ""
     if element.get("type") != "ply":
@@ -270,33 +371,23 @@ def _shape(
     filename = element.find("string[@name='filename']")
     if filename is None or not filename.get("value"):
         raise AssetError(f"{where} names no file; give it <string name='filename' value='meshes/….ply'/>")
-    mesh = _mesh_file(where, folder, _resolved(where, filename.get("value", ""), defaults))
+    mesh = folder / PurePosixPath(filename.get("value", ""))
+    if not mesh.is_file():
+        raise AssetError(f"{where}: mesh {mesh} is missing; put it there, or remove the shape")
     transform = element.find("transform[@name='to_world']")
     material = _material_of(where, element, materials)
     return SceneryShape(
         # Sionna RT leaves the prefix out of the names of objects, too.
         name=(given or mesh.stem).removeprefix("mesh-"),
         file=mesh,
-        to_world=np.eye(4) if transform is None else _to_world(where, transform, defaults),
+        to_world=np.eye(4) if transform is None else _to_world(where, transform),
         material="" if material is None else material.get("id", ""),
         itu_material="" if material is None else _itu_material(material),
         material_type="" if material is None else material.get("type", ""),
         place=where,
         colour=None if material is None else _colour(where, material),
+        radio=None if material is None else radio.get(material),
     )
-
-
-def _mesh_file(where: str, folder: Path, name: str) -> Path:
-    relative = PurePosixPath(name)
-    # Other services get the meshes under these names, below a folder of their own.
-    if relative.is_absolute() or ".." in relative.parts:
-        raise AssetError(
-            f"{where} names {name!r}; meshes travel with the description, so give a path below its folder"
-        )
-    mesh = folder / relative
-    if not mesh.is_file():
-        raise AssetError(f"{where}: mesh {mesh} is missing; put it there, or remove the shape")
-    return mesh
 
 
 def _material_of(
@@ -340,31 +431,18 @@ def _itu_material(bsdf: ElementTree.Element) -> str:
     given = bsdf.find("string[@name='type']")
     if bsdf.get("type") == "itu-radio-material" and given is not None:
         return given.get("value", "")
-    # Blender numbers the copies of a material: itu_concrete.001.
     name = re.fullmatch(r"(?:mat-)?itu[_-](.+?)(?:\.\d+)?", bsdf.get("id", ""))
     if name is None:
         return ""
     return name.group(1) if given is None else given.get("value", "")
 
 
-def _resolved(where: str, value: str, defaults: Mapping[str, str]) -> str:
-    """``value`` with every ``$name`` replaced by the description's default of that name."""
-
-    def replace(match: re.Match[str]) -> str:
-        if match.group(1) not in defaults:
-            raise AssetError(f"{where} uses ${match.group(1)}, for which there is no <default>; add one")
-        return defaults[match.group(1)]
-
-    return re.sub(r"\$(\w+)", replace, value)
-
-
-def _to_world(where: str, transform: ElementTree.Element, defaults: Mapping[str, str]) -> Float64Array:
+def _to_world(where: str, transform: ElementTree.Element) -> Float64Array:
     """Product of a transform's steps; each acts after the ones above it."""
     matrix: Float64Array = np.eye(4)
     for step in transform:
-        values = {key: _resolved(where, value, defaults) for key, value in step.attrib.items()}
         try:
-            matrix = _STEPS[step.tag](values) @ matrix
+            matrix = _STEPS[step.tag](step.attrib) @ matrix
         except KeyError as error:
             raise AssetError(
                 f"{where}: <{step.tag}> in to_world lacks {error} or is not supported; "

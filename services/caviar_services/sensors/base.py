@@ -54,7 +54,7 @@ class SensorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     bodies_per_asset: Annotated[
         int, quantity("1", "objects of one mesh that may be in the scene at once", ge=0, le=4096)
-    ] = 64
+    ] = 4096
     bodies: dict[str, Annotated[int, quantity("1", "the same, for one mesh", ge=0, le=4096)]] = {}
     """By asset name, ``objects/car.ply``; the empty name is the box."""
 

@@ -310,9 +310,9 @@ class FlightWorld(TrajectoryWorld):
                         f"{list(limits.high)}, and {limits.kept:.3f} m clear of scenery; choose another point"
                     )
                 if flyer:
-                    flyer.reset(target, flyer.state.yaw)
+                    flyer.reset(target, flyer.state.yaw if command.yaw is None else command.yaw)
                 elif uav:
-                    uav.place(target)
+                    uav.place(target, command.yaw)
 
     def checkpoint(self) -> bytes:
         """The motion of each flown object: it follows from all commands since the episode began."""

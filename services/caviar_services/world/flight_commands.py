@@ -26,9 +26,9 @@ def motion_of(agent: str, command: MotionCommand) -> Motion:
     """
     _check_numbers(agent, command)
     if isinstance(command, WaypointCommand):
-        return Motion(target=command.position, speed=command.speed, at_once=command.at_once)
+        return Motion(target=command.position, speed=command.speed, at_once=command.at_once, yaw=command.yaw)
     if isinstance(command, VelocityCommand):
-        return Motion(velocity=command.velocity)
+        return Motion(velocity=command.velocity, yaw=command.yaw, yaw_rate=command.yaw_rate)
     raise PayloadError(
         f"agent {agent!r} sends {type(command).__name__} to {command.object!r}, which flies as a point; "
         'write dynamics = "quadrotor" for it, or send waypoints or velocities'
@@ -47,9 +47,9 @@ def order_of(agent: str, command: MotionCommand) -> Order:
     """
     _check_numbers(agent, command)
     if isinstance(command, WaypointCommand):
-        return Order(target=command.position, speed=command.speed)
+        return Order(target=command.position, speed=command.speed, yaw=command.yaw)
     if isinstance(command, VelocityCommand):
-        return Order(velocity=command.velocity)
+        return Order(velocity=command.velocity, yaw=command.yaw, yaw_rate=command.yaw_rate)
     if isinstance(command, PathCommand):
         return Order(points=command.points, speed=command.speed)
     norm = math.hypot(*command.orientation)
@@ -65,13 +65,13 @@ def order_of(agent: str, command: MotionCommand) -> Order:
 def _check_numbers(agent: str, command: MotionCommand) -> None:
     values: tuple[float, ...]
     if isinstance(command, VelocityCommand):
-        values = command.velocity
+        values = (*command.velocity, command.yaw or 0.0, command.yaw_rate or 0.0)
     elif isinstance(command, AttitudeCommand):
         values = (*command.orientation, command.thrust)
     elif isinstance(command, PathCommand):
         values = (*chain.from_iterable(command.points), command.speed)
     else:
-        values = (*command.position, command.speed)
+        values = (*command.position, command.speed, command.yaw or 0.0)
     if not all(map(math.isfinite, values)):
         raise PayloadError(f"agent {agent!r} commands {command}, which is not finite; command numbers")
     far = next((place for place in places(command) if max(map(abs, place)) > MAX_COORDINATE_M), None)

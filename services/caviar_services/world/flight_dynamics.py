@@ -39,6 +39,9 @@ STOPPED_BY_GEOFENCE = "stopped-by-geofence"
 # Horizontal speed [m/s] below which an object keeps its yaw.
 _HOVERING = 0.05
 
+# Greatest rate [rad/s] of a heading that is commanded; along its course an object turns at once.
+_TURNING = math.radians(120.0)
+
 # Share of the speed below which what is left along a surface counts as none.
 _STANDSTILL = 0.01
 
@@ -107,6 +110,10 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """On the way to the target [m/s]."""
     at_once: bool = False
     """Whether it is put there before it moves."""
+    yaw: float | None = None
+    """Heading to turn to [rad]; None: that of ``yaw_rate``, and without it along the course."""
+    yaw_rate: float | None = None
+    """[rad/s]"""
 
 
 _HOVER = Motion()
@@ -217,22 +224,47 @@ class Flyer:
             state.motion = wanted
             state.restart()
         state.into_ns += length_ns
-        acceleration = _REST
+        acceleration, turning = _REST, 0.0
         while state.into_ns >= SUB_STEP_NS:
             events.add(self._next().event)
             piece = state.pieces.pop(0)
             state.begin, acceleration = piece.at(_H), piece.acceleration_at(_H)
-            state.begin_yaw = _course(state.begin[1], state.begin_yaw)
+            state.begin_yaw, turning = self._heading(state.begin[1], state.begin_yaw, SUB_STEP_NS)
             state.into_ns -= SUB_STEP_NS
         state.position, state.velocity = state.begin
         if state.into_ns:
             events.add(self._next().event)
             state.position, state.velocity = self._next().at(state.into_ns / 1e9)
             acceleration = self._next().acceleration_at(state.into_ns / 1e9)
-        state.yaw = _course(state.velocity, state.begin_yaw)
-        is_on_course = math.hypot(*state.velocity[:2]) > _HOVERING
-        state.yaw_rate = course_rate(state.velocity, acceleration) if is_on_course else 0.0
+            state.yaw, turning = self._heading(state.velocity, state.begin_yaw, state.into_ns)
+        else:
+            state.yaw = state.begin_yaw
+        if wanted.yaw is None and wanted.yaw_rate is None:
+            is_on_course = math.hypot(*state.velocity[:2]) > _HOVERING
+            turning = course_rate(state.velocity, acceleration) if is_on_course else 0.0
+        state.yaw_rate = turning
         return Counter(events - {""})
+
+    def _heading(self, velocity: Vector, yaw: float, length_ns: int) -> tuple[float, float]:
+        """Yaw [rad] at the end of a time, and the rate of a commanded one [rad/s].
+
+        Args:
+            velocity: At the end [m/s].
+            yaw: At the beginning [rad].
+            length_ns: The time [ns].
+        """
+        motion, seconds = self.state.motion, length_ns / 1e9
+        if motion.yaw is not None:
+            left = math.remainder(motion.yaw - yaw, math.tau)
+            if abs(left) <= _TURNING * seconds:
+                return motion.yaw, 0.0
+            rate = math.copysign(_TURNING, left)
+        elif motion.yaw_rate is not None:
+            rate = max(-_TURNING, min(_TURNING, motion.yaw_rate))
+        else:
+            vx, vy, _ = velocity
+            return (math.atan2(vy, vx) if math.hypot(vx, vy) > _HOVERING else yaw), 0.0
+        return math.remainder(yaw + rate * seconds, math.tau), rate
 
     def _next(self) -> _Piece:
         """The sub-step under way."""
@@ -344,11 +376,6 @@ def _bent(wish: Vector, planes: list[Vector]) -> Vector:
     crease = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     square = dot(crease, crease)
     return _scaled(crease, dot(wish, crease) / square) if square > 1e-12 else _REST
-
-
-def _course(velocity: Vector, yaw: float) -> float:
-    vx, vy, _ = velocity
-    return math.atan2(vy, vx) if math.hypot(vx, vy) > _HOVERING else yaw
 
 
 def _unit(axis: int, sign: float) -> Vector:

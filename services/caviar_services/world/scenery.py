@@ -14,7 +14,6 @@ import importlib.util
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from xml.parsers import expat
 
 import numpy as np
 
@@ -53,9 +52,13 @@ def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
     if not scenery:
         return {}
     xml = scenery_file(scenery)
-    named = _named_in(xml)
-    read_scenery(xml)  # so that an error names the user's file, not a copy at its consumers
-    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in named}}
+    files = read_scenery(xml).files  # errors name the user's file, not a copy at its consumers
+    for name, place in files.items():
+        if not (xml.parent / name).is_file():
+            raise AssetError(
+                f"{place} names {name!r}, and there is no file {xml.parent / name}; put it there"
+            )
+    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in sorted(files)}}
 
 
 def scenery_file(scenery: str) -> Path:
@@ -144,51 +147,6 @@ def _bundled(name: str) -> Path:
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise AssetError(f"sionna-rt has no scene {name!r}; {hint}known: {', '.join(known)}")
     return xml
-
-
-def _named_in(xml: Path) -> list[str]:
-    """Relative names of all files that a Mitsuba XML names, checked to be there."""
-    # A reader of its own beside `read_scenery`, which knows shapes and materials: textures, environment maps
-    # and other files travel with the scene too, whatever element names them.
-    found: list[str] = []
-    defaults: dict[str, str] = {}
-    shape = ""
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal shape
-        if tag in ("shape", "texture", "bsdf", "emitter"):
-            shape = f"<{tag}> {attributes.get('id', '')}".rstrip()
-        place = f"{xml}:{parser.CurrentLineNumber}: {shape or f'<{tag}>'}"
-        if tag == "include":
-            raise AssetError(f"{place}: <include> does not travel; write its content into this file")
-        if tag == "default":
-            defaults[f"${attributes.get('name', '')}"] = attributes.get("value", "")
-        if tag == "string" and attributes.get("name") == "filename":
-            value = attributes.get("value", "")
-            found.append(_checked(defaults.get(value, value), xml.parent, place))
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = start
-    try:
-        parser.Parse(xml.read_bytes(), True)
-    except expat.ExpatError as error:
-        raise AssetError(f"{xml}:{error.lineno}: not well-formed XML: {error}") from error
-    return sorted(set(found))
-
-
-def _checked(name: str, folder: Path, place: str) -> str:
-    path = PurePosixPath(name)
-    if not name or path.is_absolute() or ".." in path.parts:
-        raise AssetError(
-            f"{place} names {name!r}; files of scenery lie beside the XML or below it: move the file "
-            "there and write its relative path"
-        )
-    if not (folder / path).is_file():
-        raise AssetError(
-            f"{place} names {name!r}, and there is no file {folder / path}; put it there or take the shape "
-            "out of the XML"
-        )
-    return str(path)
 
 
 # Side of a grid cell [m].

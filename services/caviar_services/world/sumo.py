@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import cmath
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
@@ -14,20 +16,32 @@ from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.topics.scene import BESIDE_ROAD_PREFIX, SIMULATOR_SAYS_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
 from caviar_services.world.people import People
 from caviar_services.world.sumo_commands import Commanded, carry_out
-from caviar_services.world.sumo_conventions import Heading, Placement, body_pose, heading, object_class
-from caviar_services.world.sumo_process import Simulation, check_file, load_libsumo
+from caviar_services.world.sumo_conventions import (
+    Heading,
+    Placement,
+    body_pose,
+    distance_to_line,
+    heading,
+    object_class,
+)
+from caviar_services.world.sumo_inputs import Inputs, checked_inputs
+from caviar_services.world.sumo_process import Simulation, load_libsumo
 from caviar_services.world.sumo_states import TrafficStates
 from caviar_services.world.sumo_steps import check_spacing, step_length_ms
 
 _NS_PER_MS = 1_000_000
 # A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.
 _JUMP_DEG = 90.0
+
+# Vehicles up to this length [m] turn at a junction with their rear on their own lane or the next.
+_LONG_M = 10.0
 
 # Steps between two reports of progress on the way to a distant instant; a step takes some 0.3 ms.
 _REPORT_EVERY = 1000
@@ -131,6 +145,8 @@ class SumoWorld(World[SumoSettings]):
         self._persons: dict[str, _Kind] = {}
         self._people = People(self._step_ms / 1000.0)
         self._commanded: list[Commanded] = []
+        self._trails: dict[str, list[complex]] = {}
+        self._beside_road: set[str] = set()
         if settings.between_episodes_s is not None:
             check_spacing(settings.between_episodes_s, self._step_ms)
         if not settings.net and not settings.config:
@@ -156,15 +172,19 @@ class SumoWorld(World[SumoSettings]):
             ScenarioError: A file is missing or wrong; names file, key and line.
             SetupError: libsumo is not installed.
         """
-        for key in ("net", "config", "routes", "additional"):
-            for file in _tuple(getattr(self.settings, key)):
-                check_file(key, file)
         self._simulation = Simulation(load_libsumo())
         version = self._simulation.api.getVersion()[1]
+        notes = self._inputs.notes
         base = super().prepare(preparation)
         return Prepared(
-            prefixes=base.prefixes, notes=(*base.notes, f"{version}, steps of {self._step_ms} ms")
+            prefixes=base.prefixes, notes=(*base.notes, f"{version}, steps of {self._step_ms} ms", *notes)
         )
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        s = self.settings
+        named = {key: _tuple(getattr(s, key)) for key in ("config", "net", "routes", "additional")}
+        return checked_inputs(named, s.options)
 
     def begin(self, episode: int, seed: int) -> None:
         """Start SUMO with the episode's seed, and run it up to ``begin_s``; where episodes share one traffic,
@@ -190,7 +210,7 @@ class SumoWorld(World[SumoSettings]):
 
     def _begin_here(self, simulation: Simulation) -> None:
         """Count steps from here on; nothing turns, and people are where SUMO has them."""
-        self._steps, self._angles = 0, {}
+        self._steps, self._angles, self._trails = 0, {}, {}
         self._commanded = []
         self._people.clear()
         self._walk(simulation)
@@ -201,8 +221,14 @@ class SumoWorld(World[SumoSettings]):
         Args:
             frame: The frame.
         """
+        self._beside_road.clear()
         made = super().step(frame)
-        return replace(made, counts={**made.counts, **self._people.taken_counts()})
+        counts = {**made.counts, **self._people.taken_counts()}
+        said = self._started().said
+        counts.update({SIMULATOR_SAYS_PREFIX + text: times for text, times in said.items()})
+        counts.update({BESIDE_ROAD_PREFIX + name: 1 for name in sorted(self._beside_road)})
+        said.clear()
+        return replace(made, counts=counts)
 
     def traffic_states(self, seed: int) -> TrafficStates | None:
         """The saved states of the traffic that all episodes share; None where each has its own.
@@ -290,6 +316,7 @@ class SumoWorld(World[SumoSettings]):
                 "before it was started again: its files, or SUMO, have changed; start the run again"
             )
         self._people.taken_counts()  # of frames that were reported
+        simulation.said.clear()
         # Which objects came first follows from all frames before, which are not computed again.
         self._mounts.clear(was.arrived)
 
@@ -314,21 +341,13 @@ class SumoWorld(World[SumoSettings]):
         files = (word for option, names in self._files().items() for word in (option, ",".join(names)))
         return [*files, *self._options(seed)]
 
-    def _files(self) -> dict[str, Sequence[str]]:
-        s = self.settings
-        found = {
-            "--configuration-file": _tuple(s.config),
-            "--net-file": _tuple(s.net),
-            "--route-files": _tuple(s.routes),
-            "--additional-files": _tuple(s.additional),
-        }
-        return {option: names for option, names in found.items() if names}
+    def _files(self) -> Mapping[str, Sequence[str]]:
+        return self._inputs.files
 
     def _options(self, seed: int) -> list[str]:
-        # Warnings too, which are many; what SUMO would leave out is found before (`sumo_process.check_file`).
-        quiet = ["--no-step-log", "--duration-log.disable", "--no-warnings"]
+        quiet = ["--no-step-log", "--duration-log.disable"]
         step = ["--step-length", f"{self._step_ms / 1000:.3f}", "--seed", str(seed)]
-        return [*quiet, *step, *self.settings.options]
+        return [*quiet, *step, *self.settings.options, *self._inputs.switched_off]
 
     def _step(self, simulation: Simulation) -> None:
         api = simulation.api
@@ -368,6 +387,8 @@ class SumoWorld(World[SumoSettings]):
             towards = heading(angle, domain.getSlope(name), self._placement)
             speed = domain.getSpeed(name)
             pose = body_pose(bumper, towards, dimensions[0], dimensions[2], self._placement)
+            if dimensions[0] > _LONG_M:
+                self._follow(name, bumper, angle, dimensions)
             fx, fy, fz = towards.forward
             yield ObjectState(
                 name=self._prefix + name,
@@ -400,6 +421,18 @@ class SumoWorld(World[SumoSettings]):
                 dimensions=dimensions,
                 yaw_rate=turning(body.yaw_rate),
             )
+
+    def _follow(self, name: str, bumper: Vector, angle: float, dimensions: Vector) -> None:
+        """Note a long vehicle whose rear is beside the way that its front has gone: it is one rigid box."""
+        length, width, _ = dimensions
+        front = complex(bumper[0], bumper[1])
+        rear = front - cmath.rect(length, math.radians(90.0 - angle))
+        trail = self._trails.setdefault(name, [rear])
+        trail.append(front)
+        if distance_to_line(rear, trail) > width:
+            self._beside_road.add(self._prefix + name)
+        while len(trail) > 2 and abs(trail[1] - front) > 2 * length:
+            del trail[0]
 
     def _yaw_rate(self, vehicle: str, angle: float) -> float:
         """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. One that SUMO puts

@@ -8,6 +8,8 @@ from +x.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler
@@ -141,3 +143,22 @@ def object_class(type_id: str, vehicle_class: str, chosen: dict[str, str]) -> st
         if key in chosen:
             return chosen[key]
     return _CLASS_OF.get(vehicle_class, "car")
+
+
+def distance_to_line(point: complex, line: Sequence[complex]) -> float:
+    """Distance of a place from a line of straight pieces, both as x + jy [m].
+
+    Args:
+        point: The place.
+        line: Ends of the pieces, at least two.
+
+    Example:
+        >>> distance_to_line(5 + 2j, [0j, 10 + 0j, 10 + 10j])
+        2.0
+    """
+    distances = []
+    for start, end in pairwise(line):
+        along = end - start
+        share = ((point - start) * along.conjugate()).real / abs(along) ** 2 if along else 0.0
+        distances.append(abs(point - start - min(max(share, 0.0), 1.0) * along))
+    return min(distances)

@@ -1,42 +1,25 @@
 """The SUMO simulation in this process: starting, stepping, and saying what is wrong.
 
-libsumo is one simulation per process, prints its errors instead of raising them, and ends the
-process on some broken files; so files are looked at first, and its output is caught.
+libsumo is one simulation per process and prints what it warns of, so that its output is caught.
 """
 
 from __future__ import annotations
 
-import io
-import math
 import os
+import re
 import sys
-import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.parsers import expat
 
-from caviar_protocol.errors import RunError, ScenarioError, SetupError
+from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.host import install_command
+from caviar_services.world.sumo_inputs import one_line
 
-_ROOTS = {
-    "net": ("net",),
-    "config": ("configuration", "sumoConfiguration"),
-    "routes": ("routes",),
-    "additional": ("additional", "add", "routes"),
-}
-
-
-# Elements of traffic, and which attribute says when it begins.
-_DEPARTS = {
-    "flow": "begin",
-    "personFlow": "begin",
-    "vehicle": "depart",
-    "trip": "depart",
-    "person": "depart",
-}
+# What differs in warnings of one kind: names, numbers, and reasons with either.
+_PARTICULAR = re.compile(r"'[^']*'|-?\d+(\.\d+)?")
 
 
 def load_libsumo() -> ModuleType:
@@ -54,72 +37,6 @@ def load_libsumo() -> ModuleType:
     return libsumo  # type: ignore[no-any-return]  # an untyped module
 
 
-def check_file(key: str, file: str) -> None:
-    """Check that a file can be what a setting names.
-
-    Args:
-        key: The setting: ``net``, ``config``, ``routes`` or ``additional``.
-        file: Path of the file.
-
-    Raises:
-        ScenarioError: The file is missing, is no XML of this kind, or has traffic out of order; names file,
-            key and line.
-    """
-    path = Path(file)
-    if not path.is_file():
-        raise ScenarioError(
-            f'there is no file {file}; write "file:PATH", relative to the scenario', key=f"settings.{key}"
-        )
-    if path.suffix == ".gz":  # SUMO reads them; what is wrong in one it says itself, where it does not crash
-        return
-    roots: list[str] = []
-    order = _Departures(file, f"settings.{key}")
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if not roots:
-            roots.append(tag)
-        elif key == "routes":
-            order.see(tag, attributes, parser.CurrentLineNumber)
-
-    parser.StartElementHandler = start
-    try:
-        with path.open("rb") as stream:
-            parser.ParseFile(stream)
-    except expat.ExpatError as error:
-        raise ScenarioError(f"not well-formed XML: {error}", file, f"settings.{key}", error.lineno) from error
-    if roots[0] not in _ROOTS[key]:
-        raise ScenarioError(
-            f"holds <{roots[0]}>, {key} takes a file with <{_ROOTS[key][0]}>", file, f"settings.{key}"
-        )
-
-
-class _Departures:
-    """Whether a file of routes has its traffic in the order of departure: SUMO leaves out whatever stands
-    after something later, with a warning among many."""
-
-    def __init__(self, file: str, key: str) -> None:
-        self._file, self._key = file, key
-        self._latest, self._of = -math.inf, ""
-
-    def see(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        """Look at one more element. `ScenarioError` where it departs before the one before."""
-        time = attributes.get(_DEPARTS.get(tag, ""))
-        try:
-            departs = float(time or "nan")
-        except ValueError:
-            return  # "triggered", or hours and minutes, which SUMO knows how to read
-        name = f"{tag} {attributes.get('id', '')!r}"
-        if departs < self._latest:
-            text = (
-                f"{name} departs at {departs:g} s, after {self._of} at {self._latest:g} s: SUMO would leave "
-                "it out; sort flows, vehicles and trips by departure"
-            )
-            raise ScenarioError(text, self._file, self._key, line)
-        if departs > self._latest:
-            self._latest, self._of = departs, name
-
-
 class Simulation:
     """One SUMO simulation at a time.
 
@@ -133,6 +50,8 @@ class Simulation:
 
     def __init__(self, libsumo: ModuleType) -> None:
         self.api: Any = libsumo
+        self.said = Counter[str]()
+        """What SUMO warned of since it was read last, by kind: names and numbers are left out."""
         self._running = False
 
     def start(self, arguments: Sequence[str]) -> None:
@@ -148,21 +67,22 @@ class Simulation:
         self.close()
         if self.api.isLoaded():
             raise SetupError(
-                "libsumo already runs a simulation in this process and has room for one; "
-                "run this world as a process of its own: caviar service NAME"
+                "libsumo already runs a simulation in this process and has room for one; run this world as a "
+                "process of its own (caviar service NAME), and workers of Dask with --nthreads 1"
             )
+        printed: list[str] = []
         try:
-            with _caught_stderr() as output:
+            with _caught_stderr(printed):
                 self.api.start(["sumo", *arguments])
-        except self.api.TraCIException as error:
-            said = output.getvalue().strip() or str(error)
+        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
+            said = " ".join(printed).strip() or str(error)
             raise SetupError(
-                f"SUMO does not start: {_one_line(said)}; mend the file or setting it names"
+                f"SUMO does not start: {one_line(said)}; mend the file or setting it names"
             ) from error
         finally:
             # A start that failed may leave a simulation behind, which would refuse the next start.
             self._running = bool(self.api.isLoaded())
-        sys.stderr.write(output.getvalue())
+        self._note(printed)
 
     def step(self) -> None:
         """Simulate one step.
@@ -170,12 +90,25 @@ class Simulation:
         Raises:
             RunError: SUMO stops; has its own words.
         """
+        printed: list[str] = []
         try:
-            self.api.simulationStep()
-        except self.api.TraCIException as error:
-            raise RunError(
-                f"SUMO stopped at {self.api.simulation.getTime()} s of its time: {_one_line(str(error))}"
-            ) from error
+            with _caught_stderr(printed):
+                self.api.simulationStep()
+        except (self.api.TraCIException, self.api.FatalTraCIError) as error:
+            # SUMO has closed its simulation where the error is fatal.
+            self._running = bool(self.api.isLoaded())
+            raise RunError(f"SUMO stopped: {one_line(str(error))}") from error
+        if printed:
+            self._note(printed)
+
+    def _note(self, printed: list[str]) -> None:
+        """Count warnings and errors by kind; whatever else was printed meanwhile goes on."""
+        for line in printed:
+            level, colon, text = line.partition(": ")
+            if colon and level in ("Warning", "Error"):
+                self.said[_PARTICULAR.sub("…", text).rstrip(". ")] += 1
+            else:
+                sys.stderr.write(line + "\n")
 
     def close(self) -> None:
         """End the simulation, if one runs."""
@@ -185,23 +118,19 @@ class Simulation:
 
 
 @contextmanager
-def _caught_stderr() -> Iterator[io.StringIO]:
-    """Catch what C++ code writes to standard error meanwhile."""
+def _caught_stderr(lines: list[str]) -> Iterator[None]:
+    """Catch what C++ code writes to standard error meanwhile, as lines."""
     # By its descriptor: code that is not Python does not know `sys.stderr`. A file, not a pipe, which would
-    # block SUMO once it is full.
-    output = io.StringIO()
+    # block SUMO once it is full; in memory, since every step has one.
     sys.stderr.flush()
-    with tempfile.TemporaryFile() as file:
+    with open(os.memfd_create("sumo"), "rb") as file:  # noqa: PTH123 - it has no path
         kept = os.dup(2)
         os.dup2(file.fileno(), 2)
         try:
-            yield output
+            yield
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-            file.seek(0)
-            output.write(file.read().decode(errors="replace"))
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
+            if file.seek(0, os.SEEK_CUR):  # the descriptors share one position
+                file.seek(0)
+                lines += file.read().decode(errors="replace").splitlines()

@@ -19,6 +19,7 @@ from pathlib import Path
 from caviar_protocol.assets import default_folder
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.host import PYTHON
 from caviar_services.world.sumo_process import Simulation, load_libsumo
 
 _REPORT_EVERY = 1000
@@ -111,7 +112,7 @@ class TrafficStates:
         Raises:
             RunError: SUMO stops, or the states cannot be written.
         """
-        command = [sys.executable, "-m", __name__]
+        command = [*PYTHON, "-m", __name__]
         with subprocess.Popen(  # noqa: S603 - our own module
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:

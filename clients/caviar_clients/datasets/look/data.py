@@ -1,4 +1,4 @@
-"""What ``caviar look`` shows of a dataset: users of the catalogue, times, and a sample of the recordings."""
+"""What ``caviar dataset look`` shows of a dataset: users of the catalogue, times, a sample of recordings."""
 
 from __future__ import annotations
 

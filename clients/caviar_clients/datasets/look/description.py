@@ -85,8 +85,8 @@ def _left_out(sample: Sample) -> Iterator[str]:
     number = counted(len(sample.left_out), "recording")
     yield absent(
         f"{number} of the sample cannot be read, and {'is' if len(sample.left_out) == 1 else 'are'} left "
-        "out: remove the folder of such an episode, and the generate command plays it again. caviar verify "
-        "looks at all of them."
+        "out: remove the folder of such an episode, and the generate command plays it again. caviar dataset "
+        "verify looks at all of them."
     )
     shown = [(str(episode), text) for episode, text in sample.left_out[:SHOWN_LEFT_OUT]]
     yield table(("episode", "why"), shown, right=(0,))

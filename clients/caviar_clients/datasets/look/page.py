@@ -114,7 +114,7 @@ def page(data: Dataset, progress: Progress = _quiet, note: Callable[[str], None]
         content = Content(data, catalogue, topics, users, read_sample(data, topics, progress), found, error)
         for text in (impossible_beams(content), _unread(content.sample)):
             if text:
-                note(f"{text}; caviar verify {data.location} says more")
+                note(f"{text}; caviar dataset verify {data.location} says more")
         sections = list[Section]()
         for at, (name, title, make) in enumerate(_SECTIONS):
             some = len(data) or name in ("dataset", "generation")

@@ -9,9 +9,9 @@ import numpy as np
 
 from caviar_clients.datasets.verification.findings import Finding
 from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.space.beams import beam_gains, best_pairs
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Link, Scene
-from caviar_services.link.beam_sweep import best_pairs, sweep
 from caviar_services.link.link_budget import noise_power
 
 BEAM = 1e-9
@@ -59,7 +59,7 @@ def check_beams(
             continue
         _, tx, rx = user
         h, tolerance = matrices[user]
-        abs_y = sweep(h[None], arrays[tx], arrays[rx])[0]
+        abs_y = beam_gains(h[None], arrays[tx], arrays[rx])[0]
         for what, expected, found in _wrong_pairs(link, row, abs_y, tolerance):
             yield Finding(*place, rx, what, expected, found)
 

@@ -96,7 +96,7 @@ def refuse_impossible(catalogue: Catalogue, *, but: tuple[str, ...] = ()) -> Non
         user = f", user {one.user}" if one.user else ""
         raise RecordingError(
             f"{catalogue.path}: {column} of episode {one.episode}{at}{user} is "
-            f"{one.found}, not {one.expected}; caviar verify says all that is wrong"
+            f"{one.found}, not {one.expected}; caviar dataset verify says all that is wrong"
         )
 
 

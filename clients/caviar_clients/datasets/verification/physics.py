@@ -147,6 +147,8 @@ class PhysicsChecks:
             yield from self._sight(pair, scene)
             yield from _paths(pair)
             for c, carrier in enumerate(channel.carriers):
+                if not channel.uses(c, pair.tx, pair.rx):
+                    continue
                 user = carrier.name, channel.tx[pair.tx], pair.user
                 h = recorded.get((c, pair.tx, pair.rx))
                 if h is not None:
@@ -163,7 +165,7 @@ class PhysicsChecks:
                 yield from check_snr(place, scene, link, channel.carriers, self._budget)
 
     def _pairs(self, place: tuple[int, int], scene: Scene, channel: Channel) -> Iterator[Pair]:
-        """All pairs of two devices of the scene."""
+        """All pairs of two devices of the scene that have a carrier in common."""
         antennas: dict[str, Antenna] = {}
         for device in scene.devices:
             if isinstance(device, AntennaDevice) and device.name in (*channel.tx, *channel.rx):
@@ -172,7 +174,8 @@ class PhysicsChecks:
                     antennas[device.name] = Antenna.of(scene, device, self._patterns)
         for t, tx in enumerate(channel.tx):
             for r, rx in enumerate(channel.rx):
-                if tx != rx and tx in antennas and rx in antennas:
+                has_carrier = channel.used is None or channel.used[:, t, r].any()
+                if tx != rx and tx in antennas and rx in antennas and has_carrier:
                     yield pair_of(place, scene, channel, (t, r), (antennas[tx], antennas[rx]))
 
     def _sight(self, pair: Pair, scene: Scene) -> Iterator[Finding]:
@@ -285,7 +288,7 @@ def _line_of_sight(pair: Pair) -> Iterator[Finding]:
     for c, carrier in enumerate(channel.carriers):
         free = element * SPEED_OF_LIGHT / carrier.frequency_hz / (4 * math.pi * distance)
         found = abs(channel.a[c, pair.cut][direct[0]])
-        if free > WEAK and found < free * 10 ** (-GAIN_DB / 20):
+        if channel.uses(c, pair.tx, pair.rx) and free > WEAK and found < free * 10 ** (-GAIN_DB / 20):
             expected = f"{20 * math.log10(free):.2f} dB"
             got = f"{20 * math.log10(found):.2f} dB" if found else "0"
             yield pair.finding(f"gain of the line of sight, {carrier.name}", expected, got)

@@ -168,6 +168,7 @@ static func _device(spec, parent):
 	if spec["kind"] == "antenna":
 		made["role"] = spec["role"]
 		made["power_dbm"] = spec["power_dbm"]
+		made["carriers"] = spec.get("carriers", [])
 		made["array"] = _array(spec["array"])
 	elif spec["kind"] == "lidar":
 		made["beams"] = spec["beams"]

@@ -5,7 +5,7 @@
 const TEXT = """
 # schema: begin
 Scene names:l(s) classes:l(s) assets:l(s) position:a(<f8,N,3) orientation:a(<f8,N,4) velocity:a(<f8,N,3) dimensions:a(<f8,N,3) devices:l(AntennaDevice/LidarDevice/CameraDevice)=[] angular_velocity:a(<f8,N,3)=?
-Channel rung:s options:ChannelOptions={} expected_error_db:f=? carriers:l(Carrier) tx:l(s) rx:l(s) los:a(|b1,T,R) offsets:a(<i8,L1) object_names:l(s)=[] id:a(<u8,P) a:a(<c16,C,P) tau:a(<f8,P) aod:a(<f8,P,2) aoa:a(<f8,P,2) doppler:a(<f8,C,P) interactions:a(|u1,P,D) points:a(<f8,P,D,3) objects:a(<i4,P,D) h:l(ChannelMatrix)=[] dropped:i0=0 hf:l(ChannelResponse)=[] taps:l(ChannelTaps)=[] error_bound_db:a(<f8,T,R)=? error_reference:s=''
+Channel rung:s options:ChannelOptions={} expected_error_db:f=? carriers:l(Carrier) tx:l(s) rx:l(s) los:a(|b1,T,R) offsets:a(<i8,L1) object_names:l(s)=[] id:a(<u8,P) a:a(<c16,C,P) tau:a(<f8,P) aod:a(<f8,P,2) aoa:a(<f8,P,2) doppler:a(<f8,C,P) interactions:a(|u1,P,D) points:a(<f8,P,D,3) objects:a(<i4,P,D) h:l(ChannelMatrix)=[] dropped:i0=0 hf:l(ChannelResponse)=[] taps:l(ChannelTaps)=[] error_bound_db:a(<f8,T,R)=? error_reference:s='' used:a(|b1,C,T,R)=?
 Lidar object_names:l(s) scans:l(LidarScan)
 Camera images:l(CameraImage)
 Depth images:l(DepthImage)
@@ -50,13 +50,13 @@ DepthImage sensor:s intrinsics:Intrinsics position:t3(f) orientation:t4(f) depth
 SegmentationImage sensor:s intrinsics:Intrinsics position:t3(f) orientation:t4(f) object:a(<i4,H,W) material:a(<i4,H,W)=?
 Asset name:p digest:d size:i0
 GeometryChange frame:i0 assets:l(Asset)=[]
-AntennaDevice:antenna name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] role:e(tx,rx,both) array:AntennaArray={} power_dbm:f=0.0
+AntennaDevice:antenna name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] role:e(tx,rx,both) array:AntennaArray={} power_dbm:f=0.0 carriers:l(s)=[]
 LidarDevice:lidar name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] beams:i1..1024=64 azimuth_steps:i1..36000=1800 elevation_min:f=-0.4363323129985824 elevation_max:f=0.05235987755982989 max_range:f<0=100.0 min_range:f0=0.0
 CameraDevice:camera name:s parent:s='' position:t3(f)=[0.0,0.0,0.0] orientation:t4(f)=[1.0,0.0,0.0,0.0] width:i1..8192=640 height:i1..8192=480 field_of_view:f<0=1.5707963267948966
 Intrinsics fx:f fy:f cx:f cy:f
 BeamChoice:beam tx:s rx:s tx_beam:i0 rx_beam:i0=0 carrier:s=''
-WaypointCommand:waypoint object:s position:t3(f) speed:f<0 at_once:b=false
-VelocityCommand:velocity object:s velocity:t3(f)
+WaypointCommand:waypoint object:s position:t3(f) speed:f<0 at_once:b=false yaw:f=?
+VelocityCommand:velocity object:s velocity:t3(f) yaw:f=? yaw_rate:f=?
 UserSchedule:schedule tx:s rx:s
 PathCommand:path object:s points:l(t3(f)) speed:f<0
 AttitudeCommand:attitude object:s orientation:t4(f) thrust:f0

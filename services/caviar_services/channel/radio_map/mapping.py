@@ -251,17 +251,18 @@ def _height_over(triangle: Float64Array, x: Float64Array, y: Float64Array) -> Fl
     return np.where(inside, a[2] + s * uz + t * vz, -np.inf)
 
 
-def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
-    """The transmitters of a scene.
+def transmitters_of(scene: Scene, where: str, carrier: str) -> list[AntennaDevice]:
+    """The transmitters of a scene that use a carrier.
 
     Args:
         scene: The scene.
         where: Where it is from, for errors.
+        carrier: Name of the carrier.
 
     Raises:
         RunError: It has no transmitter, or one of dual polarization or with several panels.
     """
-    found = list(antennas(scene, "tx"))
+    found = [device for device in antennas(scene, "tx") if device.uses(carrier)]
     for device in found:
         if not device.array.is_uniform:
             raise RunError(
@@ -270,7 +271,8 @@ def transmitters_of(scene: Scene, where: str) -> list[AntennaDevice]:
             )
     if not found:
         raise RunError(
-            f'{where} has no transmitter; give a device of [[devices]] the role "tx", or choose another frame'
+            f"{where} has no transmitter on carrier {carrier!r}; give a device of [[devices]] the role "
+            '"tx", or choose another frame or carrier'
         )
     return found
 
@@ -394,7 +396,7 @@ def radio_map(
     While another transmitter serves other cells with beams of its codebook, it interferes with each of these
     in turn: in the mean over a unitary codebook, that is the gain of one element.
     """
-    devices = transmitters_of(scene, "the scene")
+    devices = transmitters_of(scene, "the scene", channel.run.carriers[carrier].name)
     rt, s = channel.scene, channel.settings
     shooting = Shooting(
         samples=-(-samples // part) * part,  # whole parts
@@ -408,6 +410,7 @@ def radio_map(
         scattering=s.scattering,
     )
     # One carrier at a time: materials of the scene have those constants that it is tuned to.
+    rt.make_room(scene, frozenset(s.without_body))
     rt.place(scene, frozenset(s.without_body))
     rt.tune(carrier)
     gain, interference, chosen, rays = [], [], [], []

@@ -1,4 +1,4 @@
-"""How many bodies moving objects may have, of which meshes and materials, also when meshes come later."""
+"""Bodies that stand for moving objects, by mesh and material; more are made when objects or meshes come."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _LaterMeshes:
-    """Meshes that came while the run goes on, and the bodies that there are for them."""
+    """Meshes that came while the run goes on, and the bodies that were made since its beginning."""
 
     meshes: Mapping[str, Mesh] = field(default_factory=dict)
     """By asset."""
@@ -54,7 +54,7 @@ class BodyPool:
 
     Args:
         assets: Files of the run by name; the meshes of objects among them.
-        pool: How many bodies there are of each asset; an empty asset is the box.
+        pool: How many bodies of each asset there are at first; an empty asset is the box, 0 forbids any.
         keys: Key of the scenario that says how many, by asset, for errors.
         objects: Materials of objects that differ from the others.
         own: Materials that meshes name in their files, by asset (`own_materials`).
@@ -135,7 +135,9 @@ class BodyPool:
         )
 
     def make_room(self, scene: Scene, solid: Sequence[int]) -> bool:
-        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+        """Make bodies where a frame has more objects of a kind than there are bodies.
+
+        A mesh of the beginning whose pool is 0 gets none: `assign` refuses its objects.
 
         Args:
             scene: The scene of a frame.
@@ -144,10 +146,12 @@ class BodyPool:
         Returns:
             Whether there are other bodies than before.
         """
-        later = self._later
-        # Boxes stand in for meshes that are not there, beside those of objects that have none.
-        mine = {self._body_of(scene, i) for i in solid if is_mesh_name(scene.assets[i])}
-        needed = Counter(key for i in solid if (key := self._body_of(scene, i)) in mine)
+        later, asset_of = self._later, scene.assets
+        needed = Counter(self._body_of(scene, i) for i in solid)
+        # Bodies that a mesh came for are made whatever the pools are; boxes stand in where it is not there.
+        came = {self._body_of(scene, i) for i in solid if is_mesh_name(asset_of[i])}
+        for key in [k for k in needed if k not in came and not self._first.counts.get(body_kind(*k))]:
+            del needed[key]
         short = any(n > self._now.counts.get(body_kind(*key), 0) for key, n in needed.items())
         if not later.changed and not short:
             return False
@@ -160,7 +164,7 @@ class BodyPool:
         return True
 
     def _with_room(self, room: Mapping[tuple[str, str], int]) -> _Bodies:
-        """The bodies of the beginning, and those for meshes that came later."""
+        """The bodies of the beginning, and those made since, which come last of their material."""
         first, later = self._first, self._later.meshes
         counts, meshes = dict(first.counts), dict(first.meshes)
         of_material = {m: [*bodies] for m, bodies in first.of_material.items()}

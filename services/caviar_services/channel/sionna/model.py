@@ -37,7 +37,7 @@ from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
 from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, scene_of
-from caviar_services.channel.sionna.settings import SionnaSettings, contributing
+from caviar_services.channel.sionna.settings import SionnaSettings, contributing, transmits
 from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
@@ -210,8 +210,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             notes += tuple(f"foliage {brief}" for brief in self.foliage.briefs)
         self._names, self._outside = scene.names, scene.outside
         notes += tuple(use.note(self.run.carriers[use.carrier].name) for use in self._outside)
-        if scene.far_note:
-            notes += (scene.far_note,)
+        notes += scene.notes
         if scene.detail_effect is not None:
             notes += (scene.detail_effect.note,)
             self._detail = scene.detail_effect.brief
@@ -233,6 +232,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         moving = meshes or any(device.on for device in self.run.devices)
         self._enumerates = s.enumerates(moving)
         switched = self._make_finder()
+        if self._launched.refraction:
+            frequencies = tuple(carrier.frequency_hz for carrier in self.run.carriers)
+            surfaces = self._scene.used_surfaces().materials
+            through = {
+                surface.name for surface in surfaces if transmits(surface, self._launched, frequencies)
+            }
+            notes += self._scene.closed_walls(through)
         return (*notes, *self._finder.notes, *switched, *self._warm_up())
 
     def _make_finder(self, before: PathFinder | None = None) -> tuple[str, ...]:
@@ -270,12 +276,13 @@ class SionnaChannel(PathModel[SionnaSettings]):
         self.run.progress("meshes loaded", 0.0)
 
     def _make_room(self, scene: Scene) -> None:
-        """Make bodies for objects whose meshes came while the run goes on, where there are too few."""
-        self._scene.make_room(scene, frozenset(self.settings.without_body))
+        """Make bodies where there are too few for the objects of a scene."""
+        if self.settings.follow is None:  # what is followed is known by the bodies that there are
+            self._scene.make_room(scene, frozenset(self.settings.without_body))
         # Also where another model that shares the scene has made them.
         if self._scene.bodies_version != self._bodies_version:
             # Kernels may have to be compiled for them, which the first trace does.
-            self.run.progress("making bodies of new meshes", COMPILE_GRACE_S)
+            self.run.progress("making more bodies", COMPILE_GRACE_S)
             self._bodies_version = self._scene.bodies_version
             self._make_finder(self._finder)
             self._names, self._outside = self._scene.names, self._scene.outside

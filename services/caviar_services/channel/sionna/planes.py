@@ -240,16 +240,22 @@ def _in_order(label: Int64Array) -> Int32Array:
     return rank[inverse.reshape(-1)]
 
 
-def shared_planes(table: PlaneTable, count: int) -> Int64Array:
+# [m]; of two faces in about one plane rays meet the one that lies above the other by more than this.
+_ABOVE = 2e-4
+
+
+def shared_planes(table: PlaneTable, material: Int64Array) -> Int64Array:
     """Number of the infinite plane that each plane of a table is a part of, Shape ``[P]``.
 
     The first planes, which stand still, share one where they agree to a grid of 1e-4 in the
-    normal and 1 mm in the offset: the walls of a row of houses reflect as one. The others are on their own.
+    normal and 1 mm in the offset: the walls of a row of houses reflect as one. Different materials share one
+    only where rays cannot tell which lies above the other. The others are on their own.
 
     Args:
         table: Planes of faces.
-        count: How many stand still.
+        material: Number of the material of each plane that stands still, Shape ``[S]``.
     """
+    count = len(material)
     if not count:
         return np.arange(len(table.normal))
     normal, middle = table.normal[:count], (table.low[:count].min(0) + table.high[:count].max(0)) / 2
@@ -260,9 +266,33 @@ def shared_planes(table: PlaneTable, count: int) -> Int64Array:
     cells = np.round(np.column_stack([normal * 1e4, offset * 1e3])).astype(np.int64)
     flat = np.flatnonzero((normal != 0).any(1))
     label = np.arange(len(table.normal))
-    _, first, inverse = np.unique(cells[flat], axis=0, return_index=True, return_inverse=True)
-    label[flat] = flat[first][inverse.reshape(-1)]
+    _, cell = np.unique(cells[flat], axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    label[flat] = _apart_by_material(table, flat, cell, offset, material)
     return _in_order(label).astype(np.int64)
+
+
+def _apart_by_material(
+    table: PlaneTable, flat: Int64Array, cell: Int64Array, offset: Float64Array, material: Int64Array
+) -> Int64Array:
+    """For each of the planes ``flat``, one of its cell that it shares its plane with: any, unless a plane of
+    another material lies above or below it there, by a gap that rays resolve."""
+    order = np.lexsort((offset[flat], cell))
+    begins = _begins(cell[order])
+    first = np.flatnonzero(begins)
+    least, most = (reduce.reduceat(material[flat[order]], first) for reduce in (np.minimum, np.maximum))
+    starts, ends = first, np.append(first[1:], len(order))
+    for start, end in zip(starts[least < most], ends[least < most], strict=True):
+        planes = flat[order[start:end]]
+        low, high, of = table.low[planes], table.high[planes] + _RIM, material[planes]
+        for gap in np.flatnonzero(np.diff(offset[planes]) > _ABOVE) + 1:
+            touch = (low[:gap, None] <= high[None, gap:] + _RIM) & (
+                low[None, gap:] <= high[:gap, None] + _RIM
+            )
+            begins[start + gap] = (touch.all(2) & (of[:gap, None] != of[None, gap:])).any()
+    found = np.empty_like(flat)
+    found[order] = flat[order][np.flatnonzero(begins)[np.cumsum(begins) - 1]]
+    return found
 
 
 class PlaneTable:
@@ -410,7 +440,7 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
     count = int(numbers.max(initial=-1)) + 1
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if float(np.einsum("fc,fc->", corners[:, 0] - corners.mean((0, 1)), normal)) <= 0 or not _is_closed(mesh):
+    if float(np.einsum("fc,fc->", corners[:, 0] - corners.mean((0, 1)), normal)) <= 0 or not is_closed(mesh):
         return np.ones(count, np.bool_)
     # Two parts of one plane may face each other's back.
     order = np.argsort(-np.einsum("fc,fc->f", normal, normal), kind="stable")
@@ -422,7 +452,12 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
     return two_sided
 
 
-def _is_closed(mesh: Mesh) -> bool:
+def is_closed(mesh: Mesh) -> bool:
+    """Whether a mesh encloses a volume, with all normals to one side.
+
+    Args:
+        mesh: Any.
+    """
     extent = float(np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else 0.0
     if extent == 0:
         return False

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.errors import PayloadError
-from caviar_protocol.geometry import is_mesh_name
+from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
@@ -41,6 +40,7 @@ from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
+    ItuMaterial,
     MaterialPolicy,
     ObjectMaterials,
     OutsideUse,
@@ -54,17 +54,17 @@ from caviar_services.channel.sionna.scene_loading import (
     bounds,
     by_material,
     counting_centre,
-    file_meshes,
-    file_vertices,
+    file_pieces,
     floats,
     itu_materials,
-    loaded,
     mi_mesh,
     near_middle,
+    new_scene,
     object_materials,
     set_materials,
     with_detail,
 )
+from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
 from caviar_services.mesh.scenery import find_scenery
 from caviar_services.mesh.shapes import Mesh, placed, unit_box
@@ -112,7 +112,7 @@ class SionnaScene(NumberedTriangles):
 
     Args:
         assets: Files of the run by name: scene description, its meshes, and meshes of objects.
-        pool: How many bodies there are of each asset; an empty asset is the box.
+        pool: How many bodies of each asset there are at first; an empty asset is the box, 0 forbids any.
         settings: Materials, edges and detail.
 
     Raises:
@@ -125,27 +125,23 @@ class SionnaScene(NumberedTriangles):
 
         self._settings = settings
         self.bodies_version = 0
-        """Counts how often bodies were made anew, for meshes that came while the run goes on."""
+        """Counts how often bodies were made anew while the run goes on."""
         self._rt_objects: list[tuple[Shape, Any]] = []
-        bodied = any(pool.values())
-        skins = self._skins = [
-            itu_material(_SKIN_NAME, settings.body_material, frequency, settings.materials, _OTHER_SKIN)
-            for frequency in settings.frequencies_hz
-            if bodied
-        ]
-        description = find_scenery(assets)
-        files = {} if description is None else file_vertices(description)  # says what is wrong with a file
-        self._scene = loaded(description)
-        self._objects, self._foliage = settings.objects, settings.foliage
-        meshes = file_meshes(self._scene, files)
-        self.foliage_meshes = {name: meshes.pop(name) for name in list(meshes) if self._foliage.of(name)}
-        """Pieces of scenery that are foliage, by name; no shape has them."""
-        self._scenery = frozenset(meshes)
-        made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         own = own_materials(assets)
+        skins = self._skins = self._skin_materials(pool, settings, own)
+        description = find_scenery(assets)
+        pieces, self.notes = file_pieces(description)
+        """Warnings for the user about the scenery."""
+        self._scene = new_scene(piece.material for piece in pieces.values())
+        self._objects, self._foliage = settings.objects, settings.foliage
+        leaves = [name for name in pieces if self._foliage.of(name)]
+        self.foliage_meshes = {name: pieces.pop(name).mesh for name in leaves}
+        """Pieces of scenery that are foliage, by name; no shape has them."""
+        self._scenery = frozenset(pieces)
+        made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         made = self._made = self._with_materials_of_meshes(made, set(own.values()))
         changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
-        full = by_material(self._scene, meshes, changed)
+        full = by_material(pieces, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = bounds(shapes)
@@ -161,7 +157,8 @@ class SionnaScene(NumberedTriangles):
         self._moving = self._body_shapes()
         self._shapes = [*shapes, *self._moving]
         # The note names the piece that is so far from the others that the ray tracer is coarse there.
-        centre, self.far_note = counting_centre(shapes)
+        centre, far_note = counting_centre(shapes)
+        self.notes += (far_note,) if far_note else ()
         super().__init__(
             self._shapes,
             self._replace_shapes(centre),
@@ -170,12 +167,38 @@ class SionnaScene(NumberedTriangles):
             centre,
             len(self._moving),
         )
+        self.notes += coinciding_materials(shapes, self.plane_of[: self._first_moving])
         self.edges: SceneEdges | None = None
         """None where nothing is diffracted."""
         if settings.edges:
             self.edges = SceneEdges(self, self.unit_meshes, settings.free_edges)
         set_materials(self._scene, settings.frequencies_hz[0], settings.materials, made)
         self._set_carriers()
+
+    def _skin_materials(
+        self, pool: Mapping[str, int], settings: SceneSettings, own: Mapping[str, str]
+    ) -> list[ItuMaterial]:
+        """The material of bodies without one of their own, on each carrier; none without bodies."""
+        self._skin_error: ScenarioError | None = None
+        """Why no object may have `body_material`; None: objects may."""
+        policy = settings.materials
+        if not any(pool.values()):
+            return []
+        try:
+            return [
+                itu_material(_SKIN_NAME, settings.body_material, frequency, policy, _OTHER_SKIN)
+                for frequency in settings.frequencies_hz
+            ]
+        except ScenarioError as error:
+            # Meshes of objects are of it for sure where none names a material; of boxes, and of objects
+            # with a material of their own, nothing may be made of it.
+            if not settings.objects.by_key and any(mesh and mesh not in own for mesh in pool):
+                raise
+            self._skin_error, policy = error, replace(policy, outside="nearest")
+        return [
+            itu_material(_SKIN_NAME, settings.body_material, frequency, policy)
+            for frequency in settings.frequencies_hz
+        ]
 
     def _set_carriers(self) -> None:
         """Note what materials have on each carrier, and which are used where they are not defined."""
@@ -192,8 +215,9 @@ class SionnaScene(NumberedTriangles):
             found = itu_materials(self._scene, frequency, settings.materials)
             used = [(material.name, itu, constants) for material, itu, constants in found]
             tuned = [(material, constants) for material, _, constants in found]
-            if skins:
+            if skins and self._skin_error is None:
                 used.append((_SKIN_NAME, skins[carrier], skins[carrier].constants))
+            if skins:
                 tuned.append((self._skin, skins[carrier].constants))
             used += [(name, of.itu[carrier], of.constants[carrier]) for name, of in made.items() if of.itu]
             tuned += [(of.radio, of.constants[carrier]) for of in made.values()]
@@ -262,6 +286,15 @@ class SionnaScene(NumberedTriangles):
             has_edges=self.edges is not None and len(self.edges) > 0,
         )
 
+    def closed_walls(self, transparent: Collection[str]) -> tuple[str, ...]:
+        """Warnings of closed thin walls, each face of which is a slab.
+
+        Args:
+            transparent: Names of the materials (`used_surfaces`) that waves go through.
+        """
+        ids = {shape.id for shape in self._at_rest if _material_name(shape) in transparent}
+        return closed_walls(self._at_rest, self.part_of[: self._first_moving], ids)
+
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
         """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
@@ -314,7 +347,7 @@ class SionnaScene(NumberedTriangles):
         self._pool.use_meshes(meshes)
 
     def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
-        """Make bodies for objects with meshes that came while the run goes on, where there are too few.
+        """Make bodies where there are too few for the objects of a scene.
 
         Then `bodies_version` is another, and what was made of the bodies before is of no use.
 
@@ -322,12 +355,11 @@ class SionnaScene(NumberedTriangles):
             scene: The scene of a frame.
             without_body: Classes of objects that waves pass through.
         """
-        if not self._pool.awaits_meshes and not any(map(is_mesh_name, scene.assets)):
-            return
         if self._pool.awaits_meshes:  # before bodies are: where a material is refused, nothing has changed
             self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
         if not self._pool.make_room(scene, self._solid(scene, without_body)):
             return
+        self._skins = self._skins or self._skin_materials({"": 1}, self._settings, {})
         self._moving = self._body_shapes()
         self._shapes = [*self._at_rest, *self._moving]
         version, ids = self.version, self._replace_shapes(self.centre)
@@ -367,9 +399,14 @@ class SionnaScene(NumberedTriangles):
 
         Raises:
             PayloadError: The pool is too small, or an object has the name of a piece of scenery.
+            ScenarioError: An object is of `body_material`, which is not defined at a carrier.
         """
         solid = self._solid(scene, without_body)
-        return self.place_bodies(scene, {i: self._pool.kind(scene, i) for i in solid})
+        kinds = {i: self._pool.kind(scene, i) for i in solid}
+        of_skin = {kind for kind, _ in self._pool.of_material[""]}
+        if self._skin_error is not None and of_skin.intersection(kinds.values()):
+            raise self._skin_error
+        return self.place_bodies(scene, kinds)
 
     def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
         """Objects of a scene that waves meet, by their index."""

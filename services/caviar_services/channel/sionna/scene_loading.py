@@ -1,6 +1,7 @@
 """Scenery in Sionna RT: loaded, given its materials, joined to a shape a material, with the detail asked for.
 
-Faces are as the ray tracer has them, vertices as they stand in the files: it keeps them in float32 only.
+Meshes and descriptions are read by our own readers: Mitsuba takes triangles only, keeps float32, and its
+errors name neither the user's file nor a shape.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -31,11 +33,8 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.drjit_setup import aligned_columns
-from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery
+from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery, world_mesh
 from caviar_services.mesh.shapes import Mesh, unit_box
-
-# By how much of its size a mesh in float32 may differ from its file.
-_SAME_VERTEX = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,65 +47,68 @@ class Shape:
     meshes: list[Mesh]
 
 
-def file_vertices(description: Path) -> dict[str, Float64Array]:
-    """Read the world vertices [m] of a scenery's shapes as they stand in its files, by name.
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A piece of scenery as its files have it."""
+
+    mesh: Mesh
+    """In world coordinates [m]."""
+    material: Any
+    """Of the ray tracer: a `sionna.rt.RadioMaterialBase`."""
+    place: str
+    """Where it stands, for messages: file, line and name."""
+
+
+def file_pieces(description: Path | None) -> tuple[dict[str, Piece], tuple[str, ...]]:
+    """Read the pieces of scenery, by name, in the order of the description.
 
     Args:
-        description: The scene description.
+        description: The scene description; None: there is none.
+
+    Returns:
+        The pieces, and a warning where meshes without triangles are left out.
 
     Raises:
         AssetError: Names what is wrong with the description, a material or a mesh.
     """
-    vertices = {}
-    shapes = read_scenery(description, asset_name(description)).shapes
-    # As Sionna RT names them: shapes and materials share one space of names there.
-    materials = {shape.material.removeprefix("mat-") for shape in shapes}
-    for shape in shapes:
-        _check_material(shape)
-        if shape.name in materials:
-            raise AssetError(
-                f"{shape.place} has the name of a material, by which the ray tracer cannot tell the two "
-                f"apart; call it something else, such as '{shape.name}-shape'"
-            )
-        turned, moved = shape.to_world[:3, :3], shape.to_world[:3, 3]
-        # Faces are read to be checked: of one that names a vertex that is not there the ray tracer dies.
-        found, _ = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
-        vertices[shape.name] = found @ turned.T + moved
-    return vertices
+    if description is None:
+        return {}, ()
+    pieces, empty = {}, []
+    materials: dict[str, Any] = {}
+    for shape in read_scenery(description, asset_name(description)).shapes:
+        material = _radio_material(shape, materials)
+        mesh = world_mesh(shape)
+        if len(mesh.faces):
+            pieces[shape.name] = Piece(mesh, material, shape.place)
+        else:
+            empty.append(f"{shape.place}, mesh {shape.file.name}")
+    if not empty:
+        return pieces, ()
+    more = f", and {len(empty) - 1} more" if len(empty) > 1 else ""
+    return pieces, (f"{WARNING}{empty[0]}, has no triangles{more}: left out",)
 
 
-def _check_material(shape: SceneryShape) -> None:
-    """Refuse a shape that has nothing to reflect radio waves with."""
-    if not shape.itu_material and not shape.material_type.endswith("radio-material"):
+def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
+    """The ray tracer's material of a shape, of which those that are ``made`` are each made once."""
+    import mitsuba as mi
+
+    if shape.radio is None:
         named = f"material {shape.material!r} of type {shape.material_type!r}"
         raise AssetError(
             f"{shape.place} has {named if shape.material else 'no material'}, of which the ray tracer has no "
             "radio constants; give it one of ITU-R P.2040, such as <bsdf type='itu-radio-material' "
             "id='itu_concrete'><string name='type' value='concrete'/></bsdf>"
         )
-
-
-def file_meshes(scene: Any, vertices: Mapping[str, Float64Array]) -> dict[str, Mesh]:
-    """The meshes of what was loaded, by name, in world coordinates.
-
-    Args:
-        scene: A `sionna.rt.Scene`.
-        vertices: Of `file_vertices`.
-    """
-    meshes = {}
-    for name, item in scene.objects.items():
-        mesh = _mesh_of(item.mi_mesh)
-        meshes[name] = _as_in_file(mesh, vertices[name]) if name in vertices else mesh
-    return meshes
-
-
-def _as_in_file(mesh: Mesh, vertices: Float64Array) -> Mesh:
-    """A mesh with its vertices in float64, unless the ray tracer took others than the file's."""
-    same = vertices.shape == mesh.vertices.shape
-    if same and len(vertices):
-        # Where the ray tracer has other vertices than the file, its own count.
-        same = bool(np.abs(vertices - mesh.vertices).max() <= _SAME_VERTEX * max(np.abs(vertices).max(), 1.0))
-    return Mesh(vertices, mesh.faces) if same else mesh
+    name, xml, place = shape.radio
+    if name not in made:
+        try:
+            with any_frequency():
+                made[name] = mi.load_string(xml.replace("<bsdf ", f"<bsdf id={quoteattr(name)} ", 1))
+        except RuntimeError as error:
+            # Of a traceback the last line says what is wrong.
+            cause = str(error).strip().splitlines()[-1].rpartition("(line 1")[2]
+            raise AssetError(f"{place}: {cause}; correct it") from error
+    return made[name]
 
 
 def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
@@ -119,28 +121,14 @@ def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
     Raises:
         AssetError: There is no such file, or it is no mesh.
     """
-    import mitsuba as mi
-
     if not asset:
         return unit_box()
     path = assets.get(asset)
     if path is None:
         known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
         raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
-    vertices, _ = read_ply(path, f"mesh {asset!r}")
-    try:
-        loaded = _mesh_of(mi.load_dict({"type": "ply", "filename": str(path), "face_normals": True}))
-    except RuntimeError as error:
-        raise AssetError(f"mesh {asset!r} ({path}) cannot be read: {error}") from error
-    return _as_in_file(loaded, vertices)
-
-
-def _mesh_of(shape: Any) -> Mesh:
-    # Its buffers, not `mi.traverse`: San Francisco has 4,735 meshes, and all their parameters take 0.5 s.
-    return Mesh(
-        np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3),
-        np.array(shape.faces_buffer(), np.int32).reshape(-1, 3),
-    )
+    vertices, faces = read_ply(path, f"mesh {asset!r}")
+    return Mesh(vertices, faces.astype(np.int32))
 
 
 def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
@@ -180,35 +168,33 @@ def floats(vertices: Float64Array) -> Any:
     return mi.Float(column)
 
 
-def loaded(description: Path | None) -> Any:
-    """Load the `sionna.rt.Scene` of a description; its materials are frozen.
+def new_scene(materials: Iterable[Any]) -> Any:
+    """Make a `sionna.rt.Scene` without shapes; its materials are frozen.
 
     Args:
-        description: None: an empty scene.
-
-    Raises:
-        AssetError: The ray tracer cannot take it.
+        materials: Of its scenery, a `sionna.rt.RadioMaterialBase` each.
     """
     from sionna.rt import load_scene
 
     # A scene refers to itself. Until one without other references is collected, kernels branch over what is
     # in it too, and are compiled anew.
     gc.collect()
-    try:
-        with any_frequency():
-            # Unmerged: pieces keep their names, and are joined by material afterwards.
-            scene = load_scene(None if description is None else str(description), merge_shapes=False)
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise AssetError(f"{asset_name(description)}: the ray tracer cannot load it: {error}") from error
-    freeze(scene)
+    scene = load_scene()
+    with any_frequency():
+        for material in materials:
+            scene.add(material)
+    for material in scene.radio_materials.values():
+        # No change of the scene's frequency is to change a material.
+        if hasattr(material, "itu_type"):
+            material.frequency_update_callback = None
     return scene
 
 
 @contextmanager
 def any_frequency() -> Iterator[None]:
-    """While a scene is loaded, which Sionna RT does at 3.5 GHz, no material is outside its range.
+    """While a material is made, which Sionna RT does at 3.5 GHz, it is not outside its range.
 
-    The materials then have constants that mean nothing: `freeze` and `set_materials` are to follow.
+    Its constants then mean nothing: `set_materials` is to follow.
     """
     from sionna.rt.radio_materials import itu_material as module
 
@@ -219,17 +205,6 @@ def any_frequency() -> Iterator[None]:
         yield
     finally:
         module.itu_material = evaluate
-
-
-def freeze(scene: Any) -> None:
-    """Let no change of the scene's frequency change a material.
-
-    Args:
-        scene: A `sionna.rt.Scene`.
-    """
-    for material in scene.radio_materials.values():
-        if hasattr(material, "itu_type"):
-            material.frequency_update_callback = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,21 +331,22 @@ def _checked_change(material: Any, name: str, change: MaterialSettings, policy: 
         ) from error
 
 
-def by_material(scene: Any, meshes: Mapping[str, Mesh], changed: Mapping[str, Any]) -> list[Shape]:
-    """Join meshes to one shape a material.
+def by_material(pieces: Mapping[str, Piece], changed: Mapping[str, Any]) -> list[Shape]:
+    """Join pieces to one shape a material.
 
     Args:
-        scene: What was loaded.
-        meshes: Of its pieces, by name.
+        pieces: By name.
         changed: Materials of pieces that are given another one than the scenery's.
     """
     # One shape a material: each further shape costs a millisecond a trace, whatever its size.
     groups: dict[str, Shape] = {}
-    for name, mesh in meshes.items():
-        material = changed.get(name, scene.objects[name].radio_material)
-        group = groups.setdefault(material.name, Shape(f"caviar-scenery-{material.name}", material, [], []))
+    for name, piece in pieces.items():
+        material = changed.get(name, piece.material)
+        # Mitsuba takes no point in the id of a shape.
+        shape = f"caviar-scenery-{material.name.replace('.', '%2E')}"
+        group = groups.setdefault(material.name, Shape(shape, material, [], []))
         group.names.append(name)
-        group.meshes.append(mesh)
+        group.meshes.append(piece.mesh)
     return list(groups.values())
 
 

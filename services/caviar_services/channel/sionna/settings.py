@@ -52,7 +52,7 @@ _SAMPLES = 100_000
 # Rays of a launch of scenery, before the first frame.
 _SCENERY_SAMPLES = 10_000_000
 
-BodyCount = Annotated[int, quantity("1", "moving objects of one mesh at most", ge=0, le=4096)]
+BodyCount = Annotated[int, quantity("1", "bodies of one mesh for moving objects, at first", ge=0, le=4096)]
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
@@ -98,7 +98,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     reflection: bool = True
     """Whether specular reflections count."""
     refraction: bool = False
-    """Whether waves pass through walls."""
+    """Whether waves pass through walls: each face is a slab of its material's thickness, so that a wall is to
+    be one face, not a closed box."""
     diffraction: bool = False
     """Whether edges diffract."""
     free_edges: bool = False
@@ -146,7 +147,8 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     bodies: BodyCount = 32
     pool: dict[str, BodyCount] = msgspec.field(default_factory=dict)
     """Bodies of single meshes where ``bodies`` does not fit, by file name without ending: ``car = 64``;
-    ``box`` for objects without a mesh."""
+    ``box`` for objects without a mesh. A frame with more objects has more bodies made, which takes seconds;
+    0 and ``follow`` refuse it."""
     without_body: tuple[str, ...] = ()
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
@@ -327,7 +329,7 @@ def contributing(
         if not any(material.scattering_coefficient > 0 for material in surfaces.materials):
             off["scattering"] = "no material has a scattering_coefficient above 0"
         if options.refraction and not any(
-            _transmits(material, options, frequencies_hz) for material in surfaces.materials
+            transmits(material, options, frequencies_hz) for material in surfaces.materials
         ):
             levels = ", ".join(_strongest(material, frequencies_hz) for material in surfaces.materials)
             off["refraction"] = f"no ray is ever sent through a material ({levels} at most)"
@@ -346,8 +348,14 @@ def contributing(
     return left, notes
 
 
-def _transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
-    """Whether a ray can be sent through on any carrier at any incidence."""
+def transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
+    """Whether a ray can be sent through a surface on any carrier at any incidence.
+
+    Args:
+        material: Of the surface.
+        options: What is traced.
+        frequencies_hz: Of the carriers [Hz].
+    """
     rough = material.scattering_coefficient**2
     returned = options.reflection * (1 - rough) + options.scattering * rough
     for constants, frequency in zip(material.constants, frequencies_hz, strict=True):

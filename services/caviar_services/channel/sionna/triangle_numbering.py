@@ -75,7 +75,8 @@ class NumberedTriangles:
         self._relative = self._corners - centre
         self.joined: JoinedFaces
         """Which faces are one surface."""
-        self._number_planes(meshes, unit_meshes)
+        material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])
+        self._number_planes(meshes, material, unit_meshes)
         last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
         self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
         self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
@@ -367,8 +368,11 @@ class NumberedTriangles:
         faces = np.concatenate([np.array(count, np.int64) for count in counts])
         self._first_triangles = np.cumsum(faces) - faces
 
-    def _number_planes(self, meshes: Sequence[Mesh], unit_meshes: Mapping[str, Mesh]) -> None:
-        """Number the planes of these pieces; bodies, each of which is a point yet, by their unit meshes."""
+    def _number_planes(
+        self, meshes: Sequence[Mesh], material: Int64Array, unit_meshes: Mapping[str, Mesh]
+    ) -> None:
+        """Number the planes of these pieces, whose materials are numbered; bodies, each of which is a point
+        yet, by their unit meshes."""
         still = len(meshes) - len(self._bodies)
         of_asset = {asset: plane_numbers(mesh) for asset, mesh in unit_meshes.items()}
         numbers = plane_numbers_of(meshes[:still])
@@ -383,7 +387,7 @@ class NumberedTriangles:
         apart.update(self._relative)
         self.part_of = parts.astype(np.int64)
         """Plane face of each triangle, numbered through all objects, of which none share any."""
-        shared = shared_planes(apart, int(counts[:still].sum()))
+        shared = shared_planes(apart, np.repeat(material[:still], counts[:still]))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
         self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())

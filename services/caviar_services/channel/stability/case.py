@@ -1,4 +1,4 @@
-"""Cases of `caviar stability`: definition, comparison of answers, the list of all, running and reporting."""
+"""Cases of `caviar measure stability`: definition, comparison of answers, list, running and reporting."""
 
 from __future__ import annotations
 

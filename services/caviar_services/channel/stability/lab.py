@@ -1,7 +1,7 @@
 """Little worlds made on the spot, and channel models that answer in them.
 
-The cases of `caviar stability` and the tests of physics are made of these: plates for scenery, boxes that
-move, antennas, one frame, its product. `formulas` says what the product should be.
+The cases of `caviar measure stability` and the tests of physics are made of these: plates for scenery, boxes
+that move, antennas, one frame, its product. `formulas` says what the product should be.
 """
 
 from __future__ import annotations

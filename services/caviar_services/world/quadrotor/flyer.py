@@ -128,18 +128,20 @@ class Quadrotor:
             self._gusts.reset(self._noise(-1))
             self.state.gust = self._gusts.state
 
-    def place(self, position: Vector) -> None:
-        """Let it hover elsewhere, with heading, battery and gust as they are.
+    def place(self, position: Vector, yaw: float | None = None) -> None:
+        """Let it hover elsewhere, with battery and gust as they are.
 
         Args:
             position: Its centre [m].
+            yaw: Its heading [rad]; None: as it is.
         """
         was = self.state
-        body = Body(position, _REST, quaternion_from_euler(was.yaw))
+        yaw = was.yaw if yaw is None else yaw
+        body = Body(position, _REST, quaternion_from_euler(yaw))
         self.state = QuadrotorState(
             body=body,
             rotors=self._hover,
-            yaw=was.yaw,
+            yaw=yaw,
             hold=position,
             gust=was.gust,
             energy_j=was.energy_j,
@@ -319,12 +321,18 @@ class Quadrotor:
         return self._pilot.attitude(body, acceleration, state.yaw, rate)
 
     def _turn(self, state: QuadrotorState, wish: Vector, length: float) -> float:
-        """Turn the heading towards the course; gives its rate [rad/s]."""
-        if math.hypot(wish[0], wish[1]) < _COURSE:
+        """Turn the heading as ordered, or towards the course; gives its rate [rad/s]."""
+        order = state.order
+        if order.yaw is not None:
+            wanted = _TURNING * math.remainder(order.yaw - state.yaw, 2.0 * math.pi)
+        elif order.yaw_rate is not None:
+            wanted = order.yaw_rate
+        elif math.hypot(wish[0], wish[1]) < _COURSE:
             return 0.0
-        error = math.remainder(math.atan2(wish[1], wish[0]) - state.yaw, 2.0 * math.pi)
+        else:
+            wanted = _TURNING * math.remainder(math.atan2(wish[1], wish[0]) - state.yaw, 2.0 * math.pi)
         most = math.radians(self._controller.max_yaw_rate_deg_s)
-        rate = max(-most, min(most, _TURNING * error))
+        rate = max(-most, min(most, wanted))
         state.yaw = math.remainder(state.yaw + rate * length, 2.0 * math.pi)
         return rate
 

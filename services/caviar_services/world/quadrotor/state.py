@@ -61,6 +61,10 @@ class Order(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     orientation: UnitQuaternion | None = None
     thrust: float = 0.0
     """With an orientation: over the mass [m/s²]."""
+    yaw: float | None = None
+    """Heading to turn to [rad]; None: that of ``yaw_rate``, and without it along the course."""
+    yaw_rate: float | None = None
+    """[rad/s]"""
 
     @property
     def asked_speed(self) -> float:
