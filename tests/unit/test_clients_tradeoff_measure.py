@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import mmap
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from link_builders import CARRIER, antenna, scene_of
 from msgspec.structs import replace
 
 from caviar_clients.tradeoff.errors import FLOOR_DB, UserChannel, difference, differences, error_fields
-from caviar_clients.tradeoff.ladder import SCATTERING, Setting
-from caviar_clients.tradeoff.report import comparable
+from caviar_clients.tradeoff.ladder import REFERENCES, SCATTERING, Setting
+from caviar_clients.tradeoff.report import _reference, comparable
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_clients.tradeoff.worker import Rung, peak_mib, reset_peak, scattering_materials, seen
 from caviar_protocol.errors import ScenarioError
@@ -182,3 +183,11 @@ def test_rows_are_means_over_the_users_that_both_know() -> None:
     same = error_fields(differences(reference, reference))
     assert (same["nmse_db"], same["path_gain_error_db"]) == (FLOOR_DB, 0.0)
     assert error_fields([])["nmse_db"] is None
+
+
+def test_what_was_measured_is_compared_with_the_finest_of_it() -> None:
+    measured = [
+        SimpleNamespace(setting=SimpleNamespace(label=name)) for name in ("geometric", "siso-rt 1e5 d3")
+    ]
+    assert _reference([*REFERENCES, "geometric"], measured) is measured[1]  # type: ignore[arg-type]
+    assert _reference([*REFERENCES, "geometric"], measured[:1]) is measured[0]  # type: ignore[arg-type]

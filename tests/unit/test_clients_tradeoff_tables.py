@@ -110,7 +110,7 @@ def test_the_front_and_the_answers_are_of_settings_that_had_the_whole_work() -> 
         row("siso-rt d2", 60.0, -3.0),
         row("siso-rt d5", 900.0, -25.0),
         row("mimo-rt", 0.5, -60.0, receivers=2.0),
-        row("siso-rt d5, keyframes", 0.1, -90.0, block="keyframes"),
+        row("siso-rt d5, keyframes", 0.1, -90.0, block="keyframes", note="of 3 scenes"),
         row("spherical 1e6", 2000.0, -200.0),
     )
     assert [r.setting for r in pareto_rows(rows, "spherical 1e6")] == [
