@@ -212,6 +212,25 @@ def undisturbed(node: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[st
         return digest, next(run.out.glob("*/"))
 
 
+THROWS = """import {{ main, World }} from "{library}";
+class Throws extends World {{
+  step() {{ throw new Error("no road is left"); }}
+}}
+await main(new Throws({{ prefixes: ["car"] }}));
+"""
+
+
+def test_a_world_that_throws_ends_with_status_1(node: str, light: Path, tmp_path: Path) -> None:
+    script = tmp_path / "throws.mjs"
+    script.write_text(THROWS.format(library=CLIENT / "src" / "index.mjs"))
+    with (
+        waiting_run(tmp_path, scenario=light) as run,
+        run.agent(node, str(script), run.url, "world") as world,
+    ):
+        assert world.wait(WITHIN_S) == 1
+        assert run.process.wait(WITHIN_S) == 1  # the world had joined: the run ends with it
+
+
 def scenes(directory: Path) -> list[str]:
     """Digests of the scenes of a run, frame by frame."""
     return [product.digest for _, product in Recording(directory).products("scene")]

@@ -238,6 +238,28 @@ def test_a_file_without_a_card_says_what_to_write(tmp_path: Path) -> None:
     assert "takes 'aod' of shape [1, 1], and the scenario's is [1, 2]" in wide
 
 
+def test_a_policy_leaves_other_transmitters_to_a_named_baseline(tmp_path: Path) -> None:
+    second = """[[devices]]
+name = "other"
+kind = "antenna"
+role = "tx"
+position_m = [0.0, 9.0, 20.0]
+array = { columns = 8 }
+"""
+    (tmp_path / "policy.onnx").touch()
+    file = with_policy(tmp_path, more='settings.others = "los-beam"')
+    file.write_text(file.read_text() + second)
+    env = BeamSelectionEnv(file, observe=("aod",), transmitters="bs")
+    assert env.action_space.n == BEAMS
+    export_module(Constant(3), env.observation_space, tmp_path / "policy.onnx", card_of(env))
+    for link in run(load_scenario(file), tmp_path / "run")["link"]:
+        own = link.tx.index("bs")
+        assert link.tx_beam[own] == 3
+        assert link.abs_y[1 - own] == link.baseline_abs_y[1 - own] > 0
+    with pytest.raises(ScenarioError, match="with transmitter mast; there are: uav/rx; transmitters: bs"):
+        BeamSelectionEnv(file, observe=("aod",), transmitters="mast")
+
+
 def test_an_export_that_chooses_otherwise_is_refused(tmp_path: Path) -> None:
     env = BeamSelectionEnv("geometric", observe=("aod",))
     space, file = env.observation_space, tmp_path / "p.onnx"
@@ -277,6 +299,11 @@ def test_the_command_prints_and_writes_the_figures(tmp_path: Path) -> None:
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["frames"]["all"] == 1000
     assert figures["abs_y"]["policy"]["LOS"]["episodes"] == 2
+    mine, its = (figures["episodes"]["abs_y"][m]["NLOS"] for m in ("policy", "optimum"))
+    lacks = np.mean(mine) - np.mean(its)
+    assert figures["policy_minus"]["optimum"]["NLOS"]["mean"] == pytest.approx(lacks)
+    assert lacks < 0
+    assert figures["episodes"]["seeds"] == [1000, 1001]
     assert figures["pilots"]["exhaustive-sweep"] == BEAMS
     assert figures["pilots"]["hierarchical-sweep"] == 12
     left = figures["spectral_efficiency"]

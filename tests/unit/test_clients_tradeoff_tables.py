@@ -13,9 +13,9 @@ from caviar_clients.plots.style import Box, place_labels, spots
 from caviar_clients.tradeoff.campaign import Skipped
 from caviar_clients.tradeoff.errors import Row, error_fields
 from caviar_clients.tradeoff.ladder import REFERENCES
-from caviar_clients.tradeoff.plot import comparable_times, draw_convergence, draw_pareto, pareto_front
-from caviar_clients.tradeoff.report import Options, Point, Report
-from caviar_clients.tradeoff.tables import level, markdown, significant
+from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto, pareto_front
+from caviar_clients.tradeoff.report import Options, Point, Report, answers, pareto_rows
+from caviar_clients.tradeoff.tables import answer_sentences, level, markdown, significant
 
 pytestmark = pytest.mark.slow
 
@@ -103,11 +103,41 @@ def test_factors_stand_beside_the_papers() -> None:
     assert "abacus" in text
 
 
-def test_a_picture_has_the_order_of_the_factors() -> None:
-    """One of two settings was measured while the machine was five times as slow, as its baseline was."""
-    rows = (row("siso-rt 1e5", 100.0, -10.0), row("siso-rt d2", 310.0, -12.0, factor=0.62))
-    made = msgspec.structs.replace(report(), rows=rows)
-    assert [entry.time_ms_median for entry in comparable_times(made)] == [100.0, pytest.approx(62.0)]
+def test_the_front_and_the_answers_are_of_settings_that_had_the_whole_work() -> None:
+    rows = (
+        row("free-space", 1.0, 4.0),
+        row("siso-rt d1", 40.0, -4.0),
+        row("siso-rt d2", 60.0, -3.0),
+        row("siso-rt d5", 900.0, -25.0),
+        row("mimo-rt", 0.5, -60.0, receivers=2.0),
+        row("siso-rt d5, keyframes", 0.1, -90.0, block="keyframes"),
+        row("spherical 1e6", 2000.0, -200.0),
+    )
+    assert [r.setting for r in pareto_rows(rows, "spherical 1e6")] == [
+        "free-space",
+        "siso-rt d1",
+        "siso-rt d5",
+    ]
+    found = answers(rows, "spherical 1e6", [-20.0, -30.0], [0.4, 50.0, 5000.0])
+    assert [answer.setting for answer in found] == [
+        "siso-rt d5",
+        "spherical 1e6",
+        None,
+        "siso-rt d1",
+        "spherical 1e6",
+    ]
+    made = msgspec.structs.replace(report(), rows=rows, answers=found)
+    assert answer_sentences(made) == [
+        "for −20.0 dB: siso-rt d5 (−25.0 dB, 900 ms)",
+        "for −30.0 dB: spherical 1e6 (the reference itself, 2000 ms)",
+        "for 0.4 ms: none; the fastest takes 0.5 ms",
+        "for 50 ms: siso-rt d1 (−4.0 dB, 40 ms)",
+        "for 5000 ms: spherical 1e6 (the reference itself, 2000 ms)",
+    ]
+    text = markdown(made)
+    assert "| siso-rt d1 * | 40 |" in text
+    assert "| siso-rt d2 | 60 |" in text
+    assert "- for 50 ms: siso-rt d1 (−4.0 dB, 40 ms)" in text
 
 
 def test_another_reference_than_the_finest_is_warned_of() -> None:
@@ -115,7 +145,8 @@ def test_another_reference_than_the_finest_is_warned_of() -> None:
     skipped = (Skipped(setting=finest, block="ladder", reason="no answer"),)
     coarser = msgspec.structs.replace(report(), reference="siso-rt 1e6 d3", skipped=skipped)
     assert _other_reference(Options(), coarser) == (
-        f"warning: errors are against 'siso-rt 1e6 d3', since '{finest}' was not measured: no answer"
+        f"warning: errors are against 'siso-rt 1e6 d3', since '{finest}' was not measured: no answer, "
+        "or name one that fits with --reference"
     )
     assert _other_reference(Options(), report()) == ""
     assert _other_reference(Options(reference="siso-rt 1e6 d3"), coarser) == ""

@@ -386,6 +386,19 @@ def test_an_episode_that_is_added_again_replaces_itself(folder: Path, tmp_path: 
     assert (catalogue.episodes(), catalogue.table("products")[1]) == ([], [])
 
 
+def test_seeds_that_follow_each_other_share_no_epochs(folder: Path) -> None:
+    pytest.importorskip("torch")
+    users, orders = caviar.dataset(folder).users(), []
+    for seed in (7, 8, 9):
+        batches = users.torch_batches(len(users), ["episode", "scene", "rx"], shuffle=seed)
+        for batches.epoch in range(3):
+            (batch,) = batches
+            orders.append(
+                tuple(zip(batch["episode"].tolist(), batch["scene"].tolist(), batch["rx"], strict=True))
+            )
+    assert len(set(orders)) == len(orders)
+
+
 def test_a_data_loader_delivers_one_order_with_any_number_of_processes(folder: Path) -> None:
     from torch.utils.data import DataLoader
 

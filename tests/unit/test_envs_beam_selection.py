@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
+import pickle
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -99,6 +101,18 @@ def test_a_seed_repeats_an_episode_in_the_same_environment_and_in_another_one() 
         assert play(env, 50, seed=5) == first
         assert play(other, 50, seed=5) == first
         assert len(set(first[0])) == 50, "the channel is drawn anew every frame"
+
+
+@pytest.mark.parametrize("taken", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])  # noqa: S301
+def test_a_copy_begins_an_episode_of_its_own(taken: Any) -> None:
+    with closing(gymnasium.make("caviar/BeamSelection-v0", scenario="geometric")) as env:
+        env.reset(seed=3)
+        with closing(taken(env)) as other:
+            with pytest.raises(RunError, match=r"call reset\(\)"):
+                other.unwrapped.step(np.int64(0))
+            observation, _ = other.reset(seed=4)
+            env.step(np.int64(0))  # that of the first goes on
+            assert observation["aoa"] == env.reset(seed=4)[0]["aoa"]
 
 
 def test_another_seed_gives_another_episode() -> None:

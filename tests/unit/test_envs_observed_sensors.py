@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from link_builders import given
+from msgspec.structs import replace
 from observation_builders import (
     SCENARIOS,
     antenna_spec,
@@ -19,9 +20,11 @@ from observation_builders import (
 )
 
 from caviar_clients.envs.base import BeamSelectionEnv
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_clients.session.embedded import EmbeddedRun
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.observations import Users, part
-from caviar_protocol.scenario import DeviceSpec, Scenario
+from caviar_protocol.recording import Recording
+from caviar_protocol.scenario import DeviceSpec, Scenario, load_scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.topics import (
     Camera,
@@ -95,6 +98,27 @@ def test_the_grid_is_that_of_the_lidar_that_was_named(scenario: Scenario) -> Non
     assert read(scenario, "lidar_grid", cars(1), given("lidar", without)) is None
 
 
+def test_a_lidar_on_several_objects_gives_each_user_the_grid_of_its_own(scenario: Scenario) -> None:
+    tops = [replace(d, on="car.*", count=3) if d.name == "top" else d for d in scenario.devices]
+    several = replace(scenario, devices=tuple(tops))
+    grids = {n: np.full((1, 1, 1), -n, np.int8) for n in (1, 2)}
+    lidar = Lidar(object_names=(), scans=tuple(scan(f"car.{n}/top", grid) for n, grid in grids.items()))
+    seen = read(several, "lidar_grid", cars(2, 1, 3), given("lidar", lidar))
+    users = Users(several, ("*",)).present(cars(2, 1, 3))
+    wanted = {place: {"car.1": -1, "car.2": -2, "car.3": 0}[pair.rx.parent] for place, pair in users}
+    assert {place: int(seen[place].item()) for place in wanted} == wanted
+    elsewhere = replace(
+        several, devices=tuple(replace(d, on="bus.*") if d.name == "top" else d for d in several.devices)
+    )
+    with pytest.raises(ScenarioError, match=r"'top' is on up to 3 objects 'bus\.\*', of which none carries"):
+        part(elsewhere, Users(elsewhere, ("*",)), "lidar_grid")
+    wide = Lidar(object_names=(), scans=(scan("car.1/top", np.zeros((2, 1, 1), np.int8)),))
+    with pytest.raises(
+        PayloadError, match=r"car\.1/top shows \[2, 1, 1\], and the policy observes \[1, 1, 1\]"
+    ):
+        read(several, "lidar_grid", cars(1), given("lidar", wide))
+
+
 OPTICS: dict[str, Any] = {
     "intrinsics": Intrinsics(fx=1.0, fy=1.0, cx=0.0, cy=0.0),
     "position": (0.0, 0.0, 0.0),
@@ -133,17 +157,13 @@ def test_a_sensor_that_left_is_not_known(scenario: Scenario, name: str) -> None:
     assert read(scenario, name, cars(2)) is None
 
 
-SENSORS = """
+LIDAR = """
 [services.lidar]
 role = "sensors"
 use = "lidar"
 budget_ms = 400
 [services.lidar.settings]
 grid = { minimum_m = [-50, -20, 0], maximum_m = [50, 30, 20], cells = [20, 10, 4] }
-[services.camera]
-role = "sensors"
-use = "camera"
-budget_ms = 400
 [[devices]]
 name = "top"
 kind = "lidar"
@@ -152,6 +172,12 @@ mount = "roof"
 position_m = [0, 0, 0.3]
 beams = 8
 azimuth_steps = 90
+"""
+SENSORS = """
+[services.camera]
+role = "sensors"
+use = "camera"
+budget_ms = 400
 [[devices]]
 name = "wall"
 kind = "camera"
@@ -179,7 +205,9 @@ def test_sensors_are_seen_to_the_last_frame_and_what_is_not_known_is_zeros_hande
     monkeypatch.setattr(TrajectoryWorld, "mesh_classes", lambda world: ("car", "uav"))
     monkeypatch.setattr(TrajectoryWorld, "known_objects", classmethod(lambda *_: None))
     path = tmp_path / "scenario.toml"
-    path.write_text((SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + SENSORS)
+    path.write_text(
+        (SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + LIDAR + SENSORS
+    )
     observe = ("lidar_grid", "camera:wall", "depth:wall", "camera:bird")
     with closing(BeamSelectionEnv(path, observe=observe)) as env:
         seen = [env.reset(seed=1)[0]]
@@ -219,3 +247,40 @@ def test_a_grid_that_is_not_in_the_settings_is_asked_for() -> None:
     )
     with pytest.raises(ScenarioError, match=r"needs \[services\.<lidar>\.settings\.grid\]"):
         part(scenario, Users(scenario, ("*",)), "lidar_grid")
+
+
+@pytest.mark.channel
+def test_a_policy_that_observes_a_lidar_is_served(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("onnx")
+    from caviar_clients.learning.export import card_of, export_module
+
+    class Counted(torch.nn.Module):  # type: ignore[misc]
+        """Beam by the number of cells that are taken."""
+
+        def forward(self, grid: Any, position: Any) -> Any:
+            beam = (grid == 1).sum() % 16 + 0 * position.sum().to(torch.int64)
+            return torch.stack([beam, beam])[None]
+
+    text = (SCENARIOS / "smoke.toml").read_text().replace("frames = 100", "frames = 4") + LIDAR
+    path = tmp_path / "scenario.toml"
+    path.write_text(text)
+    env = BeamSelectionEnv(path, observe=("lidar_grid", "position"))
+    export_module(Counted(), env.observation_space, tmp_path / "p.onnx", card_of(env))
+    served = 'use = "policy"\nsettings.file = "file:p.onnx"'
+    assert 'use = "los-beam"' in text
+    path.write_text(text.replace('use = "los-beam"', served, 1).replace('"scene", ', '"scene", "lidar", ', 1))
+    (tmp_path / "run").mkdir()
+    assert not EmbeddedRun(load_scenario(path), tmp_path / "run").run().error
+    recording = Recording(tmp_path / "run")
+    for lidar, action in zip(recording["lidar"], recording["action"], strict=True):
+        count = int((lidar.scans[0].grid.occupancy == 1).sum())
+        assert count > 0
+        pairs = [c.tx_beam * (2 if c.rx.startswith("car") else 1) + c.rx_beam for c in action.commands]
+        assert pairs[-1] == count % 16
+    alone = load_scenario(path)
+    without = replace(alone, services={n: s for n, s in alone.services.items() if n != "lidar"})
+    (tmp_path / "other").mkdir()
+    error = EmbeddedRun(without, tmp_path / "other").run().error
+    assert "needs topic 'lidar', which no service of the run produces" in error

@@ -62,6 +62,10 @@ def towards(env: UavPathV1Env, target: Sequence[float], position: np.ndarray) ->
     return (way / max(float(np.linalg.norm(way)), STEP_WAY)).astype(np.float32)
 
 
+def test_without_a_scenario_it_is_that_of_the_shipped_flight() -> None:
+    assert gymnasium.make("caviar/UavPath-v1").unwrapped.scenario.run.name == "uav-path"
+
+
 def test_it_keeps_the_rules_that_gymnasium_checks(tmp_path: Path) -> None:
     with flight(tmp_path, town(tmp_path), ("[-2.0, 140.0, 18.0]", "[-90.0, 10.0, 18.0]")) as env:
         check_env(env, skip_render_check=True)

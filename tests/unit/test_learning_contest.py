@@ -185,6 +185,7 @@ def test_the_tables_of_an_evaluation_are_whole_at_80_columns() -> None:
         },
         efficiency=dict.fromkeys(means, Interval(24.17, 0.0251, 20)),
         pilots=dict.fromkeys(means, 6.4),
+        by_episode={},
     )
     console = Console(width=80, record=True, file=io.StringIO())
     for table in _evaluation_tables(made):

@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from caviar_clients.cli.main import app
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.learning.export import export_policy
 from caviar_services.agent.policy import PolicyModel
@@ -56,3 +59,63 @@ def test_ten_thousand_choices_are_those_of_stable_baselines3(algorithm: str, tmp
     wanted = np.array([np.ravel(model.predict(seen, deterministic=True)[0]) for seen in observations])
     assert (found == wanted).all()
     assert len(np.unique(wanted)) > 3, "the network chooses"
+
+
+@pytest.mark.parametrize("keys", [None, pytest.param(["position"], marks=pytest.mark.exhaustive)])
+def test_the_statistics_of_vec_normalize_are_part_of_the_policy(
+    keys: list[str] | None, tmp_path: Path
+) -> None:
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    env = BeamSelectionEnv("geometric", observe=OBSERVED)
+    envs = VecNormalize(DummyVecEnv([lambda: env]), norm_obs_keys=keys, clip_obs=3.0)
+    model = stable_baselines3.PPO("MultiInputPolicy", envs, n_steps=128, seed=1)
+    model.learn(128)
+    export_policy(model, env, tmp_path / "policy.onnx")
+    served = PolicyModel(tmp_path / "policy.onnx")
+    observations = drawn(env)
+    found = np.array([served.act(seen) for seen in observations])
+    rows = {name: np.stack([seen[name] for seen in observations]) for name in observations[0]}
+    seen = envs.normalize_obs(rows)
+    wanted = np.array(
+        [model.predict({n: v[i] for n, v in seen.items()}, deterministic=True)[0] for i in range(len(found))]
+    )
+    assert (found[:, 0] == wanted).all()
+    assert len(np.unique(wanted)) > 3, "the network chooses"
+    model.save(tmp_path / "model.zip")
+    envs.save(str(tmp_path / "statistics.pkl"))
+    names = [str(tmp_path / name) for name in ("model.zip", "again.onnx", "statistics.pkl")]
+    command = ["policy", "export", *names[:2], "--algorithm", "ppo", "--on", "geometric"]
+    asked = CliRunner().invoke(app, command)
+    assert "give --trust if you know who wrote it" in str(asked.exception)
+    if keys is None:  # a normalised rate is negative
+        lost = CliRunner().invoke(app, [*command, "--trust"])
+        assert "outside of its bounds" in str(lost.exception)
+    made = CliRunner().invoke(app, [*command, "--trust", "--normalization", names[2]])
+    assert made.exit_code == 0, made.exception
+    again = PolicyModel(tmp_path / "again.onnx")
+    assert all(again.act(seen) == served.act(seen) for seen in observations[::20])
+
+
+def test_parts_of_sensors_go_into_the_file_with_their_own_types(tmp_path: Path) -> None:
+    class Seen(BeamSelectionEnv):
+        """An environment that shows a grid and a picture, beside what it has."""
+
+        def __init__(self) -> None:
+            super().__init__("geometric", observe=("aod",))
+            own = {
+                "camera": spaces.Box(0, 255, (36, 40, 3), np.uint8),
+                "lidar_grid": spaces.Box(-2, 1, (4, 3, 2), np.int8),
+            }
+            self.observation_space = spaces.Dict({**own, **self.observation_space.spaces})
+
+        def _observation(self, moment: Any) -> Any:
+            return {**self.observation_space.sample(), **super()._observation(moment)}
+
+    env = Seen()
+    model = stable_baselines3.PPO("MultiInputPolicy", env, n_steps=64, seed=1)
+    card = export_policy(model, env, tmp_path / "policy.onnx")
+    served = PolicyModel(tmp_path / "policy.onnx")
+    assert card.observe == ("aod", "camera", "lidar_grid")
+    assert served.types == {"aod": "tensor(float)", "camera": "tensor(uint8)", "lidar_grid": "tensor(int8)"}
+    assert served.inputs["camera"] == (1, 36, 40, 3)

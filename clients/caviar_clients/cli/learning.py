@@ -148,6 +148,12 @@ def export_command(
     on: Annotated[str, typer.Option("--on", help="scenario that it was trained on, by name or file")],
     users: Annotated[str, typer.Option(help="receivers that it serves, with * and ?")] = "*",
     steps: Annotated[int, typer.Option(min=0, help="of training, for the card")] = 0,
+    normalization: Annotated[
+        Path | None, typer.Option(help="statistics of the VecNormalize that it was trained behind")
+    ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="the model is from you: to read it runs what is pickled in it")
+    ] = False,
 ) -> None:
     """Write a trained model as an ONNX policy, with its card, for the agent `policy`."""
     from caviar_clients.envs.base import BeamSelectionEnv
@@ -163,6 +169,11 @@ def export_command(
         ) from error
     if not model.is_file():
         raise ScenarioError(f"{model}: there is no such file; give the zip file that model.save() wrote")
+    if not trust:
+        raise ScenarioError(
+            f"{model} is a model of Stable-Baselines3, and to read one runs the code that is pickled in it; "
+            "give --trust if you know who wrote it"
+        )
     try:
         trained = getattr(stable_baselines3, algorithm.upper()).load(model, device="cpu")
     except Exception as error:  # whatever a file that is no model makes it raise
@@ -179,11 +190,22 @@ def export_command(
         warnings.simplefilter("ignore")
         env = BeamSelectionEnv(on, observe=tuple(spaces), users=users)
     wanted, found = trained.action_space, env.action_space
-    if wanted != found or trained.observation_space != env.observation_space:
+    # Bounds are looked at by `export_policy`, which says what they come from.
+    if wanted != found or _spaces(trained.observation_space) != _spaces(env.observation_space):
         raise ScenarioError(
             f"{model} was trained for actions {wanted} and {_spaces(trained.observation_space)}, and {on} "
             f"has {found} and {_spaces(env.observation_space)}; name scenario and users of its training"
         )
+    if normalization is not None:
+        from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+        try:
+            trained.set_env(VecNormalize.load(str(normalization), DummyVecEnv([lambda: env])))
+        except Exception as error:  # whatever a file that is none makes it raise
+            raise ScenarioError(
+                f"{normalization} cannot be read as statistics of VecNormalize: {error}; give the file that "
+                "its save() wrote"
+            ) from error
     card = export_policy(trained, env, policy, steps=steps or int(trained.num_timesteps))
     typer.echo(f"{policy}: {card.algorithm}, observes {', '.join(card.observe)}, {policy.stat().st_size:,} B")
 
@@ -226,6 +248,7 @@ def evaluate_command(
     for table in _evaluation_tables(made):
         console.print(table)
     if json is not None:
+        played = [seed for seed in chosen for _ in range(episodes)]
         write_json(
             json,
             {
@@ -233,6 +256,12 @@ def evaluate_command(
                 "abs_y": {m: {k: vars(mean) for k, mean in means.items()} for m, means in made.found.items()},
                 "spectral_efficiency": {m: vars(mean) for m, mean in made.efficiency.items()},
                 "pilots": dict(made.pilots),
+                "episodes": {"seeds": played, "abs_y": dict(made.by_episode)},
+                "policy_minus": {
+                    m: {k: vars(made.difference(m, k)) for k in means}
+                    for m, means in made.found.items()
+                    if m != "policy"
+                },
             },
         )
 

@@ -514,11 +514,17 @@ def tradeoff(
         list[str] | None,
         typer.Option(help="ladder, keyframes, spacing, arrays or convergence; by default all"),
     ] = None,
+    error_db: Annotated[
+        list[float] | None, typer.Option(help="name the fastest setting with this NMSE of H [dB], as -20")
+    ] = None,
+    time_ms: Annotated[
+        list[float] | None, typer.Option(help="name the most accurate setting with this time of a scene [ms]")
+    ] = None,
 ) -> None:
     """Compare channel settings: time and error of each over the same scenes."""
     from caviar_clients.cli.measure import trade, tradeoff_options
 
-    options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part)
+    options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part, error_db, time_ms)
     trade(source, frames, options, json, out, _console)
 
 

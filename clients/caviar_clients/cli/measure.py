@@ -178,6 +178,8 @@ def tradeoff_options(
     seeds: int,
     minutes: float,
     parts: Sequence[str] | None,
+    errors_db: Sequence[float] | None = None,
+    times_ms: Sequence[float] | None = None,
 ) -> Options:
     """Make the options of a comparison from those of the command line.
 
@@ -188,7 +190,10 @@ def tradeoff_options(
 
     for part in parts or ():
         require_known("--part", part, PARTS)
+    # What is asked replaces the errors and times that are answered by default.
+    asked = {} if not (errors_db or times_ms) else {"errors_db": errors_db or (), "times_ms": times_ms or ()}
     return Options(
+        **{name: tuple(values) for name, values in asked.items()},
         reference=reference,
         baseline=baseline,
         receivers=receivers,
@@ -216,7 +221,7 @@ def trade(
         RunError: A file cannot be written; nothing was measured then, and no empty file is left.
     """
     from caviar_clients.tradeoff.plot import draw_convergence, draw_pareto
-    from caviar_clients.tradeoff.tables import by_reason, markdown, screen_table
+    from caviar_clients.tradeoff.tables import answer_sentences, by_reason, markdown, screen_table
 
     if out is not None:
         require_folder("--out", out, "tables and pictures")
@@ -228,13 +233,16 @@ def trade(
     if warning := _other_reference(options, report):
         print_line(console, warning, style="yellow")
     console.print(screen_table(report))
+    for sentence in answer_sentences(report):
+        print_line(console, sentence)
     for reason, labels in by_reason(report.skipped).items():
         console.print(f"not measured: {', '.join(labels)}: {reason}", markup=False, highlight=False)
     write_json(json_file, report)
     if out is not None:
         write_file(out / "tradeoff.md", markdown(report))
         files = [*files, draw_pareto(report, out / "pareto.png")]
-        if report.convergence:
+        # Without two seeds there is nothing to draw.
+        if any(point.seeds > 1 for point in report.convergence):
             files.append(draw_convergence(report, out / "convergence.png"))
     for file in files:
         print_line(console, file)
@@ -250,7 +258,8 @@ def _other_reference(options: Options, report: Report) -> str:
     if report.reference == finest or not reasons:
         return ""
     return (
-        f"warning: errors are against {report.reference!r}, since {finest!r} was not measured: {reasons[0]}"
+        f"warning: errors are against {report.reference!r}, since {finest!r} was not measured: {reasons[0]}, "
+        "or name one that fits with --reference"
     )
 
 

@@ -278,6 +278,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         title = f"frame {moment.frame.number}, t = {moment.frame.t_ns / 1e9:.2f} s"
         return self._renderer.draw(moment.scene, moment.link, pair, title)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, or one in another process, has no run: it begins an episode with `reset`."""
+        return {**self.__dict__, "_session": None, "_moment": None, "_renderer": None}
+
     def _open(self) -> Session:
         """Open the session of the environment's agent."""
         return open_session(

@@ -108,7 +108,7 @@ class UavPathV1Env(FlightEnv):
     a detour costs its length.
 
     Args:
-        scenario: Scenario file, or the name of a scenario that ships.
+        scenario: Scenario file, or the name of a scenario that ships; ``uav-path`` unless given.
         vehicle: Name of the flown object; None: the only one.
         reach_m: Distance at which the goal is reached [m].
         box_m: Two corners [m] within which start and goal are drawn; None: the object's bounds.
@@ -144,7 +144,7 @@ class UavPathV1Env(FlightEnv):
 
     def __init__(
         self,
-        scenario: str | Path,
+        scenario: str | Path = "uav-path",
         vehicle: str | None = None,
         reach_m: float = 5.0,
         box_m: tuple[Sequence[float], Sequence[float]] | None = None,

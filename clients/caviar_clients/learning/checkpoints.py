@@ -1,5 +1,8 @@
 """Checkpoints of a training: model, optimizer and replay buffer, each a folder that is there whole or not.
 
+Numbers and arrays alone, which are read without running what a file says; a model saved by Stable-Baselines3
+has pickled objects.
+
 A checkpoint is written beside the one before and gets its name when all of it is on the disk; then the one
 before is removed. A process that dies in the middle leaves a folder ``….partial``, which nothing reads.
 """
@@ -7,16 +10,18 @@ before is removed. A process that dies in the middle leaves a folder ``….parti
 from __future__ import annotations
 
 import shutil
+from collections import deque
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from caviar_clients.files import writing
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import sync_file
 
-_MODEL, _BUFFER = "model.zip", "replay_buffer.npz"
+_WEIGHTS, _STATE, _BUFFER = "weights.pt", "state.json", "replay_buffer.npz"
 _PARTIAL = ".partial"
 
 
@@ -43,10 +48,13 @@ def save_checkpoint(folder: Path, model: Any) -> Path:
     """
     done = folder / f"{model.num_timesteps:012d}"
     draft = done.with_name(done.name + _PARTIAL)
-    with writing(draft / _MODEL):
+    import torch
+
+    with writing(draft / _WEIGHTS):
         shutil.rmtree(draft, ignore_errors=True)
         draft.mkdir(parents=True)
-        model.save(draft / _MODEL)
+        torch.save(model.get_parameters(), draft / _WEIGHTS)
+        (draft / _STATE).write_bytes(msgspec.json.encode(_numbers(model)))
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None:
             np.savez(draft / _BUFFER, **_content(buffer))
@@ -63,13 +71,12 @@ def save_checkpoint(folder: Path, model: Any) -> Path:
     return done
 
 
-def load_checkpoint(path: Path, algorithm: Any, envs: Any) -> Any:
-    """Read a checkpoint.
+def load_checkpoint(path: Path, model: Any) -> Any:
+    """Read a checkpoint into a model.
 
     Args:
         path: From `newest_checkpoint`.
-        algorithm: Class of Stable-Baselines3 that it is of.
-        envs: A ``VecEnv`` with the spaces of the training.
+        model: Of Stable-Baselines3, made anew as the one that was saved was.
 
     Returns:
         The model, as it was when it was saved; its environments begin new episodes.
@@ -77,8 +84,16 @@ def load_checkpoint(path: Path, algorithm: Any, envs: Any) -> Any:
     Raises:
         RunError: It cannot be read.
     """
+    import torch
+
     try:
-        model = algorithm.load(path / _MODEL, env=envs, device="cpu")
+        model.set_parameters(torch.load(path / _WEIGHTS, weights_only=True, map_location="cpu"), device="cpu")
+        state = msgspec.json.decode((path / _STATE).read_bytes())
+        window = model._stats_window_size
+        model.ep_info_buffer = deque(state.pop("ep_info_buffer"), maxlen=window)
+        model.ep_success_buffer = deque(maxlen=window)  # no environment here says is_success
+        for name, value in state.items():
+            setattr(model, name, value)
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None:
             with np.load(path / _BUFFER) as content:
@@ -88,6 +103,13 @@ def load_checkpoint(path: Path, algorithm: Any, envs: Any) -> Any:
             f"checkpoint {path} cannot be read: {error}; remove the folder to train this seed anew"
         ) from error
     return model
+
+
+def _numbers(model: Any) -> dict[str, Any]:
+    """What a model counts, beside weights and arrays."""
+    found = {name: value for name, value in vars(model).items() if type(value) in (int, float, bool)}
+    episodes = [{name: float(value) for name, value in one.items()} for one in model.ep_info_buffer or ()]
+    return {**found, "ep_info_buffer": episodes}
 
 
 def _arrays(buffer: Any) -> dict[str, Any]:

@@ -103,6 +103,19 @@ class Evaluation:
     """Spectral efficiency [bit/s/Hz] that pilots leave, by method."""
     pilots: Mapping[str, float]
     """Of a frame, on average, by method."""
+    by_episode: Mapping[str, Mapping[str, Sequence[float]]]
+    """Mean |y| of each episode by method, then by kind of frame; NaN: it had no such frames."""
+
+    def difference(self, method: str, kind: str = "all") -> Interval:
+        """Mean |y| of the policy less that of a method in the same episodes, with the interval of the paired
+        differences.
+
+        Args:
+            method: One of `found`.
+            kind: One of `KINDS`.
+        """
+        mine, its = self.by_episode["policy"][kind], self.by_episode[method][kind]
+        return mean_of([a - b for a, b in zip(mine, its, strict=True)])
 
     def ratio(self, method: str, kind: str = "all") -> float:
         """Mean |y| of the policy over that of a method."""
@@ -154,7 +167,8 @@ def evaluate(
     episodes_played: dict[str, list[Played]] = {method: [] for method in players}
     efficiency: dict[str, list[float]] = {method: [] for method in players}
     pilots: dict[str, list[float]] = {method: [] for method in players}
-    with Contest(known, players, served, agent) as contest:
+    transmitters = model.card.transmitters if model.card else ("*",)
+    with Contest(known, players, served, agent, transmitters) as contest:
         for done, seed in enumerate(episodes_of(seeds, episodes), 1):
             for method, played in contest.play(seed).items():
                 efficiency[method].append(_mean(played.net_efficiency))
@@ -163,13 +177,14 @@ def evaluate(
             progress(done)
     stations = sorted({name for played in episodes_played["policy"] for name in played.station})
     kinds = (*KINDS, *(stations if len(stations) > 1 else ()))
+    by_episode = {
+        m: {k: tuple(_mean(p.abs_y[p.of(k)]) for p in played) for k in kinds}
+        for m, played in episodes_played.items()
+    }
     return Evaluation(
         policy=file.name,
         scenario=known.run.name,
-        found={
-            m: {k: mean_of([_mean(p.abs_y[p.of(k)]) for p in played]) for k in kinds}
-            for m, played in episodes_played.items()
-        },
+        found={m: {k: mean_of(means) for k, means in of.items()} for m, of in by_episode.items()},
         frames={k: sum(int(p.of(k).sum()) for p in episodes_played["policy"]) for k in kinds},
         power={
             m: _mean(np.concatenate([p.abs_y.reshape(-1) ** 2 for p in played]))
@@ -177,6 +192,7 @@ def evaluate(
         },
         efficiency={method: mean_of(values) for method, values in efficiency.items()},
         pilots={method: float(np.mean(values)) for method, values in pilots.items()},
+        by_episode=by_episode,
     )
 
 

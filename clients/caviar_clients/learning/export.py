@@ -72,8 +72,8 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
 
     Args:
         model: A DQN, PPO or A2C of policy ``MultiInputPolicy``, with the environment that it was trained in
-            where that has a ``VecNormalize``: a model loaded from a file gets it by
-            ``model.set_env(VecNormalize.load(…))``.
+            where that has a ``VecNormalize``: a model's file has no statistics, and not always a trace of
+            them; a model loaded from one gets them by ``model.set_env(VecNormalize.load(…))``.
         env: An environment as it was trained in.
         file: Where the ONNX file goes.
         facts: Further fields of the card: ``steps``, ``seeds``, ``figures``.
@@ -100,7 +100,7 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
         normalizer = None
     # In the order of the model's space, in which it makes its features.
     names = tuple(model.observation_space.spaces)
-    _check_observed(model.observation_space, env.observation_space, normalizer)
+    _check_observed(model, env.observation_space, normalizer)
     turned = {n for n in names if model.observation_space[n].shape != env.observation_space[n].shape}
     statistics = {} if normalizer is None else {n: normalizer.obs_rms[n] for n in normalizer.norm_obs_keys}
 
@@ -137,24 +137,28 @@ def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyC
     return export_module(Choice(), env.observation_space, file, card, choose, usual)
 
 
-def _check_observed(learnt: Any, shown: spaces.Dict[Any], normalizer: Any) -> None:
+def _check_observed(model: Any, shown: spaces.Dict[Any], normalizer: Any) -> None:
     """Raise `ScenarioError` where a model observes something else than an environment shows."""
-    normalized = () if normalizer is None else normalizer.norm_obs_keys
+    learnt = model.observation_space
     if [*learnt.spaces] != [*shown.spaces]:
         raise ScenarioError(
             f"the model observes {', '.join(learnt.spaces)}, and the environment {', '.join(shown.spaces)}; "
             "give the environment that it was trained in"
         )
     for name, box in learnt.spaces.items():
-        mine = shown[name]
+        mine, last = shown[name], (model._last_obs or {}).get(name)
         shape = mine.shape or ()
         channels_first = len(shape) == 3 and box.shape == (shape[2], *shape[:2])
-        if name not in normalized and box != mine and not channels_first:
+        if normalizer is None and last is not None and not all(map(box.contains, last)):
             raise ScenarioError(
-                f"the model observes {name!r} as {box}, and the environment shows {mine}. If it was trained "
-                "behind VecNormalize, whose statistics no model file holds, call "
-                "model.set_env(VecNormalize.load(…)) and export it in Python; else give the environment that "
-                "it was trained in"
+                f"the model last saw {name!r} outside of its bounds {box}, as behind VecNormalize, whose "
+                "statistics no model file holds: call model.set_env(VecNormalize.load(…)), or give "
+                "caviar policy export --normalization"
+            )
+        if box != mine and not channels_first:
+            raise ScenarioError(
+                f"the model observes {name!r} as {box}, and the environment shows {mine}; give the "
+                "environment that it was trained in"
             )
 
 

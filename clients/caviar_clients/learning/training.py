@@ -216,10 +216,9 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
     envs = make_envs(experiment)
     try:
         newest = newest_checkpoint(mine / CHECKPOINTS)
-        if newest is None:
-            model = _new_model(experiment, envs, _chunk_seed(seed, 0))
-        else:
-            model = load_checkpoint(newest, _resumable(experiment.algorithm.called), envs)
+        model = _new_model(experiment, envs, _chunk_seed(seed, 0))
+        if newest is not None:
+            load_checkpoint(newest, model)
         report(_progress(model, seed, total))
         with EventFile(mine / CURVES, purge_step=model.num_timesteps or None) as events:
             model.set_logger(_logger(events))
@@ -422,7 +421,7 @@ def _progress(model: Any, seed: int, asked: int) -> Progress:
 
 def _mean_reward(model: Any) -> float | None:
     ended = model.ep_info_buffer
-    return float(np.mean([episode["r"] for episode in ended])) if ended else None
+    return float(np.mean([float(episode["r"]) for episode in ended])) if ended else None
 
 
 def _logger(events: EventFile) -> Any:

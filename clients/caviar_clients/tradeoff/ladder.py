@@ -159,10 +159,18 @@ LADDER: tuple[Setting, ...] = (
 )
 
 # The finest first.
-REFERENCES = ("spherical 1e6 d5 +r+d", "siso-rt 1e6 d5 +r+d", "siso-rt 1e6 d3", "free-space")
-"""The default reference is the first of these that the channels of this installation know and that can be
-loaded, ``free-space`` only where there is no scenery. ``mimo-rt`` is none of them: it is affordable for few
-scenes, receivers and samples only."""
+REFERENCES = (
+    "spherical 1e6 d5 +r+d",
+    "siso-rt 1e6 d5 +r+d",
+    "siso-rt 1e6 d3",
+    "siso-rt enumerated d3",
+    "spherical 1e5 d3",
+    "siso-rt 1e5 d3",
+    "free-space",
+)
+"""The default reference is the first of these, which begin with the finest, that the channels of this
+installation know and that was measured in time; ``free-space`` only where there is no scenery. ``mimo-rt`` is
+none of them: it is affordable for few scenes, receivers and samples only."""
 
 BASELINES = ("siso-rt 1e5 d3", "free-space")
 """The default baseline of the factors, likewise."""

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import replace
-
 from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure, place_labels
 from caviar_clients.tradeoff.errors import Row
 from caviar_clients.tradeoff.report import Point, Report
@@ -38,7 +36,7 @@ def draw_pareto(report: Report, file: Path) -> Path:
         The file.
     """
     # The ladder alone: the lines of the paper's tables are the same settings in finer steps.
-    rows = [row for row in comparable_times(report) if row.block == "ladder" and row.nmse_db is not None]
+    rows = [row for row in report.rows if row.block == "ladder" and row.nmse_db is not None]
     with figure(file, 10.0, 11.0) as drawn:
         upper, lower = drawn.subplots(2, 1, sharex=True)
         _panel(upper, rows, report.reference, _nmse)
@@ -46,7 +44,7 @@ def draw_pareto(report: Report, file: Path) -> Path:
         upper.set_title(f"{report.scenario}: what accuracy costs", loc="left")
         _panel(lower, rows, report.reference, _gain)
         lower.set_ylabel("error of path gain [dB], mean of absolute values")
-        lower.set_xlabel(f"time of a scene [ms]: factor to {report.baseline}, times its median")
+        lower.set_xlabel("time of a scene [ms], median")
         handles, names = upper.get_legend_handles_labels()
         drawn.legend(handles, names, loc="outside lower center", ncols=4)
         # At the end, when limits and layout are known: places are found in pixels.
@@ -55,19 +53,6 @@ def draw_pareto(report: Report, file: Path) -> Path:
             points = [(row.time_ms_median, error) for row, error in shown]
             place_labels(axes, points, [row.setting for row, _ in shown], pareto_front(points))
     return file
-
-
-def comparable_times(report: Report) -> list[Row]:
-    """Replace times by factors times the baseline's time.
-
-    Settings that were measured at different times, on a machine that was not as busy at all of them, then
-    have the order of their factors.
-    """
-    # Without the baseline among the rows times stay as they were measured.
-    base = next((row.time_ms_median for row in report.rows if row.setting == report.baseline), None)
-    if base is None:
-        return list(report.rows)
-    return [replace(row, time_ms_median=row.factor * base) for row in report.rows]
 
 
 def _gain(row: Row) -> float | None:
@@ -96,7 +81,11 @@ def _panel(axes: Any, rows: Sequence[Row], reference: str, value: Callable[[Row]
     for rung, colour in RUNG_COLOURS.items():
         if any(row.rung == rung for row, _ in points):
             axes.plot([], [], "o", color=colour, markersize=8, label=rung)
-    front = pareto_front([(row.time_ms_median, error) for row, error in points])
+    # What saw fewer receivers had less to do: it is drawn, and is not on the front.
+    whole = max((row.receivers for row in rows), default=0.0)
+    front = pareto_front([(row.time_ms_median, error) for row, error in points if row.receivers == whole])
+    on_front = [(row.time_ms_median, error) for row, error in points if (row.time_ms_median, error) in front]
+    axes.plot(*_columns(on_front), "o", color=BLACK, fillstyle="none", markersize=14, label="on the front")
     axes.plot(
         *_columns(front),
         color=GREY,

@@ -22,7 +22,6 @@ from caviar_clients.tradeoff.ladder import TRUTH, Block, Setting
 from caviar_clients.tradeoff.scenes import Scenes
 from caviar_clients.tradeoff.worker import is_known, seen
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import RunError
 from caviar_protocol.space.scene import antennas
 from caviar_services.mesh.scenery import find_scenery
 from caviar_services.registry import load
@@ -79,6 +78,67 @@ Part = Literal["ladder", "keyframes", "spacing", "arrays", "convergence"]
 PARTS: tuple[Part, ...] = get_args(Part)
 
 
+class Answer(msgspec.Struct, frozen=True, kw_only=True):
+    """The setting to take for an error or a time."""
+
+    error_db: Annotated[float | None, quantity("dB", "greatest NMSE of H that was asked for")] = None
+    time_ms: Annotated[float | None, quantity("ms", "longest median time of a scene that was asked for")] = (
+        None
+    )
+    setting: str | None
+    """None: no setting that was measured is as good, or as fast."""
+
+
+def pareto_rows(rows: Sequence[Row], reference: str) -> list[Row]:
+    """Select the rows of the ladder that no other one beats in both time and NMSE, from the fastest on.
+
+    Args:
+        rows: Of a report. Those that saw fewer receivers than the reference did are left out, as their times
+            are of less work.
+        reference: Its setting, which has no error and is left out.
+    """
+    whole = max((row.receivers for row in rows), default=0.0)
+    found = list[Row]()
+    for row in sorted(
+        (
+            row
+            for row in rows
+            if row.block == "ladder"
+            and row.setting != reference
+            and row.nmse_db is not None
+            and row.receivers == whole
+        ),
+        key=lambda row: (row.time_ms_median, row.nmse_db),
+    ):
+        if not found or (row.nmse_db or 0.0) < (found[-1].nmse_db or 0.0):
+            found.append(row)
+    return found
+
+
+def answers(
+    rows: Sequence[Row], reference: str, errors_db: Sequence[float], times_ms: Sequence[float]
+) -> tuple[Answer, ...]:
+    """Choose the fastest setting for each error, and the most accurate one for each time.
+
+    Args:
+        rows: Of a report.
+        reference: Setting that errors are against. It is the answer only where no other one is.
+        errors_db: NMSE of H at most [dB].
+        times_ms: Median times of a scene at most [ms].
+    """
+    front = pareto_rows(rows, reference)
+    own = [row for row in rows if row.setting == reference and row.block == "ladder"]
+    found = []
+    for error in errors_db:
+        good = [row for row in front if (row.nmse_db or 0.0) <= error] + own
+        found.append(Answer(error_db=error, setting=good[0].setting if good else None))
+    for time_ms in times_ms:
+        fast = [row for row in front + own if row.time_ms_median <= time_ms]
+        # The front becomes more accurate as it becomes slower, and the reference has no error.
+        found.append(Answer(time_ms=time_ms, setting=fast[-1].setting if fast else None))
+    return tuple(found)
+
+
 class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Findings of a comparison, as ``caviar measure tradeoff --json`` writes them."""
 
@@ -94,6 +154,8 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Setting that factors are against."""
     elapsed_s: Annotated[float, quantity("s", "wall time of the whole")]
     machine: dict[str, str]
+    answers: tuple[Answer, ...] = ()
+    """The setting to take for each error, and for each time, that was asked for."""
     rows: tuple[Row, ...]
     convergence: tuple[Point, ...]
     skipped: tuple[Skipped, ...]
@@ -109,6 +171,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         seeds: Seeds of each point of the convergence.
         seconds: Time for everything [s].
         parts: Parts that are measured.
+        errors_db: NMSE of H [dB] that the fastest setting is named for.
+        times_ms: Times of a scene [ms] that the most accurate setting is named for.
 
     Example:
         >>> Options(parts=("ladder",), seconds=60.0).receivers is None
@@ -121,6 +185,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     seeds: int = 2
     seconds: float = 720.0
     parts: tuple[Part, ...] = PARTS
+    errors_db: tuple[float, ...] = (-10.0, -20.0)
+    times_ms: tuple[float, ...] = (10.0, 50.0, 200.0)
 
 
 _WEIGHTS: Mapping[Block, float] = {
@@ -146,7 +212,7 @@ def compare(
         report: Called with the progress.
 
     Raises:
-        RunError: A label is unknown, or reference or baseline cannot be measured.
+        RunError: A label is unknown, or no baseline can be measured.
     """
     begun = time.monotonic()
     # Measured before anything else and on every scene: all errors of the report are against it.
@@ -174,8 +240,10 @@ def compare(
                 interpolated += campaign.keyframes(share)
             else:
                 measured += campaign.block(block, settings, share)
-    # Chosen at the end, among what could be measured: the finest may have run out of memory.
-    reference = _reference(references, measured, campaign.skipped)
+    # Chosen at the end, among what was measured: the finest may have run out of memory, or of time.
+    labels = [*(setting.label for setting in references), *ladder.REFERENCES[:-1], campaign.baseline.label]
+    reference = _reference(labels, measured)
+    rows = (*(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)), *interpolated)
     receivers = [len(antennas(seen(i.scene, options.receivers, None), "rx")) for i in scenes.instants]
     return Report(
         scenario=scenes.name,
@@ -187,10 +255,8 @@ def compare(
         baseline=campaign.baseline.label,
         elapsed_s=time.monotonic() - begun,
         machine=dict(machine),
-        rows=(
-            *(_row(entry, reference) for entry in measured if not _is_of_a_curve(entry)),
-            *interpolated,
-        ),
+        answers=answers(rows, reference.setting.label, options.errors_db, options.times_ms),
+        rows=rows,
         convergence=tuple(points([entry for entry in measured if _is_of_a_curve(entry)])),
         skipped=tuple(campaign.skipped),
     )
@@ -224,17 +290,10 @@ def _plan(options: Options, needed: Sequence[Setting]) -> list[tuple[Block, list
     return plan
 
 
-def _reference(
-    references: Sequence[Setting], measured: Sequence[Measured], skipped: Sequence[Skipped]
-) -> Measured:
+def _reference(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
+    """The first of these that was measured; the baseline, the last of them, always is."""
     by_label = {entry.setting.label: entry for entry in measured}
-    for setting in references:
-        if setting.label in by_label:
-            return by_label[setting.label]
-    # Each reason once: a missing library is the reason of all of them.
-    labels = [setting.label for setting in references]
-    reasons = dict.fromkeys(entry.reason for entry in skipped if entry.setting in labels)
-    raise RunError(f"no reference can be measured, of {', '.join(labels)}: {'; '.join(reasons)}")
+    return next(by_label[label] for label in labels if label in by_label)
 
 
 def _is_of_a_curve(entry: Measured) -> bool:

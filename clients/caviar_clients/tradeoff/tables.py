@@ -22,7 +22,7 @@ from caviar_clients.tradeoff.ladder import (
     Block,
     samples_of,
 )
-from caviar_clients.tradeoff.report import Report
+from caviar_clients.tradeoff.report import Report, pareto_rows
 
 # Factors are compared and not seconds, which are those of another machine and another ray tracer.
 PAPER_SPACING = {
@@ -47,6 +47,8 @@ _BETWEEN = (
 )
 
 
+# Of the longest word of a setting, ``spherical``: a narrow terminal breaks between words.
+_WORD = 9
 NOTHING = "–"
 """Cell of a figure that does not exist."""
 
@@ -144,13 +146,43 @@ _SCREEN: Columns = {
 def screen_table(report: Report) -> Table:
     """Make the table of all rows for a terminal."""
     table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
+    front = pareto_rows(report.rows, report.reference)
     for name in _SCREEN:
-        table.add_column(name, justify="left" if name == "setting" else "right")
+        table.add_column(
+            name, justify="left" if name == "setting" else "right", min_width=_WORD * (name == "setting")
+        )
     for row in report.rows:
-        table.add_row(*(Text(cell(row)) for cell in _SCREEN.values()))
+        style = "bold" if row in front else ""
+        table.add_row(*(Text(cell(row), style) for cell in _marked(_SCREEN, front).values()))
     table.caption_justify = "left"
     table.caption = Text(_against(report))
     return table
+
+
+def _marked(columns: Columns, front: Sequence[Row]) -> Columns:
+    """Columns with a star at settings of the front."""
+    return {**columns, "setting": lambda row: f"{row.setting} *" if row in front else row.setting}
+
+
+def answer_sentences(report: Report) -> list[str]:
+    """What to take for each error and each time that was asked for, a sentence each."""
+    ladder = [row for row in report.rows if row.block == "ladder"]
+    by_setting = {row.setting: row for row in ladder}
+    sentences = []
+    for answer in report.answers:
+        asked = (
+            f"for {level(answer.error_db)} dB"
+            if answer.time_ms is None
+            else f"for {significant(answer.time_ms)} ms"
+        )
+        if answer.setting is None:
+            fastest = min((row.time_ms_median for row in ladder), default=None)
+            sentences.append(f"{asked}: none; the fastest takes {significant(fastest)} ms")
+            continue
+        row = by_setting[answer.setting]
+        error = "the reference itself" if row.setting == report.reference else f"{level(row.nmse_db)} dB"
+        sentences.append(f"{asked}: {row.setting} ({error}, {significant(row.time_ms_median)} ms)")
+    return sentences
 
 
 def markdown(report: Report) -> str:
@@ -159,9 +191,10 @@ def markdown(report: Report) -> str:
     parts = [
         f"# Time and error of channel settings: {report.scenario}",
         _setting_of(report),
+        "\n".join(f"- {sentence}" for sentence in answer_sentences(report)),
         "## The ladder",
         _meaning(),
-        _table_of(_LADDER, ladder),
+        _table_of(_marked(_LADDER, pareto_rows(report.rows, report.reference)), ladder),
         _notes(ladder),
     ]
     parts += _keyframes(report) + _spacing(report) + _arrays(report) + _convergence(report) + _skipped(report)
@@ -178,7 +211,10 @@ def _setting_of(report: Report) -> str:
 
 
 def _against(report: Report) -> str:
-    return f"Errors against {report.reference!r}; factors of time to {report.baseline!r}, measured by turns."
+    return (
+        f"Errors against {report.reference!r}; factors of time to {report.baseline!r}, measured by turns. "
+        "*: on the Pareto front of time and NMSE."
+    )
 
 
 def _meaning() -> str:

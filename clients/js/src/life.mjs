@@ -65,6 +65,8 @@ export class Life {
   #hasOffered = false;
   #rejoin_ms = 0;
   #over = false;
+  /** @type {Error | undefined} what `step` threw first; the run is over, and was no success */
+  #faulted;
   /** @type {(outcome: Outcome) => void} */
   #resolve = () => {};
   /** @type {(error: Error) => void} */
@@ -188,6 +190,7 @@ export class Life {
           ? this.#lose(message.message)
           : this.#fail(new RunError(`refused: ${message.code}: ${message.message}`));
       case "SHUTDOWN":
+        if (this.#faulted) this.#reject(this.#faulted); // before what `leave` resolves
         return this.leave(message.reason);
     } // CANCEL is advice: the answer that is under way is still due
   }
@@ -327,6 +330,7 @@ export class Life {
     } catch (error) {
       const { message, stack = "" } = asError(error);
       this.log(`${this.part.name}: frame ${grant.frame}: ${culprit ? message : stack}`);
+      this.#faulted ??= new RunError(`it failed in frame ${grant.frame}: ${message}`);
       return [encodeMessage({ type: "FAULT", ...turn, phase: "step", message, detail: stack, culprit })];
     }
   }
