@@ -300,8 +300,8 @@ class Episodes:
         if self._scheduler:
             if self._scheduler.startswith("tls:") and Security().tls_client_cert is None:
                 raise RunError(
-                    f"--scheduler {self._scheduler}: there is no certificate for TLS; name ca-file and client "
-                    "in distributed.comm.tls of Dask's configuration, ~/.config/dask/tls.yaml"
+                    f"--scheduler {self._scheduler}: there is no certificate for TLS; name ca-file and "
+                    "client in distributed.comm.tls of Dask's configuration, ~/.config/dask/tls.yaml"
                 )
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)
