@@ -42,22 +42,24 @@ def test_questions_and_orders(tmp_path: Path) -> None:
         assert http.get("/readyz").json == {"ready": True}
         assert http.post("/step").status == 409
         assert "not paused" in http.post("/step").json["detail"]
+        world.answer()  # frame 0 may be late: services warm up in it
+        sensors.answer()
         world.expect(m.Grant)
         eventually(lambda: http.get("/why").json["late"], "the world is late")
         why = http.get("/why").json
         assert why["waits"][0]["service"] == "world"
         assert why["last_blame"]["kind"] == "miss"
-        assert http.post("/pause").json == {"state": "running", "paused": True, "frame": 0}
-        world.send(m.Done(**world.ids, episode=0, frame=0))
+        assert http.post("/pause").json == {"state": "running", "paused": True, "frame": 1}
+        world.send(m.Done(**world.ids, episode=0, frame=1))
         assert world.quiet(200)
         assert http.post("/step?frames=1").status == 200
-        assert world.answer().frame == 1
+        assert world.answer().frame == 2
         sensors.answer()
         assert world.quiet(200)
         status = http.get("/status").json
-        assert (status["paused"], status["frames_finished"]) == (True, 2)
+        assert (status["paused"], status["frames_finished"]) == (True, 3)
         figures = http.get("/latencies").json
-        assert figures["world"]["grants_answered"] == 2
+        assert figures["world"]["grants_answered"] == 3
         told = [n for n in http.broker.witness.notices if (n.kind, n.service) == ("miss", "world")]
         assert figures["world"]["misses"] == len(told) >= 1  # a busy machine may have missed the second too
         assert http.post("/resume").json["paused"] is False

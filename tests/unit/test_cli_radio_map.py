@@ -103,7 +103,7 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
 
 def test_a_scene_without_a_transmitter_is_refused() -> None:
     """It may be mounted on an object that is not there yet."""
-    with pytest.raises(RunError, match="frame 7 has no transmitter; give a device"):
+    with pytest.raises(RunError, match="frame 7 has no transmitter on carrier"):
         transmitters_of(msgspec.structs.replace(scene(0), devices=()), "frame 7", "mm")
 
 
