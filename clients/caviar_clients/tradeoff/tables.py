@@ -47,8 +47,8 @@ _BETWEEN = (
 )
 
 
-# Of the longest word of a setting, ``spherical``: a narrow terminal breaks between words.
-_WORD = 9
+# Of the longest word of most settings, ``enumerated``: a narrow terminal breaks between words.
+_WORD = 10
 NOTHING = "–"
 """Cell of a figure that does not exist."""
 
@@ -133,7 +133,6 @@ _KEYFRAMES: Columns = {
 _SCREEN: Columns = {
     "setting": _LADDER["setting"],
     "time ms": _LADDER["time ms"],
-    "p99": _LADDER["p99 ms"],
     "factor": _LADDER["factor"],
     "gain dB": _LADDER["gain dB"],
     "NMSE dB": _LADDER["NMSE dB"],
