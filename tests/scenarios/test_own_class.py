@@ -47,8 +47,7 @@ def test_no_file_of_the_current_folder_is_imported_in_place_of_a_library_nor_to_
     assert not (tmp_path / "imported").exists()
     hostile(tmp_path, "evil")
     (directory,) = (tmp_path / "r").iterdir()
-    looks = ("inspect", directory), ("plot", directory), ("doctor", directory), ("budget", directory)
-    for command, path in (*looks, ("verify", "d"), ("look", "d")):
+    for command, path in (("inspect", directory), ("plot", directory), ("verify", "d")):
         run_as_printed(["caviar", command, path], tmp_path)
     scenes = scene_at(directory)
     with pytest.raises(RunError, match="module:Class, which are not loaded"):

@@ -298,6 +298,11 @@ class Episodes:
         from distributed import Client, LocalCluster, Security
 
         if self._scheduler:
+            if self._scheduler.startswith("tls:") and Security().tls_client_cert is None:
+                raise RunError(
+                    f"--scheduler {self._scheduler}: there is no certificate for TLS; set ca-file and "
+                    "client of distributed.comm.tls in Dask's configuration, ~/.config/dask/tls.yaml"
+                )
             try:
                 self._client = Client(self._scheduler, timeout=CONNECT_S, set_as_default=False)
                 self._stack.callback(self._client.close, timeout=5)

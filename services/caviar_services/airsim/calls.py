@@ -57,6 +57,7 @@ class Offer:
     """Calls by name, and the refusal of all others.
 
     Example:
+        >>> import asyncio
         >>> async def ping():
         ...     return True
         >>> asyncio.run(Offer({"ping": ping}).handle("ping", []))

@@ -51,7 +51,7 @@ def atmosphere(altitude: float) -> tuple[float, float, float]:
 
     Example:
         >>> [round(x, 3) for x in atmosphere(1000.0)]
-        [89874.571, 281.65, 1.112]
+        [89874.563, 281.65, 1.112]
     """
     kelvin = SEA_LEVEL_K - LAPSE_K_M * min(altitude, TROPOPAUSE_M)
     pascal = SEA_LEVEL_PA * (kelvin / SEA_LEVEL_K) ** (GRAVITY / (AIR_J_KG_K * LAPSE_K_M))
