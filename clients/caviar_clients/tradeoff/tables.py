@@ -47,8 +47,6 @@ _BETWEEN = (
 )
 
 
-# Of the longest word of most settings, ``enumerated``: a narrow terminal breaks between words.
-_WORD = 10
 NOTHING = "–"
 """Cell of a figure that does not exist."""
 
@@ -147,9 +145,7 @@ def screen_table(report: Report) -> Table:
     table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
     front = pareto_rows(report.rows, report.reference)
     for name in _SCREEN:
-        table.add_column(
-            name, justify="left" if name == "setting" else "right", min_width=_WORD * (name == "setting")
-        )
+        table.add_column(name, justify="left" if name == "setting" else "right")
     for row in report.rows:
         style = "bold" if row in front else ""
         table.add_row(*(Text(cell(row), style) for cell in _marked(_SCREEN, front).values()))
