@@ -145,7 +145,8 @@ def screen_table(report: Report) -> Table:
     table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
     front = pareto_rows(report.rows, report.reference)
     for name in _SCREEN:
-        table.add_column(name, justify="left" if name == "setting" else "right")
+        # Folded, not cut: a name that lost its end is another setting.
+        table.add_column(name, justify="left" if name == "setting" else "right", overflow="fold")
     for row in report.rows:
         style = "bold" if row in front else ""
         table.add_row(*(Text(cell(row), style) for cell in _marked(_SCREEN, front).values()))
