@@ -47,8 +47,6 @@ _BETWEEN = (
 )
 
 
-# Of the longest word of a setting, ``spherical``: a narrow terminal breaks between words.
-_WORD = 9
 NOTHING = "–"
 """Cell of a figure that does not exist."""
 
@@ -133,7 +131,6 @@ _KEYFRAMES: Columns = {
 _SCREEN: Columns = {
     "setting": _LADDER["setting"],
     "time ms": _LADDER["time ms"],
-    "p99": _LADDER["p99 ms"],
     "factor": _LADDER["factor"],
     "gain dB": _LADDER["gain dB"],
     "NMSE dB": _LADDER["NMSE dB"],
@@ -148,9 +145,8 @@ def screen_table(report: Report) -> Table:
     table = Table(title=Text(f"{report.scenario}: {report.origin}"), title_justify="left")
     front = pareto_rows(report.rows, report.reference)
     for name in _SCREEN:
-        table.add_column(
-            name, justify="left" if name == "setting" else "right", min_width=_WORD * (name == "setting")
-        )
+        # Folded, not cut: a name that lost its end is another setting.
+        table.add_column(name, justify="left" if name == "setting" else "right", overflow="fold")
     for row in report.rows:
         style = "bold" if row in front else ""
         table.add_row(*(Text(cell(row), style) for cell in _marked(_SCREEN, front).values()))
