@@ -87,7 +87,8 @@ def test_options_that_break_a_promise_are_refused_by_name(
 def test_what_a_configuration_would_write_is_switched_off_and_noted(tmp_path: Path) -> None:
     (note, other) = configured(
         tmp_path,
-        '<output><summary-output value="../mine.txt"/><summary-output.period value="5"/></output>'
+        '<output><summary-output value="../mine.txt"/><summary-output.period value="5"/>'
+        '<fcd-output.attributes value="x,y"/><output-prefix value="osm_"/></output>'
         '<report><log value="log.txt"/></report><processing><no-internal-links value="true"/></processing>',
     )
     assert "summary-output, log" in note

@@ -379,7 +379,10 @@ class SumoWorld(World[SumoSettings]):
         self._people.keep(seen)
 
     def _vehicle_states(self, domain: Any, api: Any) -> Iterator[ObjectState]:
-        for name, (kind, dimensions) in _present(self._vehicles, domain.getIDList()):
+        present = _present(self._vehicles, domain.getIDList())
+        for name in self._trails.keys() - self._vehicles.keys():
+            del self._trails[name]
+        for name, (kind, dimensions) in present:
             bumper = domain.getPosition3D(name)
             if bumper[0] == api.INVALID_DOUBLE_VALUE:  # on its way elsewhere, by no road
                 continue

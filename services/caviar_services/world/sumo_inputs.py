@@ -41,6 +41,18 @@ _NAMED: Mapping[str, str] = {
 _NOWHERE = ("", "NUL", "nul", "/dev/null")
 """Files to which SUMO writes nothing."""
 
+_WRITES = (
+    "-output",
+    ".output",
+    "netstate-dump",
+    "log",
+    "ssm.file",
+    "toc.file",
+    "jupedsim.wkt",
+    "jupedsim.py",
+)
+"""How the options of SUMO end that name a file which it writes; what says more of an output ends otherwise."""
+
 _ROOTS = {
     "net": ("net",),
     "config": ("configuration", "sumoConfiguration"),
@@ -107,17 +119,9 @@ def merged_options(arguments: tuple[str, ...]) -> Options:
     for section in ET.fromstring(ran.stdout):  # noqa: S314 - SUMO wrote it
         for option in section:
             values[option.tag] = value = option.get("value", "")
-            writes = section.tag == "output" or option.tag.endswith(("output", "log", ".file"))
-            if writes and _is_path(value):
+            if option.tag.endswith(_WRITES) and value not in (*_NOWHERE, "true", "false"):
                 outputs.append(option.tag)
     return Options(MappingProxyType(values), tuple(outputs))
-
-
-def _is_path(value: str) -> bool:
-    """Whether the value of an option about output can name a file: no switch, number or list of numbers."""
-    if value in (*_NOWHERE, "true", "false"):
-        return False
-    return not value.replace(",", "").replace(".", "").replace("-", "").replace(" ", "").isdigit()
 
 
 class Inputs(NamedTuple):

@@ -147,9 +147,10 @@ class BodyPool:
             Whether there are other bodies than before.
         """
         later, asset_of = self._later, scene.assets
-        needed = Counter(self._body_of(scene, i) for i in solid)
+        body_of = {i: self._body_of(scene, i) for i in solid}
+        needed = Counter(body_of.values())
         # Bodies that a mesh came for are made whatever the pools are; boxes stand in where it is not there.
-        came = {self._body_of(scene, i) for i in solid if is_mesh_name(asset_of[i])}
+        came = {body for i, body in body_of.items() if is_mesh_name(asset_of[i])}
         for key in [k for k in needed if k not in came and not self._first.counts.get(body_kind(*k))]:
             del needed[key]
         short = any(n > self._now.counts.get(body_kind(*key), 0) for key, n in needed.items())

@@ -403,9 +403,10 @@ class SionnaScene(NumberedTriangles):
         """
         solid = self._solid(scene, without_body)
         kinds = {i: self._pool.kind(scene, i) for i in solid}
-        of_skin = {kind for kind, _ in self._pool.of_material[""]}
-        if self._skin_error is not None and of_skin.intersection(kinds.values()):
-            raise self._skin_error
+        if self._skin_error is not None:
+            of_skin = {kind for kind, _ in self._pool.of_material[""]}
+            if of_skin.intersection(kinds.values()):
+                raise self._skin_error
         return self.place_bodies(scene, kinds)
 
     def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
