@@ -42,16 +42,10 @@ _NOWHERE = ("", "NUL", "nul", "/dev/null")
 """Files to which SUMO writes nothing."""
 
 _WRITES = (
-    "-output",
-    ".output",
-    "netstate-dump",
-    "log",
-    "ssm.file",
-    "toc.file",
-    "jupedsim.wkt",
-    "jupedsim.py",
+    *("-output", ".output", "netstate-dump", "log"),
+    *("ssm.file", "toc.file", "jupedsim.wkt", "jupedsim.py"),
 )
-"""How the options of SUMO end that name a file which it writes; what says more of an output ends otherwise."""
+"""How options end that name a file which SUMO writes; what says more of an output ends otherwise."""
 
 _ROOTS = {
     "net": ("net",),
