@@ -172,7 +172,8 @@ def _become(
         if env is not None:
             os.environ.clear()
             os.environ.update(env)
-        status = _run(command[2], command[3:])
+        module, *arguments = command[command.index("-m") + 1 :]
+        status = _run(module, arguments)
     except SystemExit as order:
         status = order.code if isinstance(order.code, int) else 1
     except BaseException:
