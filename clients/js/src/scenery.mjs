@@ -68,9 +68,9 @@ export class Assets {
    */
   offerMesh(name, vertices, triangles, material = "") {
     const { file, dimensions, centre } = unitMesh(name, vertices, triangles, material);
-    const asset = `objects/${name}.ply`;
-    this.offerFile(asset, file);
-    return { asset, dimensions, centre };
+    const mesh = `objects/${name}.ply`;
+    this.offerFile(mesh, file);
+    return { mesh, dimensions, centre };
   }
 
   /**
