@@ -168,6 +168,20 @@ def check_axes(ask: Ask) -> None:
                 assert _alike(numbers, expected[key], key == "orientation"), f"{engine} {key}: {numbers}"
 
 
+def check_engine_meshes(ask: Ask) -> None:
+    """Meshes in the axes, unit and winding of each engine."""
+    meshes = json.loads((ROOT / "clients" / "axes.json").read_text("utf-8"))["meshes"]
+    engines = [key for key in meshes if key not in ("about", "enu")]
+    parts = ("vertices", "triangles")
+    lines = [
+        "\t".join([name, *(_numbers(np.ravel(meshes[name][part])) for part in parts)]) for name in engines
+    ]
+    for engine, answer in zip(engines, ask("engine_mesh", lines), strict=True):
+        for part, field in zip(parts, answer.split("\t"), strict=True):
+            got = [number(word) for word in field.split()]
+            assert got == np.ravel(meshes["enu"][part]).tolist(), f"{engine} {part}: {got}"
+
+
 def _alike(got: list[float], expected: list[float], is_rotation: bool) -> bool:
     # q and -q are one rotation.
     if is_rotation and sum(a * b for a, b in zip(got, expected, strict=True)) < 0:
