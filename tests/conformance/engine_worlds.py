@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
+import numpy as np
 from scenarios_support import ROOT, blocks, environment, eventually, recorded_below, running
 from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load

@@ -60,12 +60,16 @@ static func wrong_at_run_time(name, vertices, triangles, max_faces):
 	if max_faces > 0 and triangles.size() > max_faces:
 		return who + "it has %d triangles, and this run takes %d" % [triangles.size(), max_faces]
 	for vertex in vertices:
-		if not (abs(vertex[0]) < INF and abs(vertex[1]) < INF and abs(vertex[2]) < INF):
+		if not _is_finite(vertex):
 			return who + "a vertex is not finite"
 	for side in box_of(vertices)["dimensions"]:
 		if not side > 0:
 			return who + "it is flat"
 	return ""
+
+
+static func _is_finite(vertex):
+	return abs(vertex[0]) < INF and abs(vertex[1]) < INF and abs(vertex[2]) < INF  # no NaN is
 
 
 # {dimensions, centre} of the box around the vertices that are finite.
@@ -75,7 +79,7 @@ static func box_of(vertices):
 		var low = INF
 		var high = -INF
 		for vertex in vertices:
-			if abs(vertex[i]) < INF:  # which no NaN is; min and max of Godot 3 have single precision
+			if _is_finite(vertex):  # min and max of Godot 3 have single precision
 				low = vertex[i] if vertex[i] < low else low
 				high = vertex[i] if vertex[i] > high else high
 		box["dimensions"].append(high - low + 0.0 if high >= low else 0.0)
