@@ -68,6 +68,7 @@ def test_what_a_world_returns_that_is_no_object_is_named_with_its_method(odd: ob
     ("field", "value"),
     [
         ("position", (1.0, 2.0)),
+        ("dimensions", None),
         ("velocity", (0.0, math.nan, 0.0)),
         ("orientation", ("1", "a", 0, 0)),
         ("angular_velocity", 0.5),

@@ -11,7 +11,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
@@ -304,16 +304,19 @@ class World(Service[W]):
         if listed != self._listed[0]:
             self._listed = listed, *self._described(listed)
         _, names, classes, assets = self._listed
+        tables = _tables(states)
+        turning = tables["angular_velocity"]
         return Scene(
             names=names,
             classes=classes,
             assets=assets,
-            position=_table(states, "position", [state.position for state in states], 3),
-            orientation=_table(states, "orientation", [state.orientation for state in states], 4),
-            velocity=_table(states, "velocity", [state.velocity for state in states], 3),
-            dimensions=_table(states, "dimensions", [state.dimensions for state in states], 3),
+            position=tables["position"],
+            orientation=tables["orientation"],
+            velocity=tables["velocity"],
+            dimensions=tables["dimensions"],
             devices=devices,
-            angular_velocity=_turning(states),
+            # Left out where nothing turns, so that such scenes stay as short.
+            angular_velocity=turning if turning.any() else None,
         )
 
     def _described(
@@ -350,29 +353,49 @@ def _may_begin(on: str, prefix: str) -> bool:
     return literal.startswith(prefix) or (literal != on and prefix.startswith(literal))
 
 
-def _turning(states: Sequence[ObjectState]) -> Float64Array | None:
-    """Angular velocities, Shape ``[N, 3]``; None where nothing turns, so that such scenes stay as short."""
-    still = (0.0, 0.0, 0.0)
-    given = [state.angular_velocity for state in states]
-    table = _table(states, "angular_velocity", [still if value is None else value for value in given], 3)
-    return table if table.any() else None
+_WIDTHS = {"position": 3, "orientation": 4, "velocity": 3, "dimensions": 3, "angular_velocity": 3}
+_STILL = (0.0, 0.0, 0.0)
 
 
-def _table(
-    states: Sequence[ObjectState], field: str, rows: Sequence[Sequence[float]], width: int
-) -> Float64Array:
-    """One row an object, Shape ``[N, width]``; raises `PayloadError` for an object whose row is none."""
+def _tables(states: Sequence[ObjectState]) -> dict[str, Float64Array]:
+    """Tables of the fields that are numbers, one row an object; raises `PayloadError` for others."""
+    lists: list[list[float]] = [[] for _ in _WIDTHS]
+    position, orientation, velocity, dimensions, turning = lists
     try:
-        # + 0.0: a negative zero and a zero are equal, so must their bytes be.
-        table = np.array(rows, dtype="<f8").reshape(len(rows), width) + 0.0
-        if np.isfinite(table).all():
-            return table
+        for state in states:
+            position += state.position
+            orientation += state.orientation
+            velocity += state.velocity
+            dimensions += state.dimensions
+            turning += _STILL if state.angular_velocity is None else state.angular_velocity
+        # One array of all numbers, cut up. + 0.0: −0 and 0 are equal, so must their bytes be.
+        numbers = np.array(position + orientation + velocity + dimensions + turning, dtype="<f8") + 0.0
+    except (TypeError, ValueError) as error:
+        raise _wrong(states) from error
+    count, tables, begin = len(states), {}, 0
+    if not np.isfinite(numbers).all() or [len(row) for row in lists] != [n * count for n in _WIDTHS.values()]:
+        raise _wrong(states)
+    for field, width in _WIDTHS.items():
+        tables[field] = numbers[begin : begin + count * width].reshape(count, width)
+        begin += count * width
+    return tables
+
+
+def _wrong(states: Sequence[ObjectState]) -> PayloadError:
+    """The error that names the first value of an object that is no row of numbers."""
+    values = ((state.name, field, getattr(state, field)) for state, field in product(states, _WIDTHS))
+    name, field, value = next(value for value in values if not _is_row(value[2], value[1]))
+    return PayloadError(f"object {name!r}: {field} is {value!r}; give it {_WIDTHS[field]} finite numbers")
+
+
+def _is_row(value: object, field: str) -> bool:
+    if value is None:
+        return field == "angular_velocity"
+    try:
+        row = np.array(value, dtype="<f8")
     except (TypeError, ValueError):
-        pass
-    if len(states) > 1:
-        for state, row in zip(states, rows, strict=True):
-            _table([state], field, [row], width)
-    raise PayloadError(f"object {states[0].name!r}: {field} is {rows[0]!r}; give it {width} finite numbers")
+        return False
+    return row.shape == (_WIDTHS[field],) and bool(np.isfinite(row).all())
 
 
 class Mounts:
