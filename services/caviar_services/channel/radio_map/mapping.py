@@ -38,7 +38,7 @@ _RAY_BEAM_BYTES, _CELL_BEAM_BYTES = 8, 20
 
 
 FLOOR_DB = 40.0
-"""[dB] below the noise down to which a cell has a signal, which a single ray of −174 dB in a building is not."""
+"""[dB] below the noise down to which a cell has a signal: a ray of −174 dB in a building is none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
