@@ -6,7 +6,7 @@
 //       void prepare() override { claim("car"); }
 //       std::vector<caviar::Object> step(double t, double, const std::vector<caviar::Command>&) override {
 //         caviar::Object car;
-//         car.name = car.kind = "car";
+//         car.name = car.class_ = "car";
 //         car.position = {10.0 * t, 0.0, 0.75};
 //         car.velocity = {10.0, 0.0, 0.0};
 //         car.dimensions = {4.5, 1.8, 1.5};
@@ -1269,11 +1269,20 @@ struct Pose {
   Vector3 angular_velocity{};
 };
 
+using Triangle = std::array<std::int32_t, 3>;  // corners, counter-clockwise seen from outside
+
+struct Mesh {
+  std::vector<Vector3> vertices;  // [m]
+  std::vector<Triangle> triangles;
+};
+
 // Axes and unit of length of an engine. Row i of `world` says which ENU axis (1 x, 2 y, 3 z, with its sign)
-// the engine's axis i is, `body` the same of forward, left, up; `unit` is the length in the engine of 1 m.
+// the engine's axis i is, `body` the same of forward, left, up; `unit` is the length in the engine of 1 m;
+// `clockwise`: how the engine has the corners of its triangles, as seen from outside.
 struct Axes {
   std::array<int, 3> world, body;
   double unit;
+  bool clockwise = false;
 
   Pose from_enu(const Pose& pose) const {
     return {scaled(unit, to(world, pose.position)), turned(world, body, pose.orientation),
@@ -1290,6 +1299,16 @@ struct Axes {
     Vector3 found = scaled(1 / unit, to(inverse(body), sides));
     for (double& side : found) side = std::fabs(side);
     return found;
+  }
+  // A mesh for `offer_mesh`, forward, left, up [m] and counter-clockwise as seen from outside, of one in the
+  // engine's body axes, unit and winding: clockwise in Unity and Godot, where the second and third corner
+  // change places; counter-clockwise in Unreal.
+  Mesh mesh_to_enu(const std::vector<Vector3>& vertices, const std::vector<Triangle>& triangles) const {
+    Mesh mesh{vertices, triangles};
+    for (Vector3& vertex : mesh.vertices) vertex = scaled(1 / unit, to(inverse(body), vertex));
+    for (Triangle& corners : mesh.triangles)
+      if (clockwise) std::swap(corners[1], corners[2]);
+    return mesh;
   }
 
  private:
@@ -1343,10 +1362,10 @@ struct Axes {
   }
 };
 
-inline Axes unreal() { return {{1, -2, 3}, {1, -2, 3}, 100.0}; }  // left-handed, cm: forward, right, up
-inline Axes unity() { return {{-2, 3, 1}, {-2, 3, 1}, 1.0}; }     // left-handed, m: right, up, forward
-inline Axes godot() { return {{-2, 3, -1}, {-2, 3, -1}, 1.0}; }   // right-handed, m: right, up, back
-inline Axes ned() { return {{2, 1, -3}, {1, -2, -3}, 1.0}; }      // right-handed, m: north, east, down
+inline Axes unreal() { return {{1, -2, 3}, {1, -2, 3}, 100.0}; }       // left-handed, cm: forward, right, up
+inline Axes unity() { return {{-2, 3, 1}, {-2, 3, 1}, 1.0, true}; }    // left-handed, m: right, up, forward
+inline Axes godot() { return {{-2, 3, -1}, {-2, 3, -1}, 1.0, true}; }  // right-handed, m: right, up, back
+inline Axes ned() { return {{2, 1, -3}, {1, -2, -3}, 1.0}; }           // right-handed, m: north, east, down
 
 // --- 6 objects and devices
 // -----------------------------------------------------------------------------------
@@ -1354,8 +1373,8 @@ inline Axes ned() { return {{2, 1, -3}, {1, -2, -3}, 1.0}; }      // right-hande
 // One object at one instant.
 struct Object {
   std::string name;    // begins with what `claim` declared; unique among objects and devices
-  std::string kind;    // its class: car, truck, bus, uav, pedestrian, …
-  std::string asset;   // what `offer_mesh` returned; empty: a box
+  std::string class_;  // car, truck, bus, uav, pedestrian, …
+  std::string mesh;    // that `offer_mesh` returned; empty: a box
   Vector3 position{};  // centre of the bounding box [m]
   Quaternion orientation{1.0, 0.0, 0.0, 0.0};  // body to world
   Vector3 velocity{};                          // world axes [m/s]
@@ -1528,25 +1547,45 @@ inline std::string wrong_object(const Object& object, const std::vector<std::str
                                 const std::map<std::string, Bytes>& files) {
   // Not `hypot` of three: that of libstdc++ 12 ignores a NaN.
   const auto length = [](const Vector3& v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); };
+  const auto shown = [](const auto& row) {
+    std::string text;
+    char number[32];
+    for (const double value : row) {
+      std::snprintf(number, sizeof number, "%.12g", value);
+      text += (text.empty() ? "(" : ", ") + std::string(number);
+    }
+    return text + ")";
+  };
   const Quaternion& q = object.orientation;
   const double norm = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  const std::string name = "object '" + object.name + "': ";
-  bool claimed = false;
-  for (const std::string& prefix : prefixes) claimed = claimed || object.name.rfind(prefix, 0) == 0;
-  if (!keeps_rule("NewName", object.name)) return name + "a name has 1 to 128 printable characters";
-  if (!claimed) return name + "its name begins with no prefix; call claim() for it in prepare()";
-  if (!keeps_rule("NewName", object.kind)) return name + "its kind is missing: car, uav, pedestrian, …";
-  if (!object.asset.empty() && !files.count(object.asset) && !is_mesh_name(object.asset))
-    return name + "asset '" + object.asset + "' was not offered; offer_mesh() returns its name";
+  const std::string who = "object '" + object.name + "': ";
+  const auto begins = [&](const std::string& prefix) { return object.name.rfind(prefix, 0) == 0; };
+  if (!keeps_rule("NewName", object.name))
+    return who + "name is '" + object.name + "'; give it 1 to 128 printable characters";
+  if (std::none_of(prefixes.begin(), prefixes.end(), begins)) {
+    std::string known;
+    for (const std::string& prefix : prefixes) known += (known.empty() ? "'" : ", '") + prefix + "'";
+    return who + "name begins with no prefix (" + known + "); call claim() for it in prepare()";
+  }
+  if (!keeps_rule("NewName", object.class_))
+    return who + "class_ is '" + object.class_ + "'; give it 1 to 128 printable characters: car, uav, …";
+  if (!object.mesh.empty() && !files.count(object.mesh) && !is_mesh_name(object.mesh))
+    return who + "mesh is '" + object.mesh + "', which was not offered; offer_mesh() returns its name";
   if (!(std::fabs(norm - 1.0) <= 1e-3))
-    return name + "its orientation has norm " + std::to_string(norm) + ", not 1";
-  if (!(length(object.position) <= 1e9)) return name + "its position is farther than 1e9 m, or no number";
-  if (!(length(object.velocity) < LIGHT_M_S)) return name + "its velocity is not below that of light";
+    return who + "orientation is " + shown(q) + "; give it a unit quaternion (w, x, y, z)";
+  for (const double coordinate : object.position)
+    if (!(std::fabs(coordinate) <= 1e9))
+      return who + "position is " + shown(object.position) + "; give it finite numbers of at most 1e9 m";
+  const double speed = length(object.velocity);
+  if (!(speed < LIGHT_M_S))
+    return who + "velocity is " + shown(object.velocity) + "; give it finite numbers, slower than light";
   for (const double side : object.dimensions)
-    if (!(side > 0.0 && side <= 1e5)) return name + "sides of its box are above 0 and at most 1e5 m";
-  const double corner = length(object.dimensions) / 2;
-  if (object.angular_velocity && !(length(*object.angular_velocity) * corner < LIGHT_M_S))
-    return name + "its angular velocity is not finite";
+    if (!(side > 0.0 && side <= 1e5))
+      return who + "dimensions are " + shown(object.dimensions) + "; give it sides above 0, at most 1e5 m";
+  const Vector3 turning = object.angular_velocity.value_or(Vector3{});
+  if (!(speed + length(turning) * length(object.dimensions) / 2 < LIGHT_M_S))
+    return who + "angular_velocity is " + shown(turning) +
+           "; give it finite numbers [rad/s] with which the corners are slower than light";
   return {};
 }
 
@@ -1559,7 +1598,7 @@ inline std::pair<Bytes, Bytes> encode_scene(std::vector<Object> objects,
   bool turns = false;
   const auto add = [](std::vector<double>& to, const auto& v) { to.insert(to.end(), v.begin(), v.end()); };
   for (const Object& object : objects) {
-    names.emplace_back(object.name), classes.emplace_back(object.kind), assets.emplace_back(object.asset);
+    names.emplace_back(object.name), classes.emplace_back(object.class_), assets.emplace_back(object.mesh);
     add(position, object.position), add(orientation, object.orientation), add(velocity, object.velocity);
     add(dimensions, object.dimensions), add(turning, object.angular_velocity.value_or(Vector3{}));
     turns = turns || object.angular_velocity.has_value();
@@ -1582,13 +1621,6 @@ inline std::pair<Bytes, Bytes> encode_scene(std::vector<Object> objects,
 // --- 7 meshes and scenery
 // ------------------------------------------------------------------------------------
 
-using Triangle = std::array<std::int32_t, 3>;  // corners, counter-clockwise seen from outside
-
-struct Mesh {
-  std::vector<Vector3> vertices;  // [m]
-  std::vector<Triangle> triangles;
-};
-
 // A part of the static scenery.
 struct Surface {
   std::string name;      // letters, digits, `_`, `-`, `.`; how products name it
@@ -1606,16 +1638,27 @@ struct Box {
   Vector3 centre{}, size{};
 };
 
+// Box around the vertices that are finite; all 0 where there is none.
 inline Box bounds(const std::vector<Vector3>& vertices) {
-  Box box;
-  for (std::size_t k = 0; k < 3 && !vertices.empty(); ++k) {
-    double least = vertices[0][k], most = least;
-    for (const Vector3& vertex : vertices)
-      least = std::min(least, vertex[k]), most = std::max(most, vertex[k]);
-    box.centre[k] = (least + most) / 2, box.size[k] = most - least;
+  std::optional<Vector3> least, most;
+  for (const Vector3& v : vertices) {
+    if (!std::isfinite(v[0]) || !std::isfinite(v[1]) || !std::isfinite(v[2])) continue;
+    if (!least) least = most = v;
+    for (std::size_t k = 0; k < 3; ++k)
+      (*least)[k] = std::min((*least)[k], v[k]), (*most)[k] = std::max((*most)[k], v[k]);
   }
+  Box box;
+  for (std::size_t k = 0; k < 3 && least; ++k)
+    box.centre[k] = ((*least)[k] + (*most)[k]) / 2, box.size[k] = (*most)[k] - (*least)[k];
   return box;
 }
+
+// A mesh that `offer_mesh` took, as objects have it.
+struct OfferedMesh {
+  std::string mesh;      // for `mesh` of objects; empty where it was refused, and they are boxes
+  Vector3 dimensions{};  // of its bounding box [m]
+  Vector3 centre{};      // of that box in the axes of the mesh [m]: where `position` of objects is
+};
 
 // An axis-aligned box as a mesh of twelve triangles.
 inline Mesh box_mesh(const Vector3& centre, const Vector3& size) {
@@ -1763,7 +1806,7 @@ class RunTimeMeshes {
     frame_ = frame + 1;
     if (max_faces == 0) return {};
     for (const Object& object : objects)
-      if (const auto used = used_.find(object.asset); used != used_.end()) used->second = frame;
+      if (const auto used = used_.find(object.mesh); used != used_.end()) used->second = frame;
     for (auto used = used_.begin(); used != used_.end();) {
       const bool gone = used->second + LINGER_FRAMES < frame;
       if (gone) files_.erase(used->first);
@@ -2232,12 +2275,13 @@ class World {
     return name;
   }
 
-  // Offers the mesh of objects, fitted into the unit box that `dimensions` scale; returns what goes into
-  // `asset`. In `prepare` it is there for the whole run. In `reset`, `step` and `restore` it comes while the
+  // Offers the mesh of objects, in body axes [m]; its file has it fitted into the unit box that `dimensions`
+  // scale. In `prepare` it is there for the whole run. In `reset`, `step` and `restore` it comes while the
   // run goes on, and stays as long as an object has it, and 20 frames longer, until the episode ends; a state
   // has no meshes, so that `restore` offers those of its objects again. One that is none is logged then, and
-  // its objects are boxes. `material`: of ITU-R P.2040; empty: what the channel's settings say.
-  std::string offer_mesh(const std::string& name, const std::vector<Vector3>& vertices,
+  // its objects are boxes, of at least 1 cm. `material`: of ITU-R P.2040; empty: what the channel's settings
+  // say.
+  OfferedMesh offer_mesh(const std::string& name, const std::vector<Vector3>& vertices,
                          const std::vector<Triangle>& triangles, const std::string& material = "") {
     const bool runs = stage_ >= Stage::ready;
     Mesh mesh{vertices, triangles};
@@ -2245,13 +2289,20 @@ class World {
     if (wrong.empty() && !material.empty()) wrong = wrong_material(material);
     const Box box = bounds(vertices);
     if (runs && wrong.empty()) wrong = wrong_at_run_time(mesh, box);
-    if (!wrong.empty() && !runs) return fail("mesh '" + name + "': " + wrong), "";
-    if (!wrong.empty()) return log_once("mesh '" + name + "': " + wrong + "; objects with it are boxes"), "";
+    OfferedMesh offered{"", box.size, box.centre};
+    if (!wrong.empty()) {
+      wrong = "mesh '" + name + "': " + wrong;
+      if (!runs) return fail(wrong), offered;
+      for (double& side : offered.dimensions) side = std::max(side, SMALLEST_M);
+      return log_once(wrong + "; objects with it are boxes"), offered;
+    }
     for (Vector3& vertex : mesh.vertices)
       for (std::size_t k = 0; k < 3; ++k)
         vertex[k] = box.size[k] > 0 ? (vertex[k] - box.centre[k]) / box.size[k] : 0.0;
-    if (runs) return run_time_meshes_.add(to_ply(mesh, material));
-    return offer_file("objects/" + name + ".ply", to_ply(mesh, material));
+    Bytes file = to_ply(mesh, material);
+    offered.mesh = runs ? run_time_meshes_.add(std::move(file))
+                        : offer_file("objects/" + name + ".ply", std::move(file));
+    return offered;
   }
 
   // Offers the static scenery, in world axes. At most one world of a run does. In `prepare`.
@@ -2296,6 +2347,7 @@ class World {
  private:
   enum class Stage : std::uint8_t { over, connecting, joined, ready, active };
   using Entries = std::initializer_list<Value::Entry>;
+  static constexpr double SMALLEST_M = 0.01;     // side of the box of a mesh that is refused and has none
   static constexpr std::size_t KEPT = 67108864;  // [B] of answers that are kept for a repeated GRANT
   static constexpr char MAGIC[] = "CAVIAR-WORLD-1\n";
 
@@ -2588,18 +2640,18 @@ class World {
     if (failure_.empty()) failure_ = wrong_objects(objects);
     if (!failure_.empty()) return fault("step", frame(), failure_);
     for (Object& object : objects) {
-      if (!is_mesh_name(object.asset)) continue;
+      if (!is_mesh_name(object.mesh)) continue;
       if (run_time_meshes_.max_faces == 0)
-        object.asset.clear();  // the run takes no meshes now
-      else if (!run_time_meshes_.has(object.asset))
-        log_once(object.asset + " is not there; objects with it are boxes until offer_mesh() brings it");
+        object.mesh.clear();  // the run takes no meshes now
+      else if (!run_time_meshes_.has(object.mesh))
+        log_once(object.mesh + " is not there; objects with it are boxes until offer_mesh() brings it");
     }
     const std::chrono::nanoseconds took = Clock::now() - began_;
     const std::optional<Value> change = run_time_meshes_.change(frame(), objects);
     std::map<std::string, Value> devices = mounts_.devices(objects);
     for (const Object& object : objects)
       if (devices.count(object.name))
-        return fault("step", frame(), "object '" + object.name + "' has a device's name");
+        return fault("step", frame(), "object '" + object.name + "': name is that of a device");
     auto [header, body] = encode_scene(std::move(objects), devices);
     if (header.size() > MAX_HEADER) return fault("step", frame(), "the header of the scene exceeds 1 MiB");
     Value product = Value::map({{"topic", "scene"}, {"digest", product_digest(header, body)}});
@@ -2616,7 +2668,7 @@ class World {
     std::map<std::string, bool> names;
     for (const Object& object : objects) {
       if (const std::string wrong = wrong_object(object, prefixes_, files_); !wrong.empty()) return wrong;
-      if (names.count(object.name)) return "object '" + object.name + "': its name occurs twice";
+      if (names.count(object.name)) return "object '" + object.name + "': name is in the frame twice";
       names[object.name] = true;
     }
     return {};

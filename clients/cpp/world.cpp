@@ -17,7 +17,7 @@ class Street : public caviar::World {
     Vector3 position{0.0, -20.0, 20.0}, target{20.0, -20.0, 20.0};
     double speed = 6.0, corners = 0.0;
   } uav_;
-  std::string car_mesh_;
+  caviar::OfferedMesh car_mesh_;
 
   void prepare() override {
     for (const char* name : {"car", "pedestrian", "ramp", "uav"}) claim(name);
@@ -48,7 +48,7 @@ class Street : public caviar::World {
 
   Object driven(double t) const {  // on a circle of 15 m, counter-clockwise with 9 m/s
     const double rate = 9.0 / 15.0, angle = rate * t;
-    Object car{"car", "car", car_mesh_, {15 * std::cos(angle), 15 * std::sin(angle), 0.75}};
+    Object car{"car", "car", car_mesh_.mesh, {15 * std::cos(angle), 15 * std::sin(angle), 0.75}};
     car.velocity = {-9 * std::sin(angle), 9 * std::cos(angle), 0.0};
     car.orientation = caviar::facing(car.velocity);
     car.dimensions = {4.5, 1.8, 1.5};
@@ -80,8 +80,8 @@ class Street : public caviar::World {
     const std::vector<Vector3> wedge{{0, 0, 0}, {2, 0, 0}, {2, 1, 0}, {0, 1, 0}, {0, 0, 1}, {0, 1, 1}};
     const std::vector<caviar::Triangle> sides{{0, 3, 2}, {0, 2, 1}, {0, 1, 4}, {3, 5, 2},
                                               {0, 4, 5}, {0, 5, 3}, {1, 2, 5}, {1, 5, 4}};
-    const std::string mesh = offer_mesh("ramp", wedge, sides, "wood");
-    return {"ramp", "ramp", mesh, {6.0, 2.0, 1.0}, {1, 0, 0, 0}, {}, {4.0, 2.0, 2.0}, {}};
+    const caviar::OfferedMesh ramp = offer_mesh("ramp", wedge, sides, "wood");
+    return {"ramp", "ramp", ramp.mesh, {6.0, 2.0, 1.0}, {1, 0, 0, 0}, {}, {4.0, 2.0, 2.0}, {}};
   }
 
   Bytes save() override { return Bytes(reinterpret_cast<const char*>(&uav_), sizeof uav_); }

@@ -5,9 +5,13 @@
 //     arrays HEADER BODY                  read a list of references
 //     mounts WELCOME                      adopt the devices of a WELCOME
 //     scene HEADER BODY NAME,NAME…        the scene of the objects of a scene, in the order in which they
-//     came axes ENGINE from|to NUMBER×13       a pose from ENU, or to it match PATTERN TEXT digest HEADER
-//     BODY geometry NAME DATA NAME DATA… schema                              the types of messages and
-//     payloads
+//                                         came
+//     axes ENGINE from|to NUMBER×13       a pose from ENU, or to it
+//     engine_mesh ENGINE N NUMBER×N CORNER…  a mesh to ENU: its N coordinates, its corners
+//     match PATTERN TEXT
+//     digest HEADER BODY
+//     geometry NAME DATA NAME DATA…
+//     schema                              the types of messages and payloads
 //
 // Bytes are hexadecimal digits behind an `x`, or `zeros:N`. With an endpoint and a name it is a world that
 // its settings set: `wrong` says what is wrong with its object, `deferred` that it answers frames later, as
@@ -202,8 +206,8 @@ static std::string scene(caviar::Mounts& mounts, const Bytes& header, const Byte
     for (std::size_t i = 0; i < found["names"].size(); ++i) {
       if (found["names"].at(i).text() != name) continue;
       caviar::Object object;
-      object.name = name, object.kind = found["classes"].at(i).text(),
-      object.asset = found["assets"].at(i).text();
+      object.name = name, object.class_ = found["classes"].at(i).text(),
+      object.mesh = found["assets"].at(i).text();
       for (std::size_t k = 0; k < 3; ++k)
         object.position[k] = position[3 * i + k], object.velocity[k] = velocity[3 * i + k],
         object.dimensions[k] = size[3 * i + k];
@@ -216,11 +220,31 @@ static std::string scene(caviar::Mounts& mounts, const Bytes& header, const Byte
   return "{\"header\": " + hex(again) + ", \"body\": " + hex(written) + "}";
 }
 
+static caviar::Axes engine_of(const std::string& name) {
+  return name == "unreal"  ? caviar::unreal()
+         : name == "unity" ? caviar::unity()
+         : name == "godot" ? caviar::godot()
+                           : caviar::ned();
+}
+
+static std::string engine_mesh(const std::vector<std::string>& words) {
+  caviar::Mesh mesh;
+  const std::size_t corners = 3 + std::stoul(words[2]);
+  const auto number = [&](std::size_t i) { return std::strtod(words[i].c_str(), nullptr); };
+  for (std::size_t i = 3; i < corners; i += 3)
+    mesh.vertices.push_back({number(i), number(i + 1), number(i + 2)});
+  for (std::size_t i = corners; i < words.size(); i += 3)
+    mesh.triangles.push_back({std::stoi(words[i]), std::stoi(words[i + 1]), std::stoi(words[i + 2])});
+  mesh = engine_of(words[1]).mesh_to_enu(mesh.vertices, mesh.triangles);
+  std::vector<Value> vertices, triangles;
+  for (const caviar::Vector3& vertex : mesh.vertices) vertices.emplace_back(vertex);
+  for (const caviar::Triangle& corners : mesh.triangles)
+    triangles.push_back(Value::list({corners[0], corners[1], corners[2]}));
+  return json(Value::map({{"vertices", Value::list(vertices)}, {"triangles", Value::list(triangles)}}));
+}
+
 static std::string axes(const std::vector<std::string>& words) {
-  const caviar::Axes engine = words[1] == "unreal"  ? caviar::unreal()
-                              : words[1] == "unity" ? caviar::unity()
-                              : words[1] == "godot" ? caviar::godot()
-                                                    : caviar::ned();
+  const caviar::Axes engine = engine_of(words[1]);
   double n[13] = {};
   for (std::size_t i = 0; i < 13; ++i) n[i] = std::strtod(words[3 + i].c_str(), nullptr);
   const caviar::Pose pose{
@@ -239,16 +263,18 @@ class Odd : public caviar::World {
 
   std::vector<caviar::Object> objects() {
     caviar::Object car;
-    car.name = car.kind = "car";
-    car.asset = spawned_;
+    car.name = car.class_ = "car";
+    car.mesh = crate_.mesh, car.dimensions = crate_.dimensions, car.position = crate_.centre;
     const std::string wrong = settings()["wrong"].text();
     if (wrong == "orientation") car.orientation = {2.0, 0.0, 0.0, 0.0};
     if (wrong == "dimensions") car.dimensions[1] = 0.0;
     if (wrong == "position") car.position[2] = std::nan("");
     if (wrong == "velocity") car.velocity[0] = 3e8;
-    if (wrong == "asset") car.asset = "objects/none.ply";
+    if (wrong == "unknown mesh") car.mesh = "objects/none.ply";
     if (wrong == "prefix") car.name = "tram";
-    if (wrong == "kind") car.kind = "";
+    if (wrong == "turning") car.angular_velocity = caviar::Vector3{0.0, 0.0, 4e8};
+    if (wrong == "no name") car.name = "";
+    if (wrong == "class") car.class_ = "";
     if (wrong == "device") car.name = "bs";
     if (wrong == "twice") return {car, car};
     return {car};
@@ -266,14 +292,15 @@ class Odd : public caviar::World {
   }
   void spawn_mesh(double t) {
     const std::string spawn = settings()["spawn"].text();
-    spawned_.clear();
+    crate_ = {"", {1.0, 1.0, 1.0}, {}};
     if (spawn.empty() || t < 0.05 || t > 0.35) return;
     caviar::Mesh mesh = caviar::box_mesh({}, {4.0, 2.0, 1.0});
     if (spawn == "nan") mesh.vertices[3][1] = std::nan("");
     if (spawn == "none") mesh.triangles.clear();
     if (spawn == "flat")
       for (caviar::Vector3& vertex : mesh.vertices) vertex[2] = 0.0;
-    spawned_ = offer_mesh("crate", mesh.vertices, mesh.triangles, spawn == "gold" ? "gold" : "wood");
+    for (caviar::Vector3& vertex : mesh.vertices) vertex[2] += 0.5;  // its origin is at its bottom
+    crate_ = offer_mesh("crate", mesh.vertices, mesh.triangles, spawn == "gold" ? "gold" : "wood");
   }
   std::vector<caviar::Object> step(double t, double, const std::vector<caviar::Command>&) override {
     spawn_mesh(t);
@@ -289,7 +316,7 @@ class Odd : public caviar::World {
     return objects();
   }
 
-  std::string spawned_;
+  caviar::OfferedMesh crate_{"", {1.0, 1.0, 1.0}, {}};
 };
 
 static int odd_world(const char* endpoint, const char* name) {
@@ -316,6 +343,7 @@ int main(int count, char** arguments) {
     if (what == "arrays") answer = arrays(bytes(words[1]), bytes(words[2]));
     if (what == "scene") answer = scene(mounts, bytes(words[1]), bytes(words[2]), words[3]);
     if (what == "axes") answer = axes(words);
+    if (what == "engine_mesh") answer = engine_mesh(words);
     if (what == "match")
       answer = caviar::Pattern::matches(bytes(words[1]), bytes(words[2])) ? "true" : "false";
     if (what == "digest") answer = json(caviar::product_digest(bytes(words[1]), bytes(words[2])));

@@ -106,15 +106,17 @@ def joined(program: Path, folder: Path, **welcome: Any) -> Iterator[Session]:
 @pytest.mark.parametrize(
     ("wrong", "line"),
     [
-        ("orientation", "object 'car': its orientation has norm 2.0"),
-        ("dimensions", "object 'car': sides of its box are above 0"),
-        ("position", "object 'car': its position is farther than 1e9 m, or no number"),
-        ("velocity", "object 'car': its velocity is not below that of light"),
-        ("asset", "asset 'objects/none.ply' was not offered; offer_mesh() returns its name"),
-        ("prefix", "object 'tram': its name begins with no prefix; call claim() for it in prepare()"),
-        ("kind", "object 'car': its kind is missing"),
-        ("twice", "object 'car': its name occurs twice"),
-        ("device", "object 'bs' has a device's name"),
+        ("orientation", "object 'car': orientation is (2, 0, 0, 0); give it a unit quaternion"),
+        ("dimensions", "object 'car': dimensions are (1, 0, 1); give it sides above 0"),
+        ("position", "object 'car': position is (0, 0, nan); give it finite numbers of at most 1e9 m"),
+        ("velocity", "object 'car': velocity is (300000000, 0, 0); give it finite numbers, slower than"),
+        ("turning", "object 'car': angular_velocity is (0, 0, 400000000); give it finite numbers"),
+        ("unknown mesh", "object 'car': mesh is 'objects/none.ply', which was not offered"),
+        ("prefix", "object 'tram': name begins with no prefix ('bs', 'car', 'sector'); call claim()"),
+        ("no name", "object '': name is ''; give it 1 to 128 printable characters"),
+        ("class", "object 'car': class_ is ''; give it 1 to 128 printable characters"),
+        ("twice", "object 'car': name is in the frame twice"),
+        ("device", "object 'bs': name is that of a device"),
     ],
 )
 def test_a_wrong_object_is_named_in_fault_before_it_leaves(
@@ -207,6 +209,11 @@ def test_a_mesh_that_is_none_or_that_the_run_does_not_take_leaves_a_box(
         begun(session, max_faces)
         frames = [session.step(EMPTY) for _ in range(4)]
         assert [assets_of(done) for done in frames] == [[""]] * 4
+        # What offer_mesh returned of the box is right all the same; a flat one is 1 cm high.
+        scene = decode_payload("scene", *frames[1].parts[1:3])
+        assert isinstance(scene, Scene)
+        height, middle = (0.01, 0.5) if spawn == "flat" else (1.0, 0.5)
+        assert [*scene.dimensions[0], *scene.position[0]] == [4.0, 2.0, height, 0.0, 0.0, middle]
         announced = [done.fields.get("geometry", {}).get("assets", []) for done in frames]
         assert announced == [[]] * 4
 

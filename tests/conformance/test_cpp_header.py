@@ -247,6 +247,13 @@ def test_poses_convert_to_and_from_an_engine(probe: Probe, engine: str) -> None:
                 np.testing.assert_allclose(found, right, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("engine", AXES["engines"])
+def test_a_mesh_converts_from_the_axes_and_winding_of_an_engine(probe: Probe, engine: str) -> None:
+    vertices, triangles = (np.ravel(AXES["meshes"][engine][part]) for part in ("vertices", "triangles"))
+    got = probe("engine_mesh", engine, len(vertices), *vertices, *triangles)
+    assert got == AXES["meshes"]["enu"]
+
+
 @pytest.mark.parametrize(
     ("engine", "right"),
     [("unreal", [0.01, 0.02, 0.03]), ("unity", [3, 1, 2]), ("godot", [3, 1, 2]), ("ned", [1, 2, 3])],

@@ -98,7 +98,7 @@ private:
 		Pose = caviar::unreal().to_enu(Pose);
 		caviar::Object Object;
 		Object.name = NameOf(Actor);
-		Object.kind = TagBehind(Actor, TEXT("car"));
+		Object.class_ = TagBehind(Actor, TEXT("car"));
 		Object.position = Pose.position, Object.orientation = Pose.orientation, Object.velocity = Pose.velocity;
 		Object.dimensions = caviar::unreal().dimensions_to_enu(Numbers(Box.GetSize() * Transform.GetScale3D()));
 		if (bSimulates) Object.angular_velocity = Pose.angular_velocity;
@@ -123,7 +123,7 @@ private:
 		const FIndexArrayView Corners = Detail.IndexBuffer.GetArrayView();
 		for (int32 Index = 0; Index + 2 < Corners.Num(); Index += 3)
 		{
-			// Unreal winds triangles clockwise in left-handed axes: seen from outside in ENU they are counter-clockwise.
+			// As seen from outside they are counter-clockwise in Unreal, as they are here.
 			Mesh.triangles.push_back({int32(Corners[Index]), int32(Corners[Index + 1]), int32(Corners[Index + 2])});
 		}
 		return Mesh;
