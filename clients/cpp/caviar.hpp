@@ -2248,8 +2248,9 @@ class World {
   // t0 is the simulated time of frame 0 [s].
   virtual void reset(std::int64_t seed, double t0) { static_cast<void>(seed), static_cast<void>(t0); }
 
-  // The objects at t [s since frame 0]. `previous` is that of the frame before, in frame 0 it is t: the world
-  // advances by t − previous. Objects that come in one frame get devices in the order of the list.
+  // The objects at t [s since frame 0 of the episode]. `previous` is that of the frame before, in frame 0 it
+  // is t: the world advances by t − previous. Objects that come in one frame get devices in the order of the
+  // list.
   virtual std::vector<Object> step(double t, double previous, const std::vector<Command>& commands) = 0;
 
   // State that outlives a frame, as bytes, and back; false refuses bytes that are none.

@@ -1024,6 +1024,18 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         }
     }
 
+    /// <summary>A mesh in body axes: rows of x, y, z, and of the vertices of each triangle.</summary>
+    public struct BodyMesh
+    {
+        public readonly IList<double[]> Vertices;
+        public readonly IList<int[]> Triangles;
+        public BodyMesh(IList<double[]> vertices, IList<int[]> triangles)
+        {
+            Vertices = vertices;
+            Triangles = triangles;
+        }
+    }
+
     /// <summary>Axes and unit of length of an engine, to and from those of the protocol (east, north, up;
     /// metres).</summary>
     /// <example><code>new WorldObject("car", "car", Axes.Unity.PoseToEnu(new Pose(position, orientation)),
@@ -1035,17 +1047,18 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             new double[,] { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, 1 } });
         /// <summary>Left-handed metres: x south and right, y up, z east and forward.</summary>
         public static readonly Axes Unity = new Axes(1,
-            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { 1, 0, 0 } });
+            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { 1, 0, 0 } }, null, true);
         /// <summary>Right-handed metres: x south and right, y up, z west and back.</summary>
         public static readonly Axes Godot = new Axes(1,
-            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { -1, 0, 0 } });
+            new double[,] { { 0, -1, 0 }, { 0, 0, 1 }, { -1, 0, 0 } }, null, true);
         /// <summary>North, east, down; bodies forward, right, down.</summary>
         public static readonly Axes Ned = new Axes(1,
             new double[,] { { 0, 1, 0 }, { 1, 0, 0 }, { 0, 0, -1 } },
             new double[,] { { 1, 0, 0 }, { 0, -1, 0 }, { 0, 0, -1 } });
 
         private readonly double _unit, _hand;
-        private readonly double[,] _world;
+        private readonly double[,] _world, _body;
+        private readonly bool _clockwise;
         private readonly double[] _left, _right;
 
         /// <summary>Axes of a convention of one's own.</summary>
@@ -1053,14 +1066,17 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <param name="world">Takes a direction in east, north, up to the engine's world axes.</param>
         /// <param name="body">Takes one in forward, left, up to the engine's body axes; null: the
         /// same.</param>
-        public Axes(double unit, double[,] world, double[,] body = null)
+        /// <param name="clockwise">How the engine has the corners of its triangles, as seen from outside.</param>
+        public Axes(double unit, double[,] world, double[,] body = null, bool clockwise = false)
         {
             _unit = unit;
             _world = world;
+            _body = body ?? world;
+            _clockwise = clockwise;
             _hand = Determinant(world);
             // W·R·Bᵀ with W = s·P and B = s·Q, P and Q rotations and s = ±1: the sign cancels.
             _left = QuaternionOf(world, _hand);
-            _right = Quaternions.Inverse(QuaternionOf(body ?? world, _hand));
+            _right = Quaternions.Inverse(QuaternionOf(_body, _hand));
         }
 
         public Pose PoseToEnu(Pose pose)
@@ -1085,6 +1101,15 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return new Motion(Forth(motion.Velocity, _unit), Forth(motion.AngularVelocity, _hand));
         }
 
+        /// <summary>A mesh for OfferMesh, forward, left, up [m] and counter-clockwise as seen from outside, of one
+        /// in the engine's body axes, unit and winding: clockwise in Unity and Godot, where the second and third
+        /// corner change places; counter-clockwise in Unreal.</summary>
+        public BodyMesh MeshToEnu(IList<double[]> vertices, IList<int[]> triangles)
+        {
+            return new BodyMesh(vertices.Select(vertex => Back(vertex, 1 / _unit, _body)).ToList(),
+                triangles.Select(t => _clockwise ? new[] { t[0], t[2], t[1] } : t).ToList());
+        }
+
         private double[] Forth(double[] v, double factor)
         {
             return Enumerable.Range(0, 3)
@@ -1092,10 +1117,12 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 .ToArray();
         }
 
-        private double[] Back(double[] v, double factor)
+        private double[] Back(double[] v, double factor) { return Back(v, factor, _world); }
+
+        private static double[] Back(double[] v, double factor, double[,] rows)
         {
             return Enumerable.Range(0, 3)
-                .Select(i => factor * (_world[0, i] * v[0] + _world[1, i] * v[1] + _world[2, i] * v[2]) + 0.0)
+                .Select(i => factor * (rows[0, i] * v[0] + rows[1, i] * v[1] + rows[2, i] * v[2]) + 0.0)
                 .ToArray();
         }
 
@@ -1200,6 +1227,21 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         }
     }
 
+    /// <summary>A mesh that OfferMesh took, as objects have it.</summary>
+    public sealed class OfferedMesh
+    {
+        /// <summary>For WorldObject.Mesh; empty where it was refused, and its objects are boxes.</summary>
+        public readonly string Mesh;
+        /// <summary>Sides of its bounding box [m]; middle of that box in the axes of the mesh [m], which is where
+        /// the Position of an object is.</summary>
+        public readonly double[] Dimensions, Centre;
+
+        public OfferedMesh(string mesh, double[] dimensions, double[] centre)
+        {
+            Mesh = mesh; Dimensions = dimensions; Centre = centre;
+        }
+    }
+
     /// <summary>Files that a world brings, made in memory.</summary>
     internal sealed class Assets
     {
@@ -1252,14 +1294,23 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return data;
         }
 
-        /// <summary>Vertices that fill the unit box, as the mesh of an object does.</summary>
-        public static List<double[]> InUnitBox(IList<double[]> vertices)
+        /// <summary>The box around the vertices that are finite; all 0 where there is none.</summary>
+        public static OfferedMesh BoxOf(IList<double[]> vertices)
         {
-            var low = Enumerable.Range(0, 3).Select(i => vertices.Min(v => v[i])).ToArray();
-            var high = Enumerable.Range(0, 3).Select(i => vertices.Max(v => v[i])).ToArray();
-            Func<double[], int, double> fitted =
-                (v, i) => high[i] > low[i] ? (v[i] - low[i]) / (high[i] - low[i]) - 0.5 : 0.0;
-            return vertices.Select(v => Enumerable.Range(0, 3).Select(i => fitted(v, i)).ToArray()).ToList();
+            var finite = vertices.Where(v => v.Take(3).All(x => !double.IsNaN(x) && !double.IsInfinity(x)))
+                .DefaultIfEmpty(new double[3]).ToList();
+            var low = Enumerable.Range(0, 3).Select(i => finite.Min(v => v[i])).ToArray();
+            var high = Enumerable.Range(0, 3).Select(i => finite.Max(v => v[i])).ToArray();
+            return new OfferedMesh("", high.Zip(low, (h, l) => h - l).ToArray(),
+                high.Zip(low, (h, l) => (h + l) / 2).ToArray());
+        }
+
+        /// <summary>Vertices that fill the unit box, as the mesh of an object does.</summary>
+        public static List<double[]> InUnitBox(IList<double[]> vertices, OfferedMesh box)
+        {
+            double[] side = box.Dimensions, centre = box.Centre;
+            return vertices.Select(v => Enumerable.Range(0, 3)
+                .Select(i => side[i] > 0 ? (v[i] - centre[i]) / side[i] : 0.0).ToArray()).ToList();
         }
 
         public void OfferScenery(string name, IEnumerable<SceneryMesh> meshes,
@@ -1434,9 +1485,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         /// <summary>[rad/s] in world axes; null where the world does not know it.</summary>
         public double[] AngularVelocity;
 
-        public WorldObject(string name, string kind, double[] position, double[] dimensions)
+        public WorldObject(string name, string @class, double[] position, double[] dimensions)
         {
-            Name = name; Class = kind; Position = position; Dimensions = dimensions;
+            Name = name; Class = @class; Position = position; Dimensions = dimensions;
         }
     }
 
@@ -1504,7 +1555,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                     + string.Join(", ", Prefixes) + "); add one in Prepare");
             Numbers(who + "position", item.Position, 3, 1e9);
             Numbers(who + "orientation", item.Orientation, 4, 2);
-            double norm = Math.Sqrt(item.Orientation.Sum(part => part * part));
+            double norm = Length(item.Orientation);
             if (Math.Abs(norm - 1) > 0.001)
                 throw new ArgumentException(who + "the quaternion has the norm " + norm + "; normalise it");
             Numbers(who + "velocity", item.Velocity, 3, LightSpeed);
@@ -1513,10 +1564,17 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
                 throw new ArgumentException(who + "dimensions are " + string.Join(", ", item.Dimensions)
                     + "; each has to be above 0 m");
             if (item.AngularVelocity != null) Numbers(who + "angular velocity", item.AngularVelocity, 3, 1e9);
+            double speed = Length(item.Velocity), corners = Length(item.AngularVelocity ?? new double[3])
+                * Length(item.Dimensions) / 2;
+            if (!(speed + corners < LightSpeed))
+                throw new ArgumentException(who + "velocity is " + string.Join(", ", item.Velocity)
+                    + ", its corners turn with " + corners + " m/s; together they have to be slower than light");
             if (item.Mesh != "" && HasMesh != null && !HasMesh(item.Mesh))
                 throw new ArgumentException(who + "the mesh '" + item.Mesh
                     + "' was not offered; take it from what OfferMesh returns");
         }
+
+        private static double Length(double[] v) { return Math.Sqrt(v.Sum(part => part * part)); }
 
         private static void Numbers(string what, double[] values, int count, double most)
         {
@@ -1967,6 +2025,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         private enum State { Connecting, Joined, Preparing, Ready, Active, Over }
 
         private static readonly byte[] StateMark = Bytes.Utf8("caviar-world-1\n");
+        private const double SmallestM = 0.01; // side of the box of a mesh that is refused and has none
         private const int DigestedBytes = 16 << 10, PoolRestMs = 200;
         private readonly AutoResetEvent _arrived = new AutoResetEvent(false);
         private readonly Assets _assets = new Assets();
@@ -2008,7 +2067,7 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
         protected virtual void Reset(long seed, double t0) { }
 
         /// <summary>The objects at an instant; null: not yet, ask again at the next Poll.</summary>
-        /// <param name="t">Time in the episode [s].</param>
+        /// <param name="t">Time since frame 0 of the episode [s].</param>
         /// <param name="previous">Time of the frame completed last; t itself for the first one.</param>
         /// <param name="commands">Of agents in the frame before, where Listen("action") was called.</param>
         protected abstract IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands);
@@ -2058,35 +2117,35 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             return _products.TryGetValue(topic, out found) ? found : new List<Map>();
         }
 
-        /// <summary>Bring the mesh of objects; the name of its asset, for WorldObject.Mesh. In Prepare it is
-        /// there for the whole run. In Reset, Step and Restore it comes while the run goes on, and stays as long
+        /// <summary>Bring the mesh of objects: what they have as Mesh and Dimensions. In Prepare it is there for the whole run. In Reset, Step and Restore it comes while the run goes on, and stays as long
         /// as an object has it, and 20 frames longer, until the episode ends; a state has no meshes, so that
-        /// Restore offers those of its objects again. One that is none is logged then, and the name is empty:
-        /// its objects are boxes.</summary>
-        /// <param name="vertices">In body axes (x forward, y left, z up) and any unit: they are fitted into
-        /// the unit box.</param>
+        /// Restore offers those of its objects again. One that is none is logged then, and its Mesh is empty:
+        /// its objects are boxes, of at least 1 cm.</summary>
+        /// <param name="vertices">In body axes (x forward, y left, z up) [m]; they are fitted into the unit box
+        /// that Dimensions scale.</param>
         /// <param name="material">Of Recommendation ITU-R P.2040; empty: what the channel's settings
         /// say.</param>
-        public string OfferMesh(string name, IList<double[]> vertices, IList<int[]> triangles,
+        public OfferedMesh OfferMesh(string name, IList<double[]> vertices, IList<int[]> triangles,
             string material = "")
         {
             bool runs = _state == State.Ready || _state == State.Active;
+            var box = Assets.BoxOf(vertices);
             try
             {
                 if (material != "" && !Material.Types.Contains(material))
                     throw new ArgumentException("mesh '" + name + "': no type is '" + material + "'; one of "
                         + string.Join(", ", Material.Types));
-                if (!runs)
-                    return _assets.Offer("objects/" + name + ".ply",
-                        Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
-                RunTimeMeshes.Check(name, vertices, triangles, _meshes.MaxFaces);
-                return _meshes.Add(Assets.Ply(name, Assets.InUnitBox(vertices), triangles, material));
+                if (runs) RunTimeMeshes.Check(name, vertices, triangles, _meshes.MaxFaces);
+                var file = Assets.Ply(name, Assets.InUnitBox(vertices, box), triangles, material);
+                string mesh = runs ? _meshes.Add(file) : _assets.Offer("objects/" + name + ".ply", file);
+                return new OfferedMesh(mesh, box.Dimensions, box.Centre);
             }
             catch (ArgumentException problem)
             {
                 if (!runs) throw;
                 LogOnce(problem.Message + "; objects with it are boxes");
-                return "";
+                return new OfferedMesh("", box.Dimensions.Select(side => Math.Max(side, SmallestM)).ToArray(),
+                    box.Centre);
             }
         }
 

@@ -12,9 +12,9 @@ using Caviar;
 internal sealed class Street : World
 {
     private const double Radius = 20, Speed = 10; // of the car [m, m/s]
-    private string _mesh;
+    private OfferedMesh _car;
     private double[] _uav, _wanted; // position [m]; velocity that was commanded [m/s], or null
-    // A wedge: x forward, y left, z up, in any unit.
+    // A wedge: x forward, y left, z up; objects scale it to their dimensions.
     private static readonly double[][] Wedge =
         { V(-1, -1, 0), V(1, -1, 0), V(1, 1, 0), V(-1, 1, 0), V(-1, -1, 1), V(-1, 1, 1) };
     private static readonly int[][] Sides =
@@ -23,7 +23,7 @@ internal sealed class Street : World
     protected override void Prepare()
     {
         Prefixes.AddRange(new[] { "car", "uav", "van" });
-        _mesh = OfferMesh("car", Wedge, Sides);
+        _car = OfferMesh("car", Wedge, Sides);
         double[][] ground = { V(-60, -60, 0), V(60, -60, 0), V(60, 60, 0), V(-60, 60, 0) };
         double[][] wall = { V(30, 30, 0), V(30, -30, 0), V(30, -30, 12), V(30, 30, 12) };
         int[][] square = { T(0, 1, 2), T(0, 2, 3) };
@@ -54,7 +54,7 @@ internal sealed class Street : World
         {
             new WorldObject("car", "car", place, V(4.5, 1.8, 1.5))
             {
-                Orientation = Quaternions.FromEuler(heading), Mesh = _mesh,
+                Orientation = Quaternions.FromEuler(heading), Mesh = _car.Mesh,
                 AngularVelocity = V(0, 0, turning),
                 Velocity = V(Speed * Math.Cos(heading), Speed * Math.Sin(heading), 0),
             },
@@ -65,7 +65,7 @@ internal sealed class Street : World
         {
             var van = new WorldObject("van", "truck", V(-40 + 16 * passing, 26, 1.25), V(5.5, 2.1, 2.5));
             van.Velocity = V(16, 0, 0);
-            van.Mesh = OfferMesh("van", Wedge, Sides, "metal"); // it comes while the run goes on
+            van.Mesh = OfferMesh("van", Wedge, Sides, "metal").Mesh; // it comes while the run goes on
             objects.Add(van);
         }
         return objects;

@@ -78,6 +78,12 @@ class LibraryTests:
     def test_poses_are_converted_to_the_axes_of_engines_and_back(self, ask: Ask) -> None:
         check_axes(ask)
 
+    def test_meshes_are_converted_from_the_axes_and_winding_of_engines(self, ask: Ask) -> None:
+        check_engine_meshes(ask)
+
+    def test_an_offered_mesh_says_its_name_sides_and_centre(self, ask: Ask) -> None:
+        check_offered(ask)
+
     def test_devices_are_mounted_as_the_vectors_say(self, ask: Ask) -> None:
         check_mounts(ask)
         check_matches(ask)
@@ -296,6 +302,23 @@ SPAWNED = (
     # A run that takes none.
     "limit 0|reset 0 0|add 01|frame 0 0",
 )
+
+
+def check_offered(ask: Ask) -> None:
+    """Name, sides and centre of meshes, offered before a run, while it goes on, and refused then."""
+    nan, sloping, flat = "x7ff8000000000000", "0 0 0.125 4 0 2.125 0 2 1", "0 0 0 4 0 0 0 2 0"
+    answers = ask("offered", [f"\t{sloping}", f"9\t{sloping}", f"9\t{flat}", f"9\t{sloping} {nan} 0 0"])
+    found = [
+        (mesh, *([number(word) for word in field.split()] for field in fields))
+        for mesh, *fields in (answer.split("\t") for answer in answers)
+    ]
+    box = ([4.0, 2.0, 2.0], [2.0, 1.0, 1.125])
+    assert found[0] == ("objects/car", *box)
+    assert found[1][1:] == box
+    assert found[1][0].startswith("objects/")
+    # A side of a refused mesh is at least 1 cm.
+    assert found[2] == ("", [4.0, 2.0, 0.01], [2.0, 1.0, 0.0])
+    assert found[3] == ("", *box)
 
 
 def check_spawned(ask: Ask) -> None:

@@ -6,6 +6,7 @@ using System.Collections.Generic;
 using System.Globalization;
 using System.IO;
 using System.Linq;
+using System.Reflection;
 using Caviar;
 
 internal static class Check
@@ -15,7 +16,8 @@ internal static class Check
         var answers = new Dictionary<string, Func<string[], string>>
         {
             { "vectors", Vector }, { "arrays", Elements }, { "axes", Converted }, { "mounts", Mounted },
-            { "match", Match }, { "mesh", Mesh }, { "spawned", Spawned }, { "spawn", Spawn },
+            { "match", Match }, { "mesh", Mesh }, { "engine_mesh", EngineMesh },
+            { "offered", Offered }, { "spawned", Spawned }, { "spawn", Spawn },
             { "users", Users }, { "paths", Paths }, { "commands", Commands },
         };
         foreach (var line in File.ReadAllLines(arguments[1]))
@@ -57,13 +59,38 @@ internal static class Check
                 : "")));
     }
 
+    private static readonly Dictionary<string, Axes> Engines = new Dictionary<string, Axes>
+    {
+        { "unreal", Axes.Unreal }, { "unity", Axes.Unity }, { "godot", Axes.Godot }, { "ned", Axes.Ned },
+    };
+
+    // engine, vertices, triangles: the same in ENU.
+    private static string EngineMesh(string[] fields)
+    {
+        var mesh = Engines[fields[0]].MeshToEnu(Rows(fields[1]), Triangles(fields[2]));
+        return Text(mesh.Vertices.SelectMany(row => row).ToArray()) + "\t"
+            + Text(mesh.Triangles.SelectMany(row => row).Select(corner => (double)corner).ToArray());
+    }
+
+    // MAX_FACES, the vertices of a mesh, offered before and, where MAX_FACES is given, while a run goes on: what
+    // OfferMesh returns.
+    private static string Offered(string[] fields)
+    {
+        var world = new Still { Log = line => { } };
+        Func<string, FieldInfo> own = name => typeof(World).GetField(name,
+            BindingFlags.Instance | BindingFlags.NonPublic);
+        var meshes = (RunTimeMeshes)own("_meshes").GetValue(world);
+        meshes.MaxFaces = fields[0] == "" ? 0 : long.Parse(fields[0]);
+        own("_state").SetValue(world, Enum.Parse(own("_state").FieldType, fields[0] == "" ? "Preparing" : "Ready"));
+        var found = world.OfferMesh("car", Rows(fields[1]), new[] { new[] { 0, 1, 2 } });
+        return string.Concat(found.Mesh.Take(11)) + "\t" + Text(found.Dimensions) + "\t" + Text(found.Centre);
+    }
+
     // engine, position, orientation, velocity, angular velocity in ENU: the same in the engine's axes, and
     // back.
     private static string Converted(string[] fields)
     {
-        var engines = new Dictionary<string, Axes> { { "unreal", Axes.Unreal }, { "unity", Axes.Unity },
-            { "godot", Axes.Godot }, { "ned", Axes.Ned } };
-        var axes = engines[fields[0]];
+        var axes = Engines[fields[0]];
         double[][] numbers = fields.Skip(1).Select(Numbers).ToArray();
         var pose = axes.PoseFromEnu(new Pose(numbers[0], numbers[1]));
         var motion = axes.MotionFromEnu(new Motion(numbers[2], numbers[3]));
@@ -181,8 +208,7 @@ internal static class Check
     {
         try
         {
-            var triangles = Rows(fields[3]).Select(row => row.Select(n => (int)n).ToArray()).ToList();
-            RunTimeMeshes.Check(fields[0], Rows(fields[2]), triangles, long.Parse(fields[1]));
+            RunTimeMeshes.Check(fields[0], Rows(fields[2]), Triangles(fields[3]), long.Parse(fields[1]));
             return "ok";
         }
         catch (ArgumentException problem) { return problem.Message; }
@@ -192,6 +218,11 @@ internal static class Check
     {
         var numbers = text == "" ? new double[0] : Numbers(text);
         return Enumerable.Range(0, numbers.Length / 3).Select(i => numbers.Skip(3 * i).Take(3).ToArray()).ToList();
+    }
+
+    private static List<int[]> Triangles(string text)
+    {
+        return Rows(text).Select(row => row.Select(n => (int)n).ToArray()).ToList();
     }
 
     private static string Text(double[] numbers)
