@@ -2167,8 +2167,8 @@ class World {
   double welcome_timeout_s = 120.0;  // for the first WELCOME
   int max_in_flight = 4;             // grants that may be queued
 
-  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 1 where this world failed or
-  // was refused, 128 + n after signal n.
+  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 1 where this world failed,
+  // was refused or has the blame, 128 + n after signal n.
   int run(const std::string& endpoint, const std::string& name) {
     leave_on_signals();
     if (connect(endpoint, name))
@@ -2182,7 +2182,7 @@ class World {
     endpoint_ = endpoint, name_ = name, status_ = 0, faulted_ = rejoining_ = false;
     std::string wrong;
     keys_ = Keys::from_environment(wrong);
-    if (!wrong.empty()) return end(wrong, 1);
+    if (!wrong.empty()) return end(wrong);
     context_ = zmq_ctx_new();
     deadline_ = Clock::now() + seconds(welcome_timeout_s);
     return open();
@@ -2198,11 +2198,11 @@ class World {
         status_ = 128 + stop_signal();
         break;
       }
-      if (!keep_connected()) break;
       std::vector<Bytes> parts;
-      // Not all that may come, so that a flood of messages does not hold an engine up.
+      // First what has come: the last words of a broker that is gone say why. Not all that may come, so that a flood of messages does not hold an engine up.
       for (int left = 64; left > 0 && socket_ && receive_parts(socket_, parts); --left)
         if (handle(std::move(parts)) || stage_ == Stage::over) return stage_ != Stage::over;
+      if (!keep_connected()) break;
       const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - Clock::now()).count();
       if (stage_ == Stage::over || left <= 0) break;
       // In slices, so that a signal or a silent broker is noticed.
@@ -2364,8 +2364,7 @@ class World {
     socket_ = open_dealer(context_, endpoint_, keys_, 1000);
     if (!socket_)
       return end("cannot connect to '" + endpoint_ + "': " + zmq_strerror(zmq_errno()) +
-                     "; an address is like tcp://127.0.0.1:5555",
-                 1);
+                     "; an address is like tcp://127.0.0.1:5555");
     stage_ = Stage::connecting;
     std::vector<Value> wanted;
     for (const Input& input : inputs()) {
@@ -2404,15 +2403,14 @@ class World {
     if (rejoining_) return lost("no WELCOME");
     return end("no WELCOME within " + std::to_string(static_cast<int>(welcome_timeout_s)) + " s from " +
                    endpoint_ +
-                   "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?",
-               1);
+                   "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?");
   }
 
   // A broker that waits for this world gets a new incarnation of it, on new sockets (SPEC.md, rejoin_ns).
   bool lost(const std::string& why) {
     const std::chrono::nanoseconds patience(welcome_["rejoin_ns"].integer());
     if (!rejoining_) give_up_at_ = Clock::now() + patience, pause_s_ = 0.1;
-    if (patience.count() == 0 || Clock::now() >= give_up_at_) return end(why, 1);
+    if (patience.count() == 0 || Clock::now() >= give_up_at_) return end(why);
     if (!rejoining_) log(why + "; coming back");
     rejoining_ = true, stage_ = Stage::connecting;
     heart_.stop();
@@ -2433,10 +2431,10 @@ class World {
     socket_ = context_ = nullptr, stage_ = Stage::over;
   }
 
-  bool end(const std::string& why, int status) {
+  bool end(const std::string& why) {
     log(why);
     close();
-    status_ = status == 0 && faulted_ ? 1 : status;
+    status_ = 1;
     return false;
   }
 
@@ -2467,7 +2465,7 @@ class World {
   bool handle(std::vector<Bytes> parts) {
     Message message;
     if (Problem problem = decode_message(std::move(parts), message)) {
-      if (problem.code == "version") return end(problem.message, 1);
+      if (problem.code == "version") return end(problem.message);
       return refuse(problem.code, problem.message, message.type ? message.type->tag : ""), false;
     }
     const Value& fields = message.fields;
@@ -2500,14 +2498,18 @@ class World {
 
   bool on_refuse(const Value& fields) {
     const std::string why = fields["code"].text() + ": " + fields["message"].text();
-    if (!rejoining_ || fields["code"].text() != "name-taken") return end(why, 1);
+    if (!rejoining_ || fields["code"].text() != "name-taken") return end(why);
     lost(why);
     return false;
   }
 
   bool on_shutdown(const Value& fields) {
-    log("the run is over: " + fields["reason"].text());
+    const std::string reason = fields["reason"].text();
+    // A reason that blames a service begins with its role and name.
+    const bool blamed = faulted_ || reason.rfind("world '" + name_ + "' ", 0) == 0;
+    log("the run is over: " + reason);
     leave("");
+    status_ = blamed ? 1 : 0;
     return false;
   }
 
@@ -2731,7 +2733,7 @@ class World {
     run_time_meshes_.reset(was_here_before(), fields["frame"].integer() + 1);
     if (!right || !restore(state.substr(begin + length)) || !failure_.empty()) {
       fault("restore", -1, failure_.empty() ? "RESTORE has a state that is none of this world" : failure_);
-      return end("it cannot go on from the state that it was given", 1);
+      return end("it cannot go on from the state that it was given");
     }
     std::vector<std::string> arrived;
     for (const Value& name : head["arrived"].items()) arrived.push_back(name.text());

@@ -2355,7 +2355,9 @@ Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.
             if (_heart != null) _heart.Progress();
             if (type == "SHUTDOWN" && _state != State.Connecting)
             {
-                Leave(0, message.Text("reason"));
+                // A reason that blames a service begins with its role and name.
+                string reason = message.Text("reason");
+                Leave(reason.StartsWith("world '" + Name + "' ", StringComparison.Ordinal) ? 1 : 0, reason);
                 return;
             }
             if (type == "REFUSE" && _state == State.Connecting) { Refused(message); return; }

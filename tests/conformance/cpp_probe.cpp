@@ -14,7 +14,7 @@
 //     schema                              the types of messages and payloads
 //
 // Bytes are hexadecimal digits behind an `x`, or `zeros:N`. With an endpoint and a name it is a world that
-// its settings set: `wrong` says what is wrong with its object, `deferred` that it answers frames later, as
+// its settings set: `how` that its steps fail or are late, `wrong` says what is wrong with its object, `deferred` that it answers frames later, as
 // an engine does, and it looks at links and channels. `spawn` has its car bring a mesh in frames 1 to 3, which
 // is `right`, or wrong in one of several ways.
 #include <iostream>
@@ -302,8 +302,13 @@ class Odd : public caviar::World {
     for (caviar::Vector3& vertex : mesh.vertices) vertex[2] += 0.5;  // its origin is at its bottom
     crate_ = offer_mesh("crate", mesh.vertices, mesh.triangles, spawn == "gold" ? "gold" : "wood");
   }
-  std::vector<caviar::Object> step(double t, double, const std::vector<caviar::Command>&) override {
+  std::vector<caviar::Object> step(double t, double previous,
+                                   const std::vector<caviar::Command>&) override {
+    const std::string how = settings()["how"].text();
+    if (how == "fail") fail("it fails");
+    if (how == "late") std::this_thread::sleep_for(std::chrono::milliseconds(1500));
     spawn_mesh(t);
+    if (!how.empty()) crate_.centre = {t, previous, 0.75};
     for (const caviar::Ray& ray : rays())
       if (ray.a.empty() || !(ray.tau > 0)) fail("a ray has no amplitude");
     for (const caviar::LinkUser& user : link_users())

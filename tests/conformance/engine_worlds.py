@@ -605,6 +605,41 @@ def check_slow_and_wrong(folder: Path, command: Sequence[str]) -> None:
     assert [scene.position[0, 1] for scene in scenes if scene is not None] == [3, 6, 9, 12, 15]
 
 
+ENDS = {
+    "right": (0, "the run is complete"),
+    "fail": (1, "world 'world' failed in frame 0, step: it fails"),
+    "late": (1, "world 'world' overran its budget (policy abort) in frame 0"),
+}
+"""Status and last line of a world whose setting ``how`` says what its steps do: ``late`` ones take 1.5 s."""
+
+
+def ending(folder: Path, how: str) -> Path:
+    """A scenario of two episodes for a world of `ENDS`, whose broker is gone before a late step ends."""
+    limit = 'budget_ms = 200, policy = "abort"' if how == "late" else "budget_ms = 1000"
+    text = BARE.replace("budget_ms = 1000", f'{limit}, settings = {{ how = "{how}" }}', 1)
+    text = text.replace("frames = 20", "frames = 3\nepisodes = 2")
+    scenario = folder / "ending.toml"
+    scenario.write_text(
+        text + "\n[timeouts]\nshutdown_s = 0.2\nheartbeat_s = 0.1\nliveness_s = 0.5\n", "utf-8"
+    )
+    return scenario
+
+
+def check_end(how: str, command: Sequence[str | Path], mark: str, out: Path) -> None:
+    """A world ends as `ENDS` says; times of its steps, x and y of its object, begin at 0 in each episode."""
+    done = subprocess.run(
+        command, env=environment(mark), capture_output=True, text=True, timeout=WITHIN_S, check=False
+    )
+    status, line = ENDS[how]
+    assert line in done.stderr.splitlines()[-1], done.stderr
+    assert done.returncode == status, done.stderr
+    if how == "right":
+        eventually(lambda: bool(list(out.glob("*/summary.json"))), WITHIN_S, "the run is over")
+        scenes = [frame.scene() for frame in Recording(next(out.glob("*/")))]
+        times = [tuple(scene.position[0, :2].tolist()) for scene in scenes if scene is not None]
+        assert times == [(0, 0), (0.1, 0), (0.2, 0.1)] * 2
+
+
 def check_no_gateway(command: Sequence[str]) -> None:
     """An address of ZeroMQ, and half of one, are refused at once, with what to write."""
     for address in ("tcp://127.0.0.1:5570", "127.0.0.1:8080"):

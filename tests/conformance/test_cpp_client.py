@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import engine_worlds as worlds
 import msgpack
 import numpy as np
 import pytest
@@ -259,6 +260,21 @@ def test_a_world_that_lost_the_broker_comes_back_under_its_name(world: Path, tmp
         back.expect("BYE")
 
 
+@pytest.mark.parametrize("how", worlds.ENDS)
+def test_the_end_of_a_run_is_told_with_its_reason_and_status(odd: Path, tmp_path: Path, how: str) -> None:
+    with waiting_run(worlds.ending(tmp_path, how), tmp_path) as run:
+        worlds.check_end(how, [odd, run.endpoint, "world"], run.mark, run.out)
+
+
+def test_times_of_steps_count_from_the_begin_of_their_episode(odd: Path, tmp_path: Path) -> None:
+    with joined(odd, tmp_path, settings={"how": "right"}) as session:
+        session.prepare(inputs=EMPTY)
+        session.reset(0, t0_ns=-(10**9))
+        scene = decode_payload("scene", *session.step(EMPTY).parts[1:3])
+        assert isinstance(scene, Scene)
+        assert scene.position[0, :2].tolist() == [1, 1]
+
+
 def wait_for_hello(wire: Wire) -> Received:
     """The next HELLO, where heartbeats remain without an answer."""
     for _ in range(round(WITHIN_S / 0.05)):
@@ -318,7 +334,7 @@ class Run:
     """A run that waits for the world."""
 
     def __init__(self, process: subprocess.Popen[str], mark: str, out: Path) -> None:
-        self._process, self._mark, self.out = process, mark, out
+        self._process, self.mark, self.out = process, mark, out
         self.output = ""
         eventually(lambda: bool(self._status()), WITHIN_S, "the run listens")
         self.endpoint = str(self._status()["endpoint"])
@@ -337,7 +353,7 @@ class Run:
 
     @contextmanager
     def world(self, program: Path) -> Iterator[subprocess.Popen[bytes]]:
-        with subprocess.Popen([program, self.endpoint, "world"], env=environment(self._mark)) as process:
+        with subprocess.Popen([program, self.endpoint, "world"], env=environment(self.mark)) as process:
             try:
                 yield process
             finally:

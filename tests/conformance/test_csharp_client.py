@@ -85,6 +85,12 @@ def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path,
     worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
 
 
+@pytest.mark.parametrize("how", worlds.ENDS)
+def test_the_end_of_a_run_is_told_with_its_reason_and_status(build: Path, tmp_path: Path, how: str) -> None:
+    with worlds.waiting_run(worlds.ending(tmp_path, how), tmp_path, frames=3) as run:
+        worlds.check_end(how, ["mono", build / "Slow.exe", run.url, "world"], run.mark, run.out)
+
+
 def test_an_address_that_is_no_gateways_is_refused_at_once(command: list[str]) -> None:
     worlds.check_no_gateway(command)
 

@@ -1,5 +1,8 @@
-// A world that takes three ticks for a frame, and in frame 5 has an object whose name no prefix begins.
+// A world that takes three ticks for a frame, and in frame 5 has an object whose name no prefix begins. With the
+// setting `how` it answers at once, with its times in the object's position, fails or is late.
+using System;
 using System.Collections.Generic;
+using System.Threading;
 using Caviar;
 
 internal sealed class Slow : World
@@ -10,8 +13,12 @@ internal sealed class Slow : World
 
     protected override IEnumerable<WorldObject> Step(double t, double previous, IList<Command> commands)
     {
-        if (++_ticks % 3 != 0) return null;
-        return new[] { new WorldObject(Frame < 5 ? "car" : "lorry", "car", new[] { t, _ticks, 0.75 },
+        string how = Settings.Text("how");
+        if (how == "fail") throw new InvalidOperationException("it fails");
+        if (how == "late") Thread.Sleep(1500);
+        if (how == "" && ++_ticks % 3 != 0) return null;
+        double y = how == "" ? _ticks : previous;
+        return new[] { new WorldObject(Frame < 5 ? "car" : "lorry", "car", new[] { t, y, 0.75 },
             new[] { 4.5, 1.8, 1.5 }) };
     }
 
