@@ -10,6 +10,7 @@ from pathlib import Path
 import engine_worlds as worlds
 import pytest
 from scenarios_support import ROOT
+from vector_files import load
 
 pytestmark = pytest.mark.slow
 
@@ -85,7 +86,13 @@ def test_a_frame_may_take_several_ticks_and_a_wrong_object_is_named(build: Path,
     worlds.check_slow_and_wrong(tmp_path, ["mono", str(build / "Slow.exe")])
 
 
-@pytest.mark.parametrize("how", worlds.ENDS)
+def test_an_object_as_fast_as_light_is_refused_with_its_values(ask: worlds.Ask) -> None:
+    welcome = f"welcome\t{load('welcome_mounts').header.hex()}"
+    _, answer = ask("mounts", [welcome, "car.1|car|0 0 1|1 0 0 0|2e8 0 2.5e8|4 2 2"])
+    assert answer.startswith("object 'car.1': velocity is 200000000, 0, 250000000")
+
+
+@pytest.mark.parametrize("how", ["right", "late"])
 def test_the_end_of_a_run_is_told_with_its_reason_and_status(build: Path, tmp_path: Path, how: str) -> None:
     with worlds.waiting_run(worlds.ending(tmp_path, how), tmp_path, frames=3) as run:
         worlds.check_end(how, ["mono", build / "Slow.exe", run.url, "world"], run.mark, run.out)
