@@ -77,6 +77,7 @@ def run_info(
         seed=welcome.seed,
         sampling_period_ns=int(scenario.get("sampling_period_ns", 1)),
         frames=int(scenario.get("frames", 1)),
+        episodes=int(scenario.get("episodes", 1)),
         carriers=msgspec.convert(scenario.get("carriers", ()), tuple[Carrier, ...]),
         devices=msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...]),
         scenario=scenario.get("resolved", {}),
