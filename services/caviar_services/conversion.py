@@ -68,6 +68,9 @@ def run_info(
         >>> welcome = m.Welcome(version=m.PROTOCOL_VERSION, epoch=2, attempt=1, run="demo", seed=1, **times)
         >>> run_info("agent", welcome, lambda phase, grace_s: None).again  # the broker was restarted
         True
+        >>> welcome = msgspec.structs.replace(welcome, scenario={"episodes": 2})
+        >>> run_info("agent", welcome, lambda phase, grace_s: None).episodes
+        2
     """
     scenario = welcome.scenario
     return RunInfo(
