@@ -12,6 +12,7 @@ scenario="geometric")`` needs no other import. Ray tracer, SUMO and broker are l
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,9 @@ def run(
     *,
     frames: int | None = None,
     seed: int | None = None,
+    episodes: int | None = None,
+    settings: Sequence[str] = (),
+    record: str | Sequence[str] | None = None,
     out: str | Path = "runs",
     embedded: bool = False,
     progress: bool = False,
@@ -68,6 +72,11 @@ def run(
         scenario: Name of a scenario that ships, or a TOML file.
         frames: Frames of each episode; None for those of the scenario.
         seed: Of all random numbers, from 0 to 2⁶³ − 1; None for that of the scenario.
+        episodes: Of the run; None for those of the scenario.
+        settings: ``KEY=VALUE`` each, in place of the scenario's, as ``--set`` of the command:
+            ``["services.channel.settings.samples=1000"]``.
+        record: Topics to record, ``["scene", "channel.h"]`` or ``"scene,channel.h"``; None for those of the
+            scenario.
         out: Directory in which the run's own is made.
         embedded: Whether all services run in this process, without sockets; the digest is the same.
         progress: Whether to print what ``caviar run`` prints.
@@ -89,10 +98,13 @@ def run(
     from rich.console import Console
 
     from caviar_clients.cli.run import run_scenario
+    from caviar_clients.cli.shared import keys_set
     from caviar_protocol.errors import RunError
 
     console = Console(quiet=not progress)
-    outcome = run_scenario(Path(scenario), Path(out), console, frames, seed, embedded=embedded)
+    topics = record if record is None or isinstance(record, str) else ",".join(record)
+    keys = keys_set(settings, topics, episodes)
+    outcome = run_scenario(Path(scenario), Path(out), console, frames, seed, embedded=embedded, settings=keys)
     if outcome.status:
         raise RunError(f"the run in {outcome.directory} ended early: {outcome.error}")
     return outcome.directory

@@ -17,7 +17,7 @@ class Street:
 	# A wedge: x forward, y left, z up, in any unit.
 	const WEDGE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 1], [-1, 1, 1]]
 	const SIDES = [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]]
-	var mesh = ""
+	var mesh = {}
 	var uav = []  # position [m]
 	var wanted = null  # velocity that was commanded [m/s], or null
 
@@ -53,7 +53,7 @@ class Street:
 		car["orientation"] = Axes.from_euler(heading)
 		car["velocity"] = [SPEED * cos(heading), SPEED * sin(heading), 0.0]
 		car["angular_velocity"] = [0.0, 0.0, turning]
-		car["mesh"] = mesh
+		car["mesh"] = mesh["mesh"]
 		var flying = object("uav", "uav", uav.duplicate(), [0.6, 0.6, 0.25])
 		flying["velocity"] = velocity
 		var passing = fmod(t, 10.0) - 2.0  # of the van: it is there from 2 s until 7 s of every 10 s
@@ -61,7 +61,7 @@ class Street:
 			return [car, flying]
 		var van = object("van", "truck", [-40.0 + 16.0 * passing, 26.0, 1.25], [5.5, 2.1, 2.5])
 		van["velocity"] = [16.0, 0.0, 0.0]
-		van["mesh"] = offer_mesh("van", WEDGE, SIDES, "metal")  # it comes while the run goes on
+		van["mesh"] = offer_mesh("van", WEDGE, SIDES, "metal")["mesh"]  # it comes while the run goes on
 		return [car, flying, van]
 
 	func save():

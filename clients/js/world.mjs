@@ -34,20 +34,19 @@ class Street extends World {
   }
 
   reset(seed, t0, episode) {
-    this.t0 = t0;
     this.phase = generator(seed, episode, "car")(); // where on its circle the car begins, in turns
     this.uav = { position: POINTS[0], target: POINTS[1], next: 2, speed: UAV_M_S };
   }
 
   step(t, previous, commands) {
-    this.objects = [this.carAt(t - this.t0), this.fly(t - previous, commands), ...this.truckAt(t - this.t0)];
+    this.objects = [this.carAt(t), this.fly(t - previous, commands), ...this.truckAt(t)];
     return this.objects;
   }
 
-  carAt(elapsed) {
-    const turning = CAR_M_S / CIRCLE_M, angle = 2 * Math.PI * this.phase + turning * elapsed;
+  carAt(t) {
+    const turning = CAR_M_S / CIRCLE_M, angle = 2 * Math.PI * this.phase + turning * t;
     return {
-      name: "car", class: "car", asset: this.car.asset, dimensions: this.car.dimensions,
+      name: "car", class: "car", mesh: this.car.mesh, dimensions: this.car.dimensions,
       position: [CIRCLE_M * cos(angle), CIRCLE_M * sin(angle), 0.75],
       orientation: quaternion(angle + Math.PI / 2),
       velocity: [-CAR_M_S * sin(angle), CAR_M_S * cos(angle), 0],
@@ -68,15 +67,15 @@ class Street extends World {
     return { name: "uav", class: "uav", dimensions: [0.6, 0.6, 0.25], position: this.uav.position, velocity };
   }
 
-  truckAt(elapsed) {
-    const number = Math.floor(elapsed / TRUCK_EVERY_S), since = elapsed - number * TRUCK_EVERY_S;
+  truckAt(t) {
+    const number = Math.floor(t / TRUCK_EVERY_S), since = t - number * TRUCK_EVERY_S;
     if (since >= TRUCK_STAYS_S) return [];
     // Its mesh comes with it, while the run goes on: a wedge.
     const wedge = [[-4, -1, 0], [4, -1, 0], [4, 1, 0], [-4, 1, 0], [-4, -1, 3], [-4, 1, 3]];
     const sides = [[0, 3, 2], [0, 2, 1], [0, 1, 4], [3, 5, 2], [0, 4, 5], [0, 5, 3], [1, 2, 5], [1, 5, 4]];
-    const { asset, dimensions } = this.offerMesh("truck", wedge, sides, "metal");
+    const { mesh, dimensions } = this.offerMesh("truck", wedge, sides, "metal");
     const position = [TRUCK_M_S * (since - TRUCK_STAYS_S / 2), -20, 1.5], velocity = [TRUCK_M_S, 0, 0];
-    return [{ name: `truck.${number}`, class: "truck", asset, dimensions, position, velocity }];
+    return [{ name: `truck.${number}`, class: "truck", mesh, dimensions, position, velocity }];
   }
 
   save() { return this.uav; }

@@ -59,7 +59,7 @@ class Street(Engine):
         velocity = (-CAR_M_S * math.sin(angle), CAR_M_S * math.cos(angle), 0.0)
         half = (angle + math.pi / 2) / 2
         heading = (math.cos(half), 0.0, 0.0, math.sin(half))
-        return ObjectState("car", "car", at, heading, velocity, (dx, dy, dz), rate, mesh=self.car.mesh)
+        return ObjectState("car", "car", at, heading, velocity, (dx, dy, dz), (0.0, 0.0, rate), self.car.mesh)
 
     def flown(self, seconds, orders):
         way = np.subtract(self.uav["target"], self.uav["position"])

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
+import numpy as np
 from scenarios_support import ROOT, blocks, environment, eventually, recorded_below, running
 from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
@@ -166,6 +167,20 @@ def check_axes(ask: Ask) -> None:
         for expected, there in ((pose[engine], got[:4]), (pose["enu"], got[4:])):
             for key, numbers in zip(keys, there, strict=True):
                 assert _alike(numbers, expected[key], key == "orientation"), f"{engine} {key}: {numbers}"
+
+
+def check_engine_meshes(ask: Ask) -> None:
+    """Meshes in the axes, unit and winding of each engine."""
+    meshes = json.loads((ROOT / "clients" / "axes.json").read_text("utf-8"))["meshes"]
+    engines = [key for key in meshes if key not in ("about", "enu")]
+    parts = ("vertices", "triangles")
+    lines = [
+        "\t".join([name, *(_numbers(np.ravel(meshes[name][part])) for part in parts)]) for name in engines
+    ]
+    for engine, answer in zip(engines, ask("engine_mesh", lines), strict=True):
+        for part, field in zip(parts, answer.split("\t"), strict=True):
+            got = [number(word) for word in field.split()]
+            assert got == np.ravel(meshes["enu"][part]).tolist(), f"{engine} {part}: {got}"
 
 
 def _alike(got: list[float], expected: list[float], is_rotation: bool) -> bool:

@@ -142,8 +142,8 @@ test("what no consumer would accept is named", () => {
     ],
     [{ dimensions: [4, 0, 1] }, /dimensions are \[4, 0, 1\]; give sides above 0/],
     [
-      { asset: "objects/car.ply" },
-      /asset is "objects\/car.ply", which was not offered; take it from what offerMesh returns/,
+      { mesh: "objects/car.ply" },
+      /mesh is "objects\/car.ply", which was not offered; take it from what offerMesh returns/,
     ],
   ];
   for (const [change, told] of wrong)
@@ -181,7 +181,7 @@ test("a mesh in metres becomes one of the unit box, and says its size", () => {
     [1, 2, 3],
     [2, 0, 3],
   ]);
-  assert.deepEqual(mesh, { asset: "objects/tent.ply", dimensions: [4, 2, 3], centre: [2, 0, 1.5] });
+  assert.deepEqual(mesh, { mesh: "objects/tent.ply", dimensions: [4, 2, 3], centre: [2, 0, 1.5] });
   const [{ size, digest }] = assets.listed;
   const { piece } = assets.piece(digest, 0);
   assert.equal(piece.length, size);
@@ -381,8 +381,8 @@ async function spawning(step, { max_faces = 100, attempt = 1 } = {}) {
 test("a mesh that comes while the run goes on is announced, served, and goes after its objects", async () => {
   let shown = false;
   const world = await spawning(function () {
-    const { asset, dimensions } = shown ? this.offerMesh("car", WEDGE.vertices, WEDGE.triangles, "wood") : {};
-    return [{ ...CAR, ...(shown && { asset, dimensions }) }];
+    const { mesh, dimensions } = shown ? this.offerMesh("car", WEDGE.vertices, WEDGE.triangles, "wood") : {};
+    return [{ ...CAR, ...(shown && { mesh, dimensions }) }];
   });
   assert.equal((await world.frame(0)).geometry, undefined);
   shown = true;
@@ -410,8 +410,8 @@ test("a mesh that is none while the run goes on leaves a box, and is said once",
   ];
   const world = await spawning(function () {
     return wrong.map(([name, points, corners]) => {
-      const { asset, dimensions } = this.offerMesh(name, points, corners);
-      return { ...CAR, name: `car.${name}`, asset, dimensions };
+      const { mesh, dimensions } = this.offerMesh(name, points, corners);
+      return { ...CAR, name: `car.${name}`, mesh, dimensions };
     });
   });
   for (const frame of [0, 1]) {
@@ -439,11 +439,19 @@ test("meshes are announced once more by a process that was started again, not wh
   assert.deepEqual((await world.frame(1)).geometry, { frame: 1, assets: [] });
 });
 
-test("times are those of the grant and of the frame before it", () => {
+test("times count from frame 0 of their episode", async () => {
   const world = welcomed(new World({ prefixes: ["car"] }));
-  world.began({ seed: 1n, t0_ns: 5_000_000_000n, seed_episode: 0 });
-  assert.deepEqual(world.times({ t_ns: 5_000_000_000n, previous_frame: -1 }), [5, 5]);
-  assert.deepEqual(world.times({ t_ns: 5_700_000_000n, previous_frame: 3 }), [5.7, 5.3]);
+  for (const t0_ns of [0n, 5_000_000_000n]) {
+    await world.began({ seed: 1n, t0_ns, seed_episode: 0 });
+    assert.deepEqual(world.times({ t_ns: t0_ns, previous_frame: -1 }), [0, 0]);
+    assert.deepEqual(world.times({ t_ns: t0_ns + 700_000_000n, previous_frame: 3 }), [0.7, 0.3]);
+  }
+});
+
+test("rows of a mesh may be given one after the other, and what is none is refused by offerMesh", () => {
+  const { vertices, triangles } = THREE.meshToEnu(new Float32Array([1, 2, 3, 4]), new Uint16Array([0, 1]));
+  assert.deepEqual(vertices[0], [-3, -1, 2]);
+  assert.throws(() => new Assets().offerMesh("car", vertices, triangles), /vertex 1 has the coordinate NaN/);
 });
 
 test("an agent owns what the scenario says, and gives one command for each actuator", async () => {

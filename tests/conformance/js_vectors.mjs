@@ -177,7 +177,13 @@ if (axesFile) {
   const close = (a, b, tolerance) => a.every((value, index) => Math.abs(value - b[index]) <= tolerance);
   const turned = (a, b) =>
     Math.abs(Math.abs(a.reduce((sum, value, index) => sum + value * b[index], 0)) - 1) <= 1e-12;
-  for (const [number, entry] of JSON.parse(readFileSync(axesFile, "utf8")).poses.entries()) {
+  const { poses, meshes } = JSON.parse(readFileSync(axesFile, "utf8"));
+  for (const [name, axes] of Object.entries(ENGINES)) {
+    const found = axes.meshToEnu(meshes[name].vertices, meshes[name].triangles);
+    count("meshes");
+    holds(`mesh of ${name}`, isDeepStrictEqual(found, meshes.enu), `is ${JSON.stringify(found)}`);
+  }
+  for (const [number, entry] of poses.entries()) {
     for (const [name, axes] of Object.entries(ENGINES)) {
       for (const [way, given, expected] of [
         ["fromEnu", entry.enu, entry[name]],

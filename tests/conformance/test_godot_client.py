@@ -69,6 +69,26 @@ def test_the_transform_of_a_node_is_a_pose(ask: worlds.Ask) -> None:
     assert orientation == pytest.approx([math.cos(half), 0, 0, math.sin(half)], abs=1e-6)
 
 
+def test_meshes_are_converted_from_the_axes_and_winding_of_engines(ask: worlds.Ask) -> None:
+    worlds.check_engine_meshes(ask)
+
+
+def test_an_offered_mesh_says_its_name_sides_and_centre(ask: worlds.Ask) -> None:
+    nan, sloping, flat = "x7ff8000000000000", "0 0 0.125 4 0 2.125 0 2 1", "0 0 0 4 0 0 0 2 0"
+    # Before the run, while it goes on, and two that are refused then: boxes of at least 1 cm.
+    answers = ask("offered", [f"\t{sloping}", f"9\t{sloping}", f"9\t{flat}", f"9\t{sloping} {nan} 0 0"])
+    found = [
+        (mesh, *([worlds.number(word) for word in field.split()] for field in fields))
+        for mesh, *fields in (answer.split("\t") for answer in answers)
+    ]
+    box = ([4.0, 2.0, 2.0], [2.0, 1.0, 1.125])
+    assert found[0] == ("objects/car", *box)
+    assert found[1][1:] == box
+    assert found[1][0].startswith("objects/")
+    assert found[2] == ("", [4.0, 2.0, 0.01], [2.0, 1.0, 0.0])
+    assert found[3] == ("", *box)
+
+
 def test_the_reference_world_fails_no_case_of_the_kit(godot: str, tmp_path: Path) -> None:
     # The script around Godot turns SIGTERM into a file that the add-on looks for.
     command = f"env GODOT='{godot} --path {GODOT}' {ADDON / 'run_headless.sh'} world.gd {{endpoint}} {{name}}"

@@ -96,6 +96,7 @@ def test_every_vector_is_read_written_or_refused_and_axes_are_those_of_engines(n
     assert report["checked"]["read"] == len(stated) - refused
     poses = json.loads((ROOT / "clients/axes.json").read_text())["poses"]
     assert report["checked"]["poses"] == 2 * 4 * len(poses)
+    assert report["checked"]["meshes"] == 4
 
 
 def test_what_the_library_does_without_a_broker(node: str) -> None:

@@ -32,6 +32,7 @@ from caviar_protocol.topics import (
     LidarDevice,
     LidarScan,
     Link,
+    OccupancyGrid,
     Scene,
 )
 from caviar_services.recorder.mcap import McapRecorder, McapSettings
@@ -178,6 +179,23 @@ def lidar(frame: int) -> Lidar:
         object=np.where(azimuth > np.pi, 0, 1).astype(np.int32),
     )
     return Lidar(object_names=("car.1", "wall"), scans=(scan,))
+
+
+def grid_only() -> Lidar:
+    """A fixed LIDAR whose scan has a grid alone: cells at two heights, and a transmitter."""
+    cells = np.zeros((9, 9, 3), np.int8)
+    cells[2, 3, 1], cells[6, 3, 2], cells[5, 5, 2] = 1, 1, -1
+    scan = LidarScan(
+        sensor="top",
+        position=(0.0, 0.0, 1.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        ray=np.zeros(0, np.int32),
+        points=np.zeros((0, 3), np.float32),
+        range=np.zeros(0, np.float32),
+        object=np.zeros(0, np.int32),
+        grid=OccupancyGrid(origin=(-4.0, -4.0, 0.0), cell=(1.0, 1.0, 1.0), occupancy=cells),
+    )
+    return Lidar(object_names=(), scans=(scan,))
 
 
 def product(

@@ -52,6 +52,19 @@ settings = { wrong = "step" }
         caviar.run(path, frames=3, out=tmp_path, embedded=True)
 
 
+def test_a_run_takes_episodes_settings_and_topics_as_the_command_does(tmp_path: Path) -> None:
+    run = caviar.run(
+        "smoke", frames=2, episodes=2, settings=["services.channel.budget_ms=77"], record=["scene", "link"],
+        out=tmp_path, embedded=True,
+    )  # fmt: skip
+    recording = caviar.open(run)
+    scenario = recording.metadata.scenario
+    assert (len(recording), scenario["run"]["record"]) == (4, ["scene", "link"])
+    assert scenario["services"]["channel"]["budget_ms"] == 77
+    with pytest.raises(ScenarioError, match="--set channel: write it as in"):
+        caviar.run("smoke", settings=["channel"], out=tmp_path)
+
+
 def test_a_scenario_is_loaded_by_name_and_by_file(tmp_path: Path) -> None:
     assert caviar.load_scenario("smoke").run.name == "smoke"
     with pytest.raises(ScenarioError, match="did you mean 'smoke'"):

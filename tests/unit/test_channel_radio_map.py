@@ -75,6 +75,15 @@ def test_best_server_by_received_power_and_none_without_a_signal() -> None:
     np.testing.assert_allclose(found.of_server(found.rss), [[1e-8, 2e-10, np.nan]])
 
 
+def test_what_is_far_below_the_noise_is_no_signal() -> None:
+    """−174 dB of one ray in a building: 59 dB below the noise of 100 MHz with 1 W."""
+    gain = 10 ** np.array([[[-7.0, -15.4, -15.6, -17.4]]])
+    found = coverage(gain=gain, interference_gain=gain, power_w=np.ones(1), noise_w=10**-11.5)
+    assert found.best_server.tolist() == [[0, 0, -1, -1]]
+    assert np.isnan(found.of_server(found.rss)[0]).tolist() == [False, False, True, True]
+    assert found.rss[0, 0, 3] > 0.0  # the arrays keep it
+
+
 def test_sinr_counts_all_others_with_their_interference_gain() -> None:
     expected = [[1e-8 / (1e-11 + 0.5e-9 / 4), 1e-10 / (1e-11 + 2e-10 / 4), 0.0]]
     np.testing.assert_allclose(coverage().sinr[0], expected)

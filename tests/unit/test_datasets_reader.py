@@ -7,9 +7,11 @@ import pickle
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recording_builders import channel, frame_of, grid_only, link, record, scene
 
 import caviar
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
@@ -20,8 +22,11 @@ from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset, check_level
 from caviar_clients.datasets.remote import is_address
 from caviar_clients.datasets.rows import USER_COLUMNS
+from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario
+from caviar_protocol.topics import Camera, CameraImage, Intrinsics
 
 EPISODES, SCENES, USERS = 6, 3, 2
 
@@ -79,6 +84,66 @@ def test_recorded_arrays_have_a_row_for_each_user_in_their_order(folder: Path) -
         channel = data.episode(shuffled["episode"][row])["channel"]
         user = channel.rx.index(shuffled["rx"][row])
         np.testing.assert_array_equal(h[row], channel.h[shuffled["scene"][row], user][: h.shape[1]])
+
+
+def recorded_users(run: Path, frames: int = 2, cars: int = 3) -> Users:
+    """Users of a recording with a fixed camera, and a LIDAR of which the grid alone was recorded."""
+    optics = {"intrinsics": Intrinsics(fx=4.0, fy=4.0, cx=4.0, cy=3.0), "orientation": (1.0, 0.0, 0.0, 0.0)}
+    images = [
+        CameraImage(sensor="pole", position=(0, 0, 3), rgb=np.full((6, 8, 3), n, "|u1"), **optics)
+        for n in range(frames)
+    ]
+    record(
+        run,
+        [
+            frame_of(
+                n, scene=scene(n), channel=channel(n), link=link(n), lidar=grid_only(),
+                camera=Camera(images=(images[n],)),
+            )
+            for n in range(frames)
+        ],
+    )  # fmt: skip
+    recording = Recording(run)
+    dataset = SimpleNamespace(episodes=(0,), episode=lambda _: recording, location="here")
+    names = [f"car.{u}" for _ in range(frames) for u in range(cars)]
+    table = {
+        "episode": np.zeros(len(names), int),
+        "scene": np.repeat(np.arange(frames), cars),
+        "object": np.array(names),
+        "rx": np.array([f"{name}/rx" for name in names]),
+        "tx": np.full(len(names), "bs"),
+        "carrier": np.full(len(names), "c0"),
+    }
+    return Users(dataset, Columns(table))  # type: ignore[arg-type]
+
+
+def test_users_share_the_row_of_one_sensor(tmp_path: Path) -> None:
+    users = recorded_users(tmp_path / "run")
+    one = users[users["scene"] == 1]["camera.rgb"]
+    assert (one.shape, one.strides[0], one.flags.writeable) == ((3, 6, 8, 3), 0, False)
+    rows, index = users.distinct("camera.rgb")
+    assert (len(rows), index.tolist()) == (2, [0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(rows[index], users["camera.rgb"])
+    with pytest.raises(ValueError, match="a column of the catalogue"):
+        users.distinct("scene")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("lidar.points", "was recorded without points: its scans have the grid alone"),
+        ("lidar.hits", "was recorded without hits: its scans have the grid alone"),
+        ("link.sinr", "has no sinr: the run had no packets"),
+    ],
+)
+def test_arrays_that_were_not_recorded_are_refused_and_not_listed(
+    tmp_path: Path, name: str, words: str
+) -> None:
+    users = recorded_users(tmp_path / "run")
+    assert name not in users.recorded()
+    assert {"lidar.grid", "link.snr", "camera.rgb"} <= set(users.recorded())
+    with pytest.raises(RecordingError, match=words):
+        users[name]
 
 
 def test_a_recording_of_another_dataset_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from recording_builders import channel, lidar, link, scene
+from recording_builders import channel, frame_of, grid_only, lidar, link, record, scene
 
-from caviar_clients.cli.plot import beam_amplitude
+from caviar_clients.cli.plot import beam_amplitude, plot_run
 from caviar_clients.plots.map import (
     RECEIVER,
     WITHOUT_LOS,
@@ -254,6 +254,13 @@ def test_a_scan_without_hits_is_drawn(tmp_path):
     )
     draw_scan(empty, lidar(0), scene(0), "empty", tmp_path / "lidar.png")
     assert (tmp_path / "lidar.png").stat().st_size > 1000
+
+
+def test_a_recording_of_grids_alone_has_a_picture_of_the_grid(tmp_path):
+    run = record(tmp_path / "run", [frame_of(0, scene=scene(0), lidar=grid_only())])
+    (file,) = (file for file in plot_run(run) if file.stem == "lidar")
+    found = colours(file)
+    assert {(0x44, 0x01, 0x54), (0xFD, 0xE7, 0x25), (0xE6, 0x9F, 0x00)} <= found  # both heights, the antenna
 
 
 def test_a_name_stays_on_the_side_where_it_was_and_is_never_cut():

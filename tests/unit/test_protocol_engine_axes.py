@@ -41,6 +41,17 @@ def test_poses_and_velocities_are_those_of_the_vectors(axes: EngineAxes, number:
     np.testing.assert_allclose(axes.motion_to_enu(there), motion_of(entry["enu"]), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("axes", ENGINES.values(), ids=ENGINES)
+def test_meshes_are_those_of_the_vectors(axes: EngineAxes) -> None:
+    given, expected = VECTORS["meshes"][axes.name], VECTORS["meshes"]["enu"]
+    vertices, triangles = axes.mesh_to_enu(given["vertices"], given["triangles"])
+    np.testing.assert_array_equal(vertices, expected["vertices"])
+    np.testing.assert_array_equal(triangles, expected["triangles"])
+    # Counter-clockwise as seen from outside: the volume that the triangles enclose is positive.
+    corners = vertices[triangles]
+    assert np.linalg.det(corners - vertices.mean(axis=0)).sum() > 0
+
+
 @pytest.mark.parametrize(
     ("axes", "forward"),
     [(UNREAL, (1, 0, 0)), (UNITY, (0, 0, 1)), (GODOT, (0, 0, -1)), (NED, (1, 0, 0))],

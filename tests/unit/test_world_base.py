@@ -38,7 +38,7 @@ def test_objects_are_sorted_and_keep_their_own_values() -> None:
         [
             [
                 state("car.b", position=(1.0, 2.0, 3.0), velocity=(4.0, 5.0, 6.0)),
-                state("car.a", kind="ship", position=(-1.0, -2.0, -3.0), dimensions=(9.0, 8.0, 7.0)),
+                state("car.a", class_="ship", position=(-1.0, -2.0, -3.0), dimensions=(9.0, 8.0, 7.0)),
             ]
         ]
     )
@@ -62,6 +62,33 @@ def test_what_a_world_returns_that_is_no_object_is_named_with_its_method(odd: ob
         PayloadError, match=rf"^Odd\.objects_at returned {re.escape(repr(wrong))}.*ObjectState"
     ):
         scene_at(Odd([[]]), 0)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("position", (1.0, 2.0)),
+        ("dimensions", None),
+        ("velocity", (0.0, math.nan, 0.0)),
+        ("orientation", ("1", "a", 0, 0)),
+        ("angular_velocity", 0.5),
+        ("mesh", ("objects/car.ply", (4.0, 2.0, 1.5))),
+        ("class_", None),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_object_and_field(field: str, value: object) -> None:
+    world = ScriptedWorld([[state("car.a"), state("car.b", **{field: value})]])
+    with pytest.raises(
+        PayloadError, match=rf"^object 'car\.b': {field} is {re.escape(repr(value))}; give it"
+    ):
+        scene_at(world, 0)
+
+
+def test_angular_velocities_are_zeros_beside_one_that_turns_and_else_left_out() -> None:
+    turning = state("car.b", angular_velocity=(-0.0, 0.5, 0.25))
+    world = ScriptedWorld([[state("car.a"), turning], [state("car.a", angular_velocity=(0.0, -0.0, 0.0))]])
+    assert scene_at(world, 0).angular_velocity.tolist() == [[0.0, 0.0, 0.0], [0.0, 0.5, 0.25]]
+    assert scene_at(world, 1).angular_velocity is None
 
 
 @pytest.mark.parametrize("method", ["prefixes", "mesh_classes"])

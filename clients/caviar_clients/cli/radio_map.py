@@ -26,6 +26,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.host import DISTRIBUTION
 from caviar_protocol.topics import Scene
 from caviar_services.channel.radio_map.mapping import (
+    FLOOR_DB,
     BeamChoice,
     Coverage,
     RadioMap,
@@ -323,7 +324,7 @@ def _summary(mapped: _Mapped) -> Iterator[str]:
     yield f"{nx} × {ny} cells of {mapped.metadata['cell_m']:g} m, {mapped.metadata['surface']}"
     yield f"noise {10 * math.log10(coverage.noise_w) + 30:.1f} dBm: {mapped.metadata['noise']}"
     yield from mapped.notes
-    yield f"{share:.1%} of the cells have a signal"
+    yield f"{share:.1%} of the cells have a signal, which is at most {FLOOR_DB:g} dB below the noise"
     if not reached.any():
         heights = ", ".join(
             f"{name!r} at z = {at[2]:g} m" for name, at in zip(found.names, found.positions, strict=True)

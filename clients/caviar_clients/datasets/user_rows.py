@@ -166,7 +166,9 @@ class Users:
 
         Returns:
             An array for each name; axis 0 counts the users, in their order. Rows of different lengths are
-            padded with NaN, −1 for integers, 0 for unsigned ones and false for booleans.
+            padded with NaN, −1 for integers, 0 for unsigned ones and false for booleans. Where all these
+            users have one row, as the picture of a scene's only camera, it is not copied: the array is a view
+            that cannot be written. See `distinct` for users of many scenes.
 
         Raises:
             RecordingError: There is no such name, or it was not recorded; a user's object has no such sensor.
@@ -178,6 +180,32 @@ class Users:
         recorded = [name for name in names if "." in name]
         rows = self._recorded(recorded) if recorded else {}
         return Columns({name: columns[name] if name in columns else _stacked(rows[name]) for name in names})
+
+    def distinct(self, name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Read each row of a recorded array once, however many users have it, as the pictures of cameras.
+
+        Args:
+            name: Of a recorded array, ``"camera.rgb"``.
+
+        Returns:
+            The rows, padded as of `read`, and for each user the index of its own: with both,
+            ``rows[index[i]]`` is ``users[name][i]``.
+
+        Raises:
+            RecordingError: As of `read`.
+            ValueError: It is a column of the catalogue.
+
+        Example:
+            >>> users = caviar.dataset("data/cameras").users()  # doctest: +SKIP
+            >>> pictures, index = users.distinct("camera.rgb")  # doctest: +SKIP
+        """
+        self.check_names([name])
+        if "." not in name:
+            raise ValueError(f"distinct({name!r}): a column of the catalogue; numpy.unique finds its values")
+        rows = self._recorded([name])[name]
+        once = {id(row): row for row in rows}
+        place = {key: at for at, key in enumerate(once)}
+        return _stacked([*once.values()]), np.array([place[id(row)] for row in rows], dtype=np.int64)
 
     def batches(self, size: int, names: Sequence[str], *, shuffle: int | None = None) -> Iterator[Columns]:
         """Read the users in parts, so that a dataset of any size is read in the memory of one.
@@ -326,7 +354,10 @@ class Users:
             raise RecordingError(f"{place}: {topic} is absent")
         rows = arrays.columns[field].rows(arrays, payload)
         at = {key: number for number, key in enumerate(arrays.keys_of(payload))}
-        return [rows[self._key(topic, at, user, place)] for user in users]
+        keys = [self._key(topic, at, user, place) for user in users]
+        # Users with one row have one object, which `_stacked` and `distinct` know again.
+        found = {key: rows[key] for key in set(keys)}
+        return [found[key] for key in keys]
 
     def _key(self, topic: str, at: Mapping[Any, int], user: int, place: str) -> int:
         """The row of a product that a user has."""
@@ -423,6 +454,8 @@ def _stacked(rows: Sequence[Any]) -> NDArray[Any]:
     """Rows as one array, padded where their lengths differ."""
     if not rows:
         return np.zeros(0)
+    if len(rows) > 1 and np.ndim(rows[0]) and all(row is rows[0] for row in rows):
+        return np.broadcast_to(rows[0], (len(rows), *np.shape(rows[0])))
     arrays = [np.asarray(row) for row in rows]
     shape = tuple(np.max([array.shape for array in arrays], axis=0).astype(int)) if arrays[0].ndim else ()
     if all(array.shape == shape for array in arrays):

@@ -185,7 +185,7 @@ class MovingMap:
 
     def _prepare_curves(self, axes: Any, data: UserSeries) -> None:
         for (_, values, style), label in zip(
-            curves(data, self._plan.agent), ("best", f"chosen ({self._plan.agent})", "baseline"), strict=True
+            curves(data, self._plan.agent), ("best", f"chosen ({self._plan.agent})", "LOS beam"), strict=True
         ):
             axes.plot(data.time, np.where(data.has_path, values, np.nan), label=label, **style)
         shade(axes, data)

@@ -226,7 +226,7 @@ def curves(data: UserSeries, agent: str) -> list[tuple[str, Float64Array, dict[s
     return [
         ("optimum", data.best, {"color": OPTIMUM, "linewidth": 2.8}),
         (f"agent ({agent})", data.abs_y, {"color": AGENT, "linewidth": 1.6}),
-        ("baseline (straight line)", data.baseline, {"color": BASELINE, "linewidth": 1.1, "linestyle": "--"}),
+        ("LOS beam", data.baseline, {"color": BASELINE, "linewidth": 1.1, "linestyle": "--"}),
     ]
 
 

@@ -4,6 +4,7 @@
 import { cos, sin } from "./trigonometry.mjs";
 
 /** @import { Quaternion, Vector3 } from "./types.d.ts" */
+/** @import { Triples } from "./scenery.mjs" */
 /** @typedef {readonly [Vector3, Vector3, Vector3]} Matrix  rows */
 /** @typedef {number[]} Numbers */
 /**
@@ -19,9 +20,12 @@ export class EngineAxes {
    * @param {Matrix} world  takes a direction in ENU to the engine's world axes; left-handed ones mirror it
    * @param {Matrix} body  the same from a body's axes (forward, left, up)
    * @param {number} unit  length in the engine of 1 m
+   * @param {boolean} clockwise  whether its triangles are clockwise as seen from outside, as Unity and Godot
+   *   have them; those of Unreal and three.js are counter-clockwise
    */
-  constructor(name, world, body = world, unit = 1) {
+  constructor(name, world, body = world, unit = 1, clockwise = false) {
     this.name = name;
+    this.clockwise = clockwise;
     this.unit = unit;
     this.world = world;
     this.body = body;
@@ -55,6 +59,23 @@ export class EngineAxes {
   }
 
   /**
+   * A mesh of the engine, as it gives it, for `offerMesh`.
+   *
+   * @param {Triples} vertices  in its body axes and unit
+   * @param {Triples} triangles  three indices each, wound as the engine does
+   * @returns {{ vertices: Numbers[], triangles: Numbers[] }} forward, left, up [m]; counter-clockwise as seen
+   *   from outside: the second and third corner change places where the engine has them clockwise
+   * @example const { vertices, triangles } = THREE_MODEL.meshToEnu(position.array, index.array);
+   */
+  meshToEnu(vertices, triangles) {
+    const body = transposed(this.body);
+    return {
+      vertices: triples(vertices).map((vertex) => scaled(1 / this.unit, times(body, vertex))),
+      triangles: triples(triangles).map(([a, b, c]) => (this.clockwise ? [a, c, b] : [a, b, c])),
+    };
+  }
+
+  /**
    * @param {Motion} motion
    * @param {Matrix} world
    * @param {Matrix} body
@@ -83,17 +104,29 @@ export const UNREAL = new EngineAxes(
   100,
 );
 /** Left-handed metres: x south and right, y up, z east and forward. */
-export const UNITY = new EngineAxes("unity", [
-  [0, -1, 0],
-  [0, 0, 1],
-  [1, 0, 0],
-]);
+export const UNITY = new EngineAxes(
+  "unity",
+  [
+    [0, -1, 0],
+    [0, 0, 1],
+    [1, 0, 0],
+  ],
+  undefined,
+  1,
+  true,
+);
 /** Right-handed metres: x south and right, y up, z west and back. */
-export const GODOT = new EngineAxes("godot", [
-  [0, -1, 0],
-  [0, 0, 1],
-  [-1, 0, 0],
-]);
+export const GODOT = new EngineAxes(
+  "godot",
+  [
+    [0, -1, 0],
+    [0, 0, 1],
+    [-1, 0, 0],
+  ],
+  undefined,
+  1,
+  true,
+);
 /** North, east, down; bodies forward, right, down. */
 export const NED = new EngineAxes(
   "ned",
@@ -170,6 +203,15 @@ function times(m, [x, y, z]) {
 function scaled(factor, vector) {
   // A hundredth is no binary number: dividing by 100 is exact where multiplying by 1/100 is not.
   return vector.map((value) => (Math.abs(factor) < 1 ? value / Math.round(1 / factor) : value * factor) + 0);
+}
+
+/** Rows of three of what is given as triples, or one after the other.
+ * @param {Triples} values  @returns {Numbers[]} */
+function triples(values) {
+  const numbers = Array.from(/** @type {ArrayLike<any>} */ (values)).flat();
+  // What is no row of three stays in the last one, for offerMesh to refuse.
+  const rows = Math.ceil(numbers.length / 3);
+  return Array.from({ length: rows }, (_, row) => numbers.slice(3 * row, 3 * row + 3));
 }
 
 /** @param {Matrix} m  @returns {Matrix} */

@@ -33,9 +33,10 @@ export function sceneOf(objects, { prefixes, offered, devices: mounted }) {
       throw new SceneError(`two objects are named ${quoted(object.name)}; names have to differ`);
     checkName(object, prefixes);
     checkNumbers(object);
-    if (object.asset && !isMeshName(object.asset) && !offered(object.asset)) {
+    const { mesh = "" } = object;
+    if (typeof mesh !== "string" || (mesh && !isMeshName(mesh) && !offered(mesh))) {
       throw new SceneError(
-        `object ${quoted(object.name)}: asset is ${quoted(object.asset)}, which was not offered; ` +
+        `object ${quoted(object.name)}: mesh is ${quoted(mesh)}, which was not offered; ` +
           "take it from what offerMesh returns",
       );
     }
@@ -53,7 +54,7 @@ export function sceneOf(objects, { prefixes, offered, devices: mounted }) {
   return {
     names,
     classes: sorted.map((object) => object.class),
-    assets: sorted.map((object) => object.asset ?? ""),
+    assets: sorted.map((object) => object.mesh ?? ""),
     position: table(3, (object) => object.position),
     orientation: table(4, (object) => object.orientation ?? LEVEL),
     velocity: table(3, (object) => object.velocity),

@@ -68,9 +68,9 @@ export class Assets {
    */
   offerMesh(name, vertices, triangles, material = "") {
     const { file, dimensions, centre } = unitMesh(name, vertices, triangles, material);
-    const asset = `objects/${name}.ply`;
-    this.offerFile(asset, file);
-    return { asset, dimensions, centre };
+    const mesh = `objects/${name}.ply`;
+    this.offerFile(mesh, file);
+    return { mesh, dimensions, centre };
   }
 
   /**
@@ -163,15 +163,15 @@ export function unitMesh(name, vertices, triangles, material) {
 }
 
 /**
- * The bounding box of points; what is not finite counts as 0.
+ * The bounding box of points; without what is not finite.
  * @param {Triples} vertices
  * @returns {Box}
  */
 export function boxOf(vertices) {
   const low = [Infinity, Infinity, Infinity],
     high = [-Infinity, -Infinity, -Infinity];
-  flat(vertices).forEach((given, index) => {
-    const value = Number.isFinite(given) ? given : 0;
+  flat(vertices).forEach((value, index) => {
+    if (!Number.isFinite(value)) return;
     low[index % 3] = Math.min(low[index % 3], value);
     high[index % 3] = Math.max(high[index % 3], value);
   });

@@ -174,7 +174,7 @@ export class Service {
    * Go to the state at the start of an episode; equal arguments lead to equal frames.
    *
    * @param {bigint} seed
-   * @param {number} t0  time of frame 0 [s]
+   * @param {number} t0  time of frame 0 in the run [s]
    * @param {number} episode  number of the episode from the first one with this seed
    * @returns {void | Promise<void>}
    */
@@ -190,15 +190,13 @@ export class Service {
   }
 
   /**
-   * Time of a grant and of the frame that this service completed before it [s]; of the first frame both are
-   * t0.
+   * Time of a grant and of the frame that this service completed before it, since frame 0 of the episode [s].
    * @param {Message} grant
    * @returns {[t: number, previous: number]}
    */
   times({ t_ns, previous_frame }) {
     const period = BigInt(this.info.scenario.sampling_period_ns ?? 0);
-    const previous_ns = this.#t0_ns + BigInt(Math.max(previous_frame, 0)) * period;
-    return [Number(t_ns) / 1e9, Number(previous_frame < 0 ? this.#t0_ns : previous_ns) / 1e9];
+    return [Number(t_ns - this.#t0_ns) / 1e9, Number(BigInt(Math.max(previous_frame, 0)) * period) / 1e9];
   }
 
   /**

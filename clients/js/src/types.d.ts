@@ -20,17 +20,18 @@ export interface SceneObject {
   orientation?: Quaternion;
   /** [m/s], world axes. Doppler shifts follow from it. */
   velocity: Vector3;
-  /** [rad/s], world axes; 0 where it is left out. */
+  /** [rad/s], world axes; left out: it does not turn, or how is not known. */
   angular_velocity?: Vector3;
   /** Length (x), width (y), height (z) of its bounding box [m]. */
   dimensions: Vector3;
   /** Name of a mesh of `offerMesh`; empty or left out: the box itself. */
-  asset?: string;
+  mesh?: string;
 }
 
 /** What `offerMesh` returns: two fields of a `SceneObject`, and where the mesh's box was. */
 export interface OfferedMesh {
-  asset: string;
+  /** Empty where it was refused: its objects are boxes. */
+  mesh: string;
   dimensions: [number, number, number];
   /** Centre of the mesh's bounding box in its own coordinates [m]. */
   centre: [number, number, number];

@@ -65,8 +65,8 @@ export class World extends Service {
   /**
    * Say where the objects are.
    *
-   * @param {number} t  time of the frame [s]
-   * @param {number} previous  time of the frame that this world completed before [s], from which it has to
+   * @param {number} t  time since frame 0 of the episode [s]
+   * @param {number} previous  that of the frame which this world completed before [s], from which it has to
    *   advance; it equals `t` in the first frame
    * @param {Command[]} commands  of agents in the frame before
    * @param {Input[]} inputs  products that the world asked for
@@ -86,8 +86,8 @@ export class World extends Service {
    * @param {Triples} vertices  x forward, y left, z up [m], as triples or one after the other
    * @param {Triples} triangles  three indices each, counter-clockwise seen from outside
    * @param {string} [material]  of ITU-R P.2040, such as `wood`; left out: what the channel's settings say
-   * @returns {OfferedMesh} `asset` and `dimensions` of objects that look like it; where it is none and the
-   *   run goes on, that is logged, and the `asset` is empty: its objects are boxes
+   * @returns {OfferedMesh} `mesh` and `dimensions` of objects that look like it; where it is none and the
+   *   run goes on, that is logged, and the `mesh` is empty: its objects are boxes
    * @throws {SceneError} in `prepare`, where it is none
    */
   offerMesh(name, vertices, triangles, material = "") {
@@ -99,13 +99,13 @@ export class World extends Service {
         throw new SceneError(
           `mesh ${JSON.stringify(name)} has ${faces} triangles, and this run takes ${most}`,
         );
-      return { asset: this.#meshes.add(file), dimensions, centre };
+      return { mesh: this.#meshes.add(file), dimensions, centre };
     } catch (error) {
       if (!(error instanceof SceneError)) throw error;
       this.#say(`${error.message}; objects with it are boxes`);
       const { dimensions, centre } = boxOf(vertices);
       const [x, y, z] = dimensions.map((side) => Math.max(side, SMALLEST_M));
-      return { asset: "", dimensions: [x, y, z], centre };
+      return { mesh: "", dimensions: [x, y, z], centre };
     }
   }
 
@@ -195,10 +195,11 @@ export class World extends Service {
 
   /** An object as the run may have it. @param {SceneObject} object  @returns {SceneObject} */
   #looked(object) {
-    if (!object.asset || !isMeshName(object.asset)) return object;
-    if (!this.#meshes.maxFaces) return { ...object, asset: "" }; // the run takes no meshes now
-    if (!this.#meshes.has(object.asset))
-      this.#say(`${object.asset} is not there; objects with it are boxes until offerMesh brings it`);
+    const { mesh } = object;
+    if (!mesh || !isMeshName(mesh)) return object;
+    if (!this.#meshes.maxFaces) return { ...object, mesh: "" }; // the run takes no meshes now
+    if (!this.#meshes.has(mesh))
+      this.#say(`${mesh} is not there; objects with it are boxes until offerMesh brings it`);
     return object;
   }
 

@@ -13,8 +13,9 @@ from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Float64Array, Int32Array
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector, multiply
 
 _HALF = 0.5**0.5
@@ -44,6 +45,8 @@ class EngineAxes:
             are left-handed.
         body: The same from a body's axes (forward, left, up) to the engine's.
         unit: Length in the engine of 1 m.
+        clockwise: Whether its triangles are clockwise as seen from outside, as Unity and Godot have them;
+            those of Unreal are counter-clockwise: what the eye sees counts, not the hand of the axes.
 
     Example:
         >>> UNREAL.from_enu(Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))).position
@@ -54,6 +57,7 @@ class EngineAxes:
     world: _Rows
     body: _Rows
     unit: float = 1.0
+    clockwise: bool = False
 
     def from_enu(self, pose: Pose) -> Pose:
         """Convert a pose from ENU metres.
@@ -105,6 +109,26 @@ class EngineAxes:
             _scaled(self._hand, _vector(world @ motion.angular_velocity)),
         )
 
+    def mesh_to_enu(self, vertices: ArrayLike, triangles: ArrayLike) -> tuple[Float64Array, Int32Array]:
+        """Convert a mesh of the engine, as it gives it, to one for `Engine.offer_mesh`.
+
+        Args:
+            vertices: In the engine's body axes and unit, Shape ``[V, 3]``.
+            triangles: Vertices of each, wound as the engine does, Shape ``[F, 3]``.
+
+        Returns:
+            Vertices forward, left, up [m], and triangles counter-clockwise as seen from outside; the second
+            and third corner change places where the engine has them clockwise.
+
+        Example:
+            >>> vertices, triangles = UNITY.mesh_to_enu([(0, 0, 1), (1, 0, 0), (0, 2, 0)], [(0, 1, 2)])
+            >>> vertices.tolist(), triangles.tolist()
+            ([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 2.0]], [[0, 2, 1]])
+        """
+        points = np.asarray(vertices, np.float64).reshape(-1, 3) @ np.array(self.body) / self.unit + 0.0
+        corners = np.asarray(triangles, np.int32).reshape(-1, 3)
+        return points, corners[:, [0, 2, 1]] if self.clockwise else corners
+
     def _to_world(self, vector: Vector) -> Vector:
         return _vector(np.array(self.world) @ vector)
 
@@ -125,12 +149,14 @@ UNITY = EngineAxes(
     "unity",
     world=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
     body=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+    clockwise=True,
 )
 """Left-handed metres: x south and right, y up, z east and forward."""
 GODOT = EngineAxes(
     "godot",
     world=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
     body=((0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)),
+    clockwise=True,
 )
 """Right-handed metres: x south and right, y up, z west and back."""
 NED = EngineAxes(

@@ -265,10 +265,10 @@ def _state(
 ) -> ObjectState:
     return ObjectState(
         name=name,
-        kind=thing.kind,
+        class_=thing.kind,
         position=pose.position,
         orientation=pose.orientation,
         velocity=velocity,
         dimensions=thing.dimensions_m,
-        yaw_rate=yaw_rate,
+        angular_velocity=(0.0, 0.0, yaw_rate),
     )

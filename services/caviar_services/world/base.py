@@ -11,7 +11,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
@@ -40,13 +40,13 @@ class ObjectState(NamedTuple):
 
     Example:
         >>> level, still = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        >>> ObjectState("car.1", "car", (0.0, 0.0, 0.75), level, still, (4.6, 1.9, 1.5)).yaw_rate
-        0.0
+        >>> ObjectState("car.1", "car", (0.0, 0.0, 0.75), level, still, (4.6, 1.9, 1.5)).class_
+        'car'
     """
 
     name: str
-    kind: str
-    """Its class: ``car``, ``truck``, ``bus``, ``uav``, ``pedestrian``, …"""
+    class_: str
+    """``car``, ``truck``, ``bus``, ``uav``, ``pedestrian``, …"""
     position: Vector
     """Centre of the bounding box [m]."""
     orientation: UnitQuaternion
@@ -54,10 +54,8 @@ class ObjectState(NamedTuple):
     """[m/s], world axes."""
     dimensions: Vector
     """Length (x), width (y), height (z) [m]."""
-    yaw_rate: float = 0.0
-    """[rad/s] about the vertical through its position, counter-clockwise; 0 also where it is not known."""
-    tilt_rate: tuple[float, float] = (0.0, 0.0)
-    """[rad/s] about the world's x and y through its position, right-handed."""
+    angular_velocity: Vector | None = None
+    """[rad/s], world axes, right-handed; None: it does not turn, or how is not known."""
     mesh: str = ""
     """Its own mesh, by the name that `World.add_mesh` returned or that it has in `World.scenery`; empty: that
     of its class, or a box."""
@@ -300,23 +298,25 @@ class World(Service[W]):
         # Before they are sorted: devices go to the objects that came first, which a world lists in front.
         devices = self._mounts.devices([(state.name, state.dimensions) for state in states])
         devices = self._mounts.turned_back(devices, {state.name: state for state in states})
-        states = sorted(states)
-        listed = [(state.name, state.kind, state.mesh) for state in states]
+        states = sorted(states, key=lambda state: state.name)
+        listed = [(state.name, state.class_, state.mesh) for state in states]
         # Objects hardly ever come and go: what follows from names and classes alone is kept.
         if listed != self._listed[0]:
             self._listed = listed, *self._described(listed)
         _, names, classes, assets = self._listed
-        position, orientation, velocity, dimensions = _tables(states)
+        tables = _tables(states)
+        turning = tables["angular_velocity"]
         return Scene(
             names=names,
             classes=classes,
             assets=assets,
-            position=position,
-            orientation=orientation,
-            velocity=velocity,
-            dimensions=dimensions,
+            position=tables["position"],
+            orientation=tables["orientation"],
+            velocity=tables["velocity"],
+            dimensions=tables["dimensions"],
             devices=devices,
-            angular_velocity=_turning(states),
+            # Left out where nothing turns, so that such scenes stay as short.
+            angular_velocity=turning if turning.any() else None,
         )
 
     def _described(
@@ -333,14 +333,18 @@ class World(Service[W]):
             raise PayloadError(
                 f"world {self.run.name!r} has an object named {odd!r}; leave out the control characters"
             )
+        for name, class_, mesh in listed:
+            for field, value in (("class_", class_), ("mesh", mesh)):
+                if not isinstance(value, str):
+                    raise PayloadError(f"object {name!r}: {field} is {value!r}; give it a str")
         meshes = set(self.mesh_classes())
         assets = tuple(
             # A run may take no meshes that come while it goes on: their objects then are as if without.
             (mesh if self._meshes.max_faces or not is_mesh_name(mesh) else "")
-            or (f"objects/{kind}.ply" if kind in meshes else "")
-            for _, kind, mesh in listed
+            or (f"objects/{class_}.ply" if class_ in meshes else "")
+            for _, class_, mesh in listed
         )
-        return names, tuple(kind for _, kind, _ in listed), assets
+        return names, tuple(class_ for _, class_, _ in listed), assets
 
 
 def _may_begin(on: str, prefix: str) -> bool:
@@ -349,29 +353,49 @@ def _may_begin(on: str, prefix: str) -> bool:
     return literal.startswith(prefix) or (literal != on and prefix.startswith(literal))
 
 
-def _turning(states: Sequence[ObjectState]) -> Float64Array | None:
-    """Angular velocities, Shape ``[N, 3]``; None where nothing turns, so that such scenes stay as short."""
-    rates = [(*state.tilt_rate, state.yaw_rate) for state in states]
-    if not any(map(any, rates)):
-        return None
-    return np.array(rates) + 0.0  # as in `_tables`
+_WIDTHS = {"position": 3, "orientation": 4, "velocity": 3, "dimensions": 3, "angular_velocity": 3}
+_STILL = (0.0, 0.0, 0.0)
 
 
-def _tables(states: Sequence[ObjectState]) -> tuple[Float64Array, ...]:
-    """Positions, orientations, velocities and dimensions, one row an object each."""
-    position, orientation, velocity, dimensions = list[float](), list[float](), list[float](), list[float]()
-    for state in states:
-        position += state.position
-        orientation += state.orientation
-        velocity += state.velocity
-        dimensions += state.dimensions
-    # One array of all numbers, cut up. + 0.0: a negative zero and a zero are equal, so must their bytes be.
-    numbers = np.array(position + orientation + velocity + dimensions, dtype="<f8") + 0.0
-    count, tables, begin = len(states), [], 0
-    for width in (3, 4, 3, 3):
-        tables.append(numbers[begin : begin + count * width].reshape(count, width))
+def _tables(states: Sequence[ObjectState]) -> dict[str, Float64Array]:
+    """Tables of the fields that are numbers, one row an object; raises `PayloadError` for others."""
+    lists: list[list[float]] = [[] for _ in _WIDTHS]
+    position, orientation, velocity, dimensions, turning = lists
+    try:
+        for state in states:
+            position += state.position
+            orientation += state.orientation
+            velocity += state.velocity
+            dimensions += state.dimensions
+            turning += _STILL if state.angular_velocity is None else state.angular_velocity
+        # One array of all numbers, cut up. + 0.0: −0 and 0 are equal, so must their bytes be.
+        numbers = np.array(position + orientation + velocity + dimensions + turning, dtype="<f8") + 0.0
+    except (TypeError, ValueError) as error:
+        raise _wrong(states) from error
+    count, tables, begin = len(states), {}, 0
+    if not np.isfinite(numbers).all() or [len(row) for row in lists] != [n * count for n in _WIDTHS.values()]:
+        raise _wrong(states)
+    for field, width in _WIDTHS.items():
+        tables[field] = numbers[begin : begin + count * width].reshape(count, width)
         begin += count * width
-    return tuple(tables)
+    return tables
+
+
+def _wrong(states: Sequence[ObjectState]) -> PayloadError:
+    """The error that names the first value of an object that is no row of numbers."""
+    values = ((state.name, field, getattr(state, field)) for state, field in product(states, _WIDTHS))
+    name, field, value = next(value for value in values if not _is_row(value[2], value[1]))
+    return PayloadError(f"object {name!r}: {field} is {value!r}; give it {_WIDTHS[field]} finite numbers")
+
+
+def _is_row(value: object, field: str) -> bool:
+    if value is None:
+        return field == "angular_velocity"
+    try:
+        row = np.array(value, dtype="<f8")
+    except (TypeError, ValueError):
+        return False
+    return row.shape == (_WIDTHS[field],) and bool(np.isfinite(row).all())
 
 
 class Mounts:

@@ -365,25 +365,24 @@ class FlightWorld(TrajectoryWorld):
             thing = self._flown[name]
             yield ObjectState(
                 name=name,
-                kind=thing.kind,
+                class_=thing.kind,
                 position=flyer.state.position,
                 orientation=quaternion_from_euler(flyer.state.yaw),
                 velocity=flyer.state.velocity,
                 dimensions=thing.dimensions_m,
-                yaw_rate=flyer.state.yaw_rate,
+                angular_velocity=(0.0, 0.0, flyer.state.yaw_rate),
             )
         for name, seen in self._fleet.seen.items():
             body = seen.body
             x, y, z = rotated(body.orientation, body.rates)
             yield ObjectState(
                 name=name,
-                kind=self._flown[name].kind,
+                class_=self._flown[name].kind,
                 position=body.position,
                 orientation=body.orientation,
                 velocity=body.velocity,
                 dimensions=self._flown[name].dimensions_m,
-                yaw_rate=turning(z),
-                tilt_rate=(turning(x), turning(y)),
+                angular_velocity=(turning(x), turning(y), turning(z)),
             )
 
 

@@ -268,12 +268,12 @@ class Panda3dWorld(World[Panda3dSettings]):
                 pose = Pose((x, y, z), multiply(quaternion_from_euler(yaw_rate * rest), pose.orientation))
             yield ObjectState(
                 name=name,
-                kind=thing.kind,
+                class_=thing.kind,
                 position=pose.position,
                 orientation=pose.orientation,
                 velocity=velocity,
                 dimensions=thing.dimensions_m,
-                yaw_rate=yaw_rate,
+                angular_velocity=(0.0, 0.0, yaw_rate),
             )
 
     def checkpoint(self) -> bytes:

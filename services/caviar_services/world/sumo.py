@@ -85,7 +85,7 @@ class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fiel
 class _Kind(NamedTuple):
     """What does not change while an object is there."""
 
-    kind: str
+    class_: str
     dimensions: Vector
 
 
@@ -362,8 +362,8 @@ class SumoWorld(World[SumoSettings]):
             self._persons[name] = self._kind(api.person, name)
 
     def _kind(self, domain: Any, name: str) -> _Kind:
-        kind = object_class(domain.getTypeID(name), domain.getVehicleClass(name), self.settings.classes)
-        return _Kind(kind, (domain.getLength(name), domain.getWidth(name), domain.getHeight(name)))
+        class_ = object_class(domain.getTypeID(name), domain.getVehicleClass(name), self.settings.classes)
+        return _Kind(class_, (domain.getLength(name), domain.getWidth(name), domain.getHeight(name)))
 
     def _walk(self, simulation: Simulation) -> None:
         """Let people walk after the places where SUMO has them now."""
@@ -382,7 +382,7 @@ class SumoWorld(World[SumoSettings]):
         present = _present(self._vehicles, domain.getIDList())
         for name in self._trails.keys() - self._vehicles.keys():
             del self._trails[name]
-        for name, (kind, dimensions) in present:
+        for name, (class_, dimensions) in present:
             bumper = domain.getPosition3D(name)
             if bumper[0] == api.INVALID_DOUBLE_VALUE:  # on its way elsewhere, by no road
                 continue
@@ -395,18 +395,18 @@ class SumoWorld(World[SumoSettings]):
             fx, fy, fz = towards.forward
             yield ObjectState(
                 name=self._prefix + name,
-                kind=kind,
+                class_=class_,
                 position=pose.position,
                 orientation=pose.orientation,
                 velocity=(speed * fx, speed * fy, speed * fz),
                 dimensions=dimensions,
-                yaw_rate=self._yaw_rate(name, angle),
+                angular_velocity=(0.0, 0.0, self._yaw_rate(name, angle)),
             )
 
     def _person_states(self, domain: Any) -> Iterator[ObjectState]:
         turn = self._placement.yaw
         c, s = math.cos(turn), math.sin(turn)
-        for name, (kind, dimensions) in _present(self._persons, domain.getIDList()):
+        for name, (class_, dimensions) in _present(self._persons, domain.getIDList()):
             if name not in self._people:  # rides in a vehicle
                 continue
             body = self._people.body(name)
@@ -417,12 +417,12 @@ class SumoWorld(World[SumoSettings]):
             pose = body_pose(body.position, towards, 0.0, dimensions[2], self._placement)
             yield ObjectState(
                 name=self._prefix + name,
-                kind=kind,
+                class_=class_,
                 position=pose.position,
                 orientation=pose.orientation,
                 velocity=(c * vx - s * vy, s * vx + c * vy, vz),
                 dimensions=dimensions,
-                yaw_rate=turning(body.yaw_rate),
+                angular_velocity=(0.0, 0.0, turning(body.yaw_rate)),
             )
 
     def _follow(self, name: str, bumper: Vector, angle: float, dimensions: Vector) -> None:

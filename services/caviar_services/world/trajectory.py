@@ -133,12 +133,12 @@ class TrajectoryWorld(World[TrajectorySettings]):
             velocity = track.velocity(t)
             yield ObjectState(
                 name=name,
-                kind=thing.kind,
+                class_=thing.kind,
                 position=track.position(t),
                 orientation=quaternion_from_euler(track.yaw(t, velocity)),
                 velocity=velocity,
                 dimensions=thing.dimensions_m,
-                yaw_rate=track.yaw_rate(t, velocity),
+                angular_velocity=(0.0, 0.0, track.yaw_rate(t, velocity)),
             )
 
 

@@ -10,6 +10,7 @@ const Products = preload("res://addons/caviar/caviar_products.gd")
 const RunTimeMeshes = preload("res://addons/caviar/caviar_run_time_meshes.gd")
 const Scene = preload("res://addons/caviar/caviar_scene.gd")
 const Scenery = preload("res://addons/caviar/caviar_scenery.gd")
+const World = preload("res://addons/caviar/caviar_world.gd")
 
 var codec = Codec.new()
 var builder
@@ -74,6 +75,20 @@ func ask_axes(fields):
 		found += [text(pair[0]["position"]), text(pair[0]["orientation"])]
 		found += [text(pair[1]["velocity"]), text(pair[1]["angular_velocity"])]
 	return join(found)
+
+
+func ask_engine_mesh(fields):
+	var found = Axes.new(fields[0]).mesh_to_enu(rows(fields[1]), rows(fields[2]))
+	return join([text(flat(found["vertices"])), text(flat(found["triangles"]))])
+
+
+# The vertices of a mesh, offered before and, where MAX_FACES is given, while a run goes on: what offer_mesh returns.
+func ask_offered(fields):
+	var world = World.new()
+	world._meshes.max_faces = int(fields[0])
+	world._state = World.READY if fields[0] != "" else World.PREPARING
+	var found = world.offer_mesh("car", rows(fields[1]), [[0, 1, 2]])
+	return join([found["mesh"].substr(0, 11), text(found["dimensions"]), text(found["centre"])])
 
 
 # x, y, z and the quaternion of a node that is scaled by 2: its pose in ENU.
@@ -150,6 +165,13 @@ func ask_spawned(fields):
 func ask_spawn(fields):
 	var wrong = Scenery.wrong_at_run_time(fields[0], rows(fields[2]), rows(fields[3]), int(fields[1]))
 	return "ok" if wrong == "" else wrong
+
+
+func flat(rows):
+	var found = []
+	for row in rows:
+		found += row
+	return found
 
 
 func rows(text):

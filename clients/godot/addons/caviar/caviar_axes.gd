@@ -13,8 +13,11 @@ const WORLDS = {
 	"ned": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],  # north, east, down
 }
 const BODIES = {"ned": [[1, 0, 0], [0, -1, 0], [0, 0, -1]]}  # forward, right, down; others as their worlds
+const CLOCKWISE = ["unity", "godot"]  # triangles as seen from outside; in Unreal they are counter-clockwise
 
 var _world
+var _body
+var _clockwise
 var _hand
 var _unit
 var _left
@@ -23,11 +26,13 @@ var _right
 
 func _init(engine):
 	_world = WORLDS[engine]
+	_body = BODIES.get(engine, _world)
+	_clockwise = engine in CLOCKWISE
 	_unit = 100.0 if engine == "unreal" else 1.0
 	_hand = _determinant(_world)
 	# W·R·Bᵀ with W = s·P and B = s·Q, P and Q rotations and s = ±1: the sign cancels.
 	_left = quaternion_of(_scaled(_world, _hand))
-	_right = inverse(quaternion_of(_scaled(BODIES.get(engine, _world), _hand)))
+	_right = inverse(quaternion_of(_scaled(_body, _hand)))
 
 
 # {position, orientation} of the engine in the protocol's axes.
@@ -60,6 +65,18 @@ func transform_to_enu(transform):
 	return pose_to_enu(vector(transform.origin), quaternion_of(matrix))
 
 
+# {vertices, triangles} for offer_mesh, forward, left, up [m] and counter-clockwise as seen from outside, of a mesh as
+# the engine gives it: in its body axes, unit and winding. Corners: [[a, b, c], ...]; the second and third change
+# places where the engine has them clockwise.
+func mesh_to_enu(vertices, triangles):
+	var found = {"vertices": [], "triangles": []}
+	for vertex in vertices:
+		found["vertices"].append(_back(vertex, 1.0 / _unit, _body))
+	for corners in triangles:
+		found["triangles"].append([corners[0], corners[2], corners[1]] if _clockwise else corners)
+	return found
+
+
 # A Vector3 as [x, y, z].
 static func vector(of):
 	return [of.x, of.y, of.z]
@@ -72,10 +89,10 @@ func _forth(v, factor):
 	return found
 
 
-func _back(v, factor):
+func _back(v, factor, rows = _world):
 	var found = []
 	for i in range(3):
-		found.append(factor * (_world[0][i] * v[0] + _world[1][i] * v[1] + _world[2][i] * v[2]) + 0.0)
+		found.append(factor * (rows[0][i] * v[0] + rows[1][i] * v[1] + rows[2][i] * v[2]) + 0.0)
 	return found
 
 

@@ -94,7 +94,7 @@ func _check(item):
 	_check_numbers(who + "velocity", item["velocity"], 3, LIGHT_M_S)
 	_check_numbers(who + "dimensions", item["dimensions"], 3, 1e5)
 	if item["angular_velocity"] != null:
-		_check_numbers(who + "angular velocity", item["angular_velocity"], 3, 1e9)
+		_check_numbers(who + "angular_velocity", item["angular_velocity"], 3, 1e9)
 	if problem != "":
 		return
 	var q = item["orientation"]
@@ -105,8 +105,10 @@ func _check(item):
 		if side <= 0:
 			_wrong(who + "dimensions are %s; each has to be above 0 m" % str(item["dimensions"]))
 	var mesh = item["mesh"]
-	if mesh != "" and scenery != null and not scenery.has(mesh) and not RunTimeMeshes.is_name(mesh):
-		_wrong(who + "the mesh '%s' was not offered; take it from what offer_mesh returns" % mesh)
+	if typeof(mesh) != TYPE_STRING:
+		_wrong(who + "mesh is %s; give it the text that offer_mesh returns as mesh" % str(mesh))
+	elif mesh != "" and scenery != null and not scenery.has(mesh) and not RunTimeMeshes.is_name(mesh):
+		_wrong(who + "mesh is '%s', which was not offered; take it from what offer_mesh returns" % mesh)
 
 
 func _check_numbers(what, values, count, most):

@@ -59,17 +59,32 @@ static func wrong_at_run_time(name, vertices, triangles, max_faces):
 		return who + "it has no triangle"
 	if max_faces > 0 and triangles.size() > max_faces:
 		return who + "it has %d triangles, and this run takes %d" % [triangles.size(), max_faces]
+	for vertex in vertices:
+		if not _is_finite(vertex):
+			return who + "a vertex is not finite"
+	for side in box_of(vertices)["dimensions"]:
+		if not side > 0:
+			return who + "it is flat"
+	return ""
+
+
+static func _is_finite(vertex):
+	return abs(vertex[0]) < INF and abs(vertex[1]) < INF and abs(vertex[2]) < INF  # no NaN is
+
+
+# {dimensions, centre} of the box around the vertices that are finite.
+static func box_of(vertices):
+	var box = {"dimensions": [], "centre": []}
 	for i in range(3):
 		var low = INF
 		var high = -INF
 		for vertex in vertices:
-			if is_nan(vertex[i]) or is_inf(vertex[i]):
-				return who + "a vertex is not finite"
-			low = min(low, vertex[i])
-			high = max(high, vertex[i])
-		if not high > low:
-			return who + "it is flat"
-	return ""
+			if _is_finite(vertex):  # min and max of Godot 3 have single precision
+				low = vertex[i] if vertex[i] < low else low
+				high = vertex[i] if vertex[i] > high else high
+		box["dimensions"].append(high - low + 0.0 if high >= low else 0.0)
+		box["centre"].append((high + low) / 2.0 if high >= low else 0.0)
+	return box
 
 
 # meshes: [{name, vertices, triangles, material}]; materials: [{name, type, thickness}], thickness 0.2 m if
@@ -132,18 +147,14 @@ func _ply(name, vertices, triangles, material = ""):
 
 
 static func _in_unit_box(vertices):
+	var box = box_of(vertices)
 	var found = []
 	for vertex in vertices:
-		found.append([0.0, 0.0, 0.0])
-	for i in range(3):
-		var low = INF
-		var high = -INF
-		for vertex in vertices:
-			low = min(low, vertex[i])
-			high = max(high, vertex[i])
-		for j in range(vertices.size()):
-			if high > low:
-				found[j][i] = (vertices[j][i] - low + 0.0) / (high - low) - 0.5
+		var row = []
+		for i in range(3):
+			var side = box["dimensions"][i]
+			row.append((vertex[i] - box["centre"][i]) / side if side > 0 else 0.0)
+		found.append(row)
 	return found
 
 

@@ -17,6 +17,7 @@ const Scene = preload("caviar_scene.gd")
 const Scenery = preload("caviar_scenery.gd")
 
 const WAIT = "wait"  # what `step` returns to be asked again in the next tick
+const SMALLEST_M = 0.01  # [m] side of the box of a mesh that is refused and has none
 const DIGESTED_BYTES = 16 << 10
 const STATE_MARK = "caviar-world-1"
 enum { CONNECTING, JOINED, PREPARING, READY, ACTIVE, OVER }
@@ -105,22 +106,30 @@ func object(object_name, kind, position, dimensions):
 	return Scene.object(object_name, kind, position, dimensions)
 
 
-# The mesh of objects, for `mesh` of them. In `prepare` it is there for the whole run. In `reset`, `step` and
+# {mesh, dimensions, centre}: what an object with this mesh has as `mesh` and `dimensions` [m], and where the middle
+# of its box, its `position`, is in the mesh's own axes. In `prepare` it is there for the whole run. In `reset`, `step` and
 # `restore` it comes while the run goes on, and stays as long as an object has it, and 20 frames longer, until the
 # episode ends; a state has no meshes, so that `restore` offers those of its objects again. One that is none is
-# printed then, and the name is empty: its objects are boxes.
+# printed then, and its `mesh` is empty: its objects are boxes.
 func offer_mesh(mesh_name, vertices, triangles, material = ""):
+	var offered = Scenery.box_of(vertices)
+	offered["mesh"] = ""
 	if _state != READY and _state != ACTIVE:
-		return _scenery.offer_mesh(mesh_name, vertices, triangles, material)
+		offered["mesh"] = _scenery.offer_mesh(mesh_name, vertices, triangles, material)
+		return offered
 	var wrong = Scenery.wrong_at_run_time(mesh_name, vertices, triangles, _meshes.max_faces)
 	_scenery.problem = ""
 	var file = _scenery.unit_mesh(mesh_name, vertices, triangles, material) if wrong == "" else null
 	if wrong == "":
 		wrong = _scenery.problem
 	if wrong == "":
-		return _meshes.add(file)
+		offered["mesh"] = _meshes.add(file)
+		return offered
 	_say(wrong + "; objects with it are boxes")
-	return ""
+	for i in range(3):
+		if offered["dimensions"][i] < SMALLEST_M:
+			offered["dimensions"][i] = SMALLEST_M
+	return offered
 
 
 func _say(line):
@@ -504,7 +513,7 @@ func _answered(grant, parts):
 
 # A mesh as the run may have it.
 func _looked(mesh):
-	if not RunTimeMeshes.is_name(mesh):
+	if typeof(mesh) != TYPE_STRING or not RunTimeMeshes.is_name(mesh):
 		return mesh
 	if _meshes.max_faces == 0:
 		return ""  # the run takes no meshes now

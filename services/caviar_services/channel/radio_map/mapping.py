@@ -37,6 +37,10 @@ _RAY_BYTES, _CELL_BYTES = 600, 300
 _RAY_BEAM_BYTES, _CELL_BEAM_BYTES = 8, 20
 
 
+FLOOR_DB = 40.0
+"""[dB] below the noise down to which a cell has a signal: a ray of −174 dB in a building is none."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Coverage:
     """Gains of T transmitters in a grid of cells, and their powers.
@@ -81,8 +85,12 @@ class Coverage:
 
     @cached_property
     def best_server(self) -> Int32Array:
-        """Index of the transmitter with the greatest received power, Shape ``[ny, nx]``; −1: no signal."""
-        return np.where(self.rss.max(axis=0) > 0, self.rss.argmax(axis=0), -1).astype(np.int32)
+        """Index of the transmitter with the greatest received power, Shape ``[ny, nx]``.
+
+        −1: no signal, or one that is more than `FLOOR_DB` below the noise.
+        """
+        floor = self.noise_w * 10 ** (-FLOOR_DB / 10)
+        return np.where(self.rss.max(axis=0) > floor, self.rss.argmax(axis=0), -1).astype(np.int32)
 
     @property
     def has_signal(self) -> BoolArray:
