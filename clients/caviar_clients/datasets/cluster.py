@@ -334,7 +334,7 @@ class Episodes:
         # In two steps, since Ctrl-C may end the second one, which leaves a cluster that is half made.
         cluster = LocalCluster.__new__(LocalCluster)
         self._stack.callback(_abandon, cluster)
-        cluster.__init__(  # type: ignore[misc]
+        cluster.__init__(
             security=security,
             n_workers=self.workers,
             threads_per_worker=1,
