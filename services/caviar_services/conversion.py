@@ -68,6 +68,9 @@ def run_info(
         >>> welcome = m.Welcome(version=m.PROTOCOL_VERSION, epoch=2, attempt=1, run="demo", seed=1, **times)
         >>> run_info("agent", welcome, lambda phase, grace_s: None).again  # the broker was restarted
         True
+        >>> welcome = msgspec.structs.replace(welcome, scenario={"episodes": 2})
+        >>> run_info("agent", welcome, lambda phase, grace_s: None).episodes
+        2
     """
     scenario = welcome.scenario
     return RunInfo(
@@ -77,6 +80,7 @@ def run_info(
         seed=welcome.seed,
         sampling_period_ns=int(scenario.get("sampling_period_ns", 1)),
         frames=int(scenario.get("frames", 1)),
+        episodes=int(scenario.get("episodes", 1)),
         carriers=msgspec.convert(scenario.get("carriers", ()), tuple[Carrier, ...]),
         devices=msgspec.convert(scenario.get("devices", ()), tuple[DeviceSpec, ...]),
         scenario=scenario.get("resolved", {}),

@@ -86,6 +86,8 @@ class RunInfo:
     """Simulated time between two frames [ns]."""
     frames: int = 1
     """Frames of an episode, unless an agent ends it earlier."""
+    episodes: int = 1
+    """Of the run."""
     carriers: tuple[Carrier, ...] = ()
     devices: tuple[DeviceSpec, ...] = ()
     """Worlds: the devices that this world publishes. Others: all devices of the scenario."""

@@ -42,6 +42,16 @@ def test_train_and_evaluate(tmp_path: Path) -> None:
     assert re.findall(r"^(\S+) +all \d", printed, re.MULTILINE) == ["policy", "los-beam", "random", "optimum"]
 
 
+def test_learned_beams(tmp_path: Path) -> None:
+    """A few frames, all in sight, and too few steps to win by."""
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+    pytest.importorskip("sionna.rt", reason="the ray tracer is not installed")
+    printed = started(tmp_path, "learned_beams.py", "--frames", "6", "--steps", "600")
+    shares = dict(re.findall(r"^(\S+) +all (\d\.\d+)", printed, re.MULTILINE))
+    assert 0.0 < float(shares["policy"]) <= 1.0
+    assert 0.9 < float(shares["los-beam"]) <= 1.0
+
+
 def test_own_policy_learns(tmp_path: Path) -> None:
     """A few frames of 64 members suffice to be far above random beams."""
     pytest.importorskip("torch", reason="PyTorch is not installed")

@@ -14,7 +14,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -316,8 +316,18 @@ def test_an_agent_that_ends_its_process_is_named_with_the_exit_and_costs_its_epi
         assert sorted(path.name[-1] for path in (out / "episodes").iterdir()) == ["1", "2"]
 
 
-def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_path: Path) -> None:
-    """As a terminal sends it: to the command and to its processes."""
+@pytest.mark.parametrize(
+    "send",
+    [
+        lambda pid: os.killpg(pid, signal.SIGINT),  # as a terminal does, to the command and its processes
+        lambda pid: os.kill(pid, signal.SIGTERM),
+    ],
+    ids=["ctrl-c", "sigterm"],
+)
+def test_a_signal_ends_all_processes_and_says_how_to_go_on(
+    send: Callable[[int], None], scenario: Path, tmp_path: Path
+) -> None:
+    """Temporary folders go, too."""
     out = tmp_path / "d"
     command = [
         *COMMAND,
@@ -331,12 +341,18 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
         "--workers",
         "2",
     ]
+    (temporary := tmp_path / "tmp").mkdir()
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"TMPDIR": str(temporary)},
     )
     wait_for(out, 3, process)
     workers = children(psutil.Process(process.pid))
-    os.killpg(process.pid, signal.SIGINT)
+    send(process.pid)
     said, errors = process.communicate(timeout=60.0)
     assert process.returncode == 130, errors
     assert "starting 2 processes …" in said
@@ -345,6 +361,18 @@ def test_ctrl_c_ends_all_processes_and_says_how_to_go_on(scenario: Path, tmp_pat
     gone, alive = psutil.wait_procs(workers, timeout=10.0)
     assert (len(gone) >= 2, alive) == (True, [])
     assert not (out / ".work").exists()
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_dataset_that_is_deleted_ends_the_command(scenario: Path, tmp_path: Path) -> None:
+    out, scenes = tmp_path / "d", ("--episodes", "400", "--scenes", "5", "--workers", "2")
+    command = [*COMMAND, str(scenario), "--out", str(out), *scenes]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for(out, 3, process)
+    out.rename(tmp_path / "gone")
+    _, errors = process.communicate(timeout=60.0)
+    assert (process.returncode, errors.count("\n")) == (1, 1), errors
+    assert f"{out} was deleted while it was generated, which ended it" in errors
 
 
 @pytest.mark.parametrize("small_disk", ["4m"], indirect=True)

@@ -55,7 +55,7 @@ def prepared(attend: Callable[[], None] = lambda: None, **values: Any) -> Iterat
     """A prepared agent in its run, and the port that it listens on."""
     values = {"vehicles": {"Drone1": "uav"}, "users": ("motion:uav",), "listen": "127.0.0.1:0"} | values
     settings = AirSimSettings(**values)
-    agent = AirSimAgent(settings, RunInfo(name="pilot", attend=attend, scenario={"run": {"episodes": 2}}))
+    agent = AirSimAgent(settings, RunInfo(name="pilot", attend=attend, episodes=2))
     try:
         declared = agent.prepare(Preparation(demand={}))
         assert declared.actuators == ("motion:uav",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import pytest
 
 import caviar
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
+from caviar_services.agent.baselines import LosBeamAgent
+from caviar_services.service import Frame, StepResult
 
 pytestmark = pytest.mark.slow
 
@@ -78,3 +81,19 @@ def test_an_environment_needs_no_other_import() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr[-2000:]
+
+
+def test_a_run_whose_directory_is_deleted_ends_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = LosBeamAgent.step
+
+    def step(agent: LosBeamAgent, frame: Frame) -> StepResult:
+        if frame.number == 3:
+            shutil.rmtree(next(tmp_path.iterdir()))
+        return answer(agent, frame)
+
+    monkeypatch.setattr(LosBeamAgent, "step", step)
+    with pytest.raises(RunError, match=r"was deleted while the run went on, which ended it$"):
+        caviar.run("smoke", frames=1_000_000, out=tmp_path, embedded=True)
+    assert list(tmp_path.iterdir()) == []

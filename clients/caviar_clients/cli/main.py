@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from collections.abc import Callable
@@ -562,6 +563,10 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 def main() -> None:
     """Entry point: errors meant for the user become one line and status 1, warnings a line."""
     warnings.showwarning = _show_warning
+    # As Ctrl-C, so that temporary folders and child processes are not left; one that is ignored stays so.
+    for order in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(order) is signal.SIG_DFL:
+            signal.signal(order, signal.default_int_handler)
     try:
         app()
     except CaviarError as error:

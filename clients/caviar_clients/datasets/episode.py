@@ -12,7 +12,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +29,7 @@ from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import CaviarError
-from caviar_protocol.files import replace_file, sync_file
+from caviar_protocol.files import PrivateFolder, replace_file, sync_file
 from caviar_protocol.host import resident_mib
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
@@ -108,11 +108,12 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
     remote = RemoteDataset(task.out) if is_address(task.out) else None
     directory = DatasetDirectory(Path(task.out))
     target = directory.episode(task.episode)
+    stack = ExitStack()
     try:
         if remote is None and target.exists() and not task.trial:
             # By a twin of this task, on a worker that was given up.
             return EpisodeResult(task.episode, rows=rows_of(Recording(target)), measured=measured)
-        work = work_folder(task.out, str(task.episode))
+        work = stack.enter_context(work_folder(task.out, str(task.episode)))
     except OSError as error:
         return EpisodeResult(task.episode, str(unwritable(error.filename or task.out, error)))
     except CaviarError as error:
@@ -137,7 +138,7 @@ def play_episode(task: EpisodeTask) -> EpisodeResult:
     except OSError as error:
         return EpisodeResult(task.episode, str(unwritable(error.filename or work, error)), measured=measured)
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        stack.close()
 
 
 def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
@@ -171,20 +172,27 @@ def _on_disk(folder: Path) -> int:
     return sum(stat.st_blocks * 512 for stat in about) + about[0].st_blksize
 
 
-def work_folder(out: str, prefix: str) -> Path:
+@contextmanager
+def work_folder(out: str, prefix: str) -> Iterator[Path]:
     """Make a folder for what is half-written: on the disk of what is complete, so that it can be renamed.
 
-    Of a dataset with an address it is one of the temporary folders of this machine.
+    Of a dataset with an address it is one of the temporary folders of this machine. It is removed at the end.
 
     Args:
         out: Folder or address of the dataset.
         prefix: Of its name.
     """
     if is_address(out):
-        return Path(tempfile.mkdtemp(prefix=f"caviar-{prefix}-"))
+        with PrivateFolder(prefix) as folder:
+            yield folder.path
+        return
     work = DatasetDirectory(Path(out)).work
     work.mkdir(exist_ok=True)
-    return Path(tempfile.mkdtemp(prefix=f"{prefix}-", dir=work))
+    made = Path(tempfile.mkdtemp(prefix=f"{prefix}-", dir=work))
+    try:
+        yield made
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
 
 
 def _put_into_place(

@@ -126,22 +126,18 @@ def _put_scenery(scenario: Scenario, out: str, episode: int, cached: Mapping[str
     settings = {**recorder.settings, "copy_assets": True}
     services = {**scenario.services, name: msgspec.structs.replace(recorder, settings=settings)}
     shortened = _shortened(msgspec.structs.replace(scenario, services=services), 1)
-    work = work_folder(out, "scenery")
-    try:
+    with work_folder(out, "scenery") as work:
         task = replace(
             EpisodeTask(shortened, episode, out, trial=True, cached=cached), kept=str(work / "episode")
         )
         result = play_episode(task)
         found = RunDirectory(work / "episode").assets
-        if not found.is_dir():
-            return result.error
-        if is_address(out):
-            RemoteDataset(out).put_assets(found)
-        else:
-            rename_unless_there(found, DatasetDirectory(Path(out)).assets)
+        if found.is_dir():
+            if is_address(out):
+                RemoteDataset(out).put_assets(found)
+            else:
+                rename_unless_there(found, DatasetDirectory(Path(out)).assets)
         return result.error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _shortened(scenario: Scenario, scenes: int) -> Scenario:

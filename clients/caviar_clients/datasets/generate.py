@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +20,7 @@ from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.texts import counted
 from caviar_clients.datasets.traffic import SharedTraffic
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import CaviarError, RunError
 
 MOST_EPISODES = 10**18 - 1
 """That a catalogue can number."""
@@ -102,7 +103,9 @@ def generate(
                 ledger.upload()
         finally:
             began = ledger.began
-            catalogue.close()
+            # SQLite refuses to close one that was deleted, and the error of that is told already.
+            with nullcontext() if directory.catalogue.exists() else suppress(CaviarError):
+                catalogue.close()
             if not began:  # it was refused before anything was there
                 _remove_catalogue(directory)
 
@@ -157,6 +160,8 @@ def _generate(ledger: Ledger, observer: Observer, workers: int, scheduler: str) 
         ledger.keep_plan()
         began = time.monotonic()
         for result in episodes.play(_tasks(ledger, left, traffic)):
+            if not ledger.directory.catalogue.exists():  # SQLite would go on in the file without a name
+                raise RunError(f"{ledger.directory.path} was deleted while it was generated, which ended it")
             _keep(result, catalogue, outcome)
             outcome.wall_s = time.monotonic() - began
             observer.ended(result)

@@ -181,11 +181,14 @@ def _trained(rules: RulesName, episodes: Sequence[Episode], settings: Settings) 
     """B-A2C, with the settings of the challenge's baseline."""
     import torch
     from stable_baselines3 import A2C
+    from stable_baselines3.common.logger import Logger
 
     # The network is tiny: threads that wait for each other take more time than its products.
     torch.set_num_threads(1)
     env = RadioStrikeEnv(rules, episodes=episodes)
     model = A2C("MlpPolicy", env, learning_rate=1e-3, n_steps=1, gamma=0.7, seed=settings.seed, device="cpu")
+    # Its own logger makes a temporary folder that it never removes.
+    model.set_logger(Logger(folder=None, output_formats=[]))
     # Of `legacy` a user that is always scheduled is at the end of its trajectories by then.
     most = sum(episode.steps for episode in episodes) if rules == "legacy" else settings.train_steps
     return model.learn(min(settings.train_steps, most))

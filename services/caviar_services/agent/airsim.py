@@ -190,7 +190,7 @@ class AirSimAgent(Agent[AirSimSettings]):
                 "depth": tuple(frame.payloads("depth", Depth).values()),
                 "segmentation": tuple(frame.payloads("segmentation", Segmentation).values()),
             },
-            is_last_episode=frame.episode + 1 >= self._episodes,
+            is_last_episode=frame.episode + 1 >= self.run.episodes,
         )
         deciding = self._loop.submit(self._decide(snapshot))
         # A script may hold the world for hours. Without progress the run would end with `stall_s`; and the
@@ -209,11 +209,6 @@ class AirSimAgent(Agent[AirSimSettings]):
         if self.settings.start == "client":
             await self._server.called.wait()
         return await self._bridge.decide(snapshot)
-
-    @property
-    def _episodes(self) -> int:
-        run = self.run.scenario.get("run")
-        return int(run.get("episodes", 1)) if isinstance(run, dict) else 1
 
     def close(self) -> None:
         """Answer what is under way with an error, and hang up."""
