@@ -1535,8 +1535,8 @@ class Mounts {
   std::vector<std::string> arrived_;
 };
 
-// Whether a name is that of a mesh that came while a run went on, `objects/SHA-256.ply`: consumers without that
-// mesh have a box.
+// Whether a name is that of a mesh that came while a run went on, `objects/SHA-256.ply`: consumers without
+// that mesh have a box.
 inline bool is_mesh_name(const std::string& name) {
   return name.size() == 8 + 64 + 4 && name.rfind("objects/", 0) == 0 && name.rfind(".ply") == 72 &&
          name.find_first_not_of("0123456789abcdef", 8) == 72;
@@ -1688,10 +1688,11 @@ inline std::string wrong_mesh(const Mesh& mesh) {
 // The mesh as a binary PLY file, which names the material of its object, where it has one of its own.
 inline Bytes to_ply(const Mesh& mesh, const std::string& material = "") {
   const std::string comment = material.empty() ? "" : "comment material " + material + "\n";
-  Bytes file =
-      "ply\nformat binary_little_endian 1.0\n" + comment + "element vertex " + std::to_string(mesh.vertices.size()) +
-      "\nproperty float x\nproperty float y\nproperty float z\nelement face " +
-      std::to_string(mesh.triangles.size()) + "\nproperty list uchar int vertex_indices\nend_header\n";
+  Bytes file = "ply\nformat binary_little_endian 1.0\n" + comment + "element vertex " +
+               std::to_string(mesh.vertices.size()) +
+               "\nproperty float x\nproperty float y\nproperty float z\nelement face " +
+               std::to_string(mesh.triangles.size()) +
+               "\nproperty list uchar int vertex_indices\nend_header\n";
   const auto add = [&file](const void* data, std::size_t size) {
     file.append(static_cast<const char*>(data), size);
   };
@@ -2167,8 +2168,8 @@ class World {
   double welcome_timeout_s = 120.0;  // for the first WELCOME
   int max_in_flight = 4;             // grants that may be queued
 
-  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 1 where this world failed,
-  // was refused or has the blame, 128 + n after signal n.
+  // Takes part in a run until it is over. Returns the exit status: 0 after SHUTDOWN, 1 where this world
+  // failed, was refused or has the blame, 128 + n after signal n.
   int run(const std::string& endpoint, const std::string& name) {
     leave_on_signals();
     if (connect(endpoint, name))
@@ -2199,7 +2200,8 @@ class World {
         break;
       }
       std::vector<Bytes> parts;
-      // First what has come: the last words of a broker that is gone say why. Not all that may come, so that a flood of messages does not hold an engine up.
+      // First what has come: the last words of a broker that is gone say why. Not all that may come, so that
+      // a flood of messages does not hold an engine up.
       for (int left = 64; left > 0 && socket_ && receive_parts(socket_, parts); --left)
         if (handle(std::move(parts)) || stage_ == Stage::over) return stage_ != Stage::over;
       if (!keep_connected()) break;
@@ -2364,7 +2366,7 @@ class World {
     socket_ = open_dealer(context_, endpoint_, keys_, 1000);
     if (!socket_)
       return end("cannot connect to '" + endpoint_ + "': " + zmq_strerror(zmq_errno()) +
-                     "; an address is like tcp://127.0.0.1:5555");
+                 "; an address is like tcp://127.0.0.1:5555");
     stage_ = Stage::connecting;
     std::vector<Value> wanted;
     for (const Input& input : inputs()) {
@@ -2402,8 +2404,8 @@ class World {
     if (Clock::now() < deadline_) return true;
     if (rejoining_) return lost("no WELCOME");
     return end("no WELCOME within " + std::to_string(static_cast<int>(welcome_timeout_s)) + " s from " +
-                   endpoint_ +
-                   "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?");
+               endpoint_ +
+               "; is the broker there, and does it ask for keys (CAVIAR_KEY, CAVIAR_BROKER_KEY)?");
   }
 
   // A broker that waits for this world gets a new incarnation of it, on new sockets (SPEC.md, rejoin_ns).

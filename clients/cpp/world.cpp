@@ -1,7 +1,7 @@
-// The reference world: a car and a UAV move, a pedestrian and a ramp come and go, and it brings a street and the
-// meshes of car and ramp, that of the ramp while the run goes on. The UAV flies between four points, or where
-// agents send it; that state is saved, so that the world goes on where it was when it is killed and started
-// again.
+// The reference world: a car and a UAV move, a pedestrian and a ramp come and go, and it brings a street and
+// the meshes of car and ramp, that of the ramp while the run goes on. The UAV flies between four points, or
+// where agents send it; that state is saved, so that the world goes on where it was when it is killed and
+// started again.
 //
 //     g++ -std=c++17 -O2 world.cpp -o world -lzmq -pthread
 //     ./world tcp://127.0.0.1:5555 world
