@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import engine_worlds as worlds
 import pytest
 from node_project import node_project
 from scenarios_support import ROOT, blocks, caviar, environment, eventually, running
@@ -215,17 +216,25 @@ def undisturbed(node: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[st
 
 THROWS = """import {{ main, World }} from "{library}";
 class Throws extends World {{
-  step() {{ throw new Error("no road is left"); }}
+  step() {{ {step} }}
 }}
 await main(new Throws({{ prefixes: ["car"] }}));
 """
 
 
-def test_a_world_that_throws_ends_with_status_1(node: str, light: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "step",
+    [
+        'throw new Error("no road is left");',
+        "for (const until = Date.now() + 1500; Date.now() < until; ); return [];",
+    ],
+    ids=["throws", "late"],
+)
+def test_a_world_that_ends_the_run_ends_with_status_1(node: str, step: str, tmp_path: Path) -> None:
     script = tmp_path / "throws.mjs"
-    script.write_text(THROWS.format(library=CLIENT / "src" / "index.mjs"))
+    script.write_text(THROWS.format(library=CLIENT / "src" / "index.mjs", step=step))
     with (
-        waiting_run(tmp_path, scenario=light) as run,
+        waiting_run(tmp_path, scenario=worlds.ending(tmp_path, "late")) as run,
         run.agent(node, str(script), run.url, "world") as world,
     ):
         assert world.wait(WITHIN_S) == 1

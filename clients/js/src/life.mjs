@@ -19,6 +19,7 @@ import { decodePayload, payloadDigest } from "./topics.mjs";
  * What a life asks of the service that it is one of.
  * @typedef {object} Part
  * @property {string} name
+ * @property {string} role
  * @property {number} grace  [s] that its preparation may stay silent
  * @property {() => Message} hello
  * @property {(welcome: Message) => void} welcomed
@@ -190,6 +191,9 @@ export class Life {
           ? this.#lose(message.message)
           : this.#fail(new RunError(`refused: ${message.code}: ${message.message}`));
       case "SHUTDOWN":
+        // A reason that blames a service begins with its role and name.
+        if (message.reason.startsWith(`${this.part.role} '${this.part.name}' `))
+          this.#faulted ??= new RunError(message.reason);
         if (this.#faulted) this.#reject(this.#faulted); // before what `leave` resolves
         return this.leave(message.reason);
     } // CANCEL is advice: the answer that is under way is still due

@@ -328,7 +328,8 @@ func _receive(bytes):
 
 func _take(type, fields, parts):
 	if type == "SHUTDOWN" and _state != CONNECTING:
-		_leave(0, fields["reason"])
+		# A reason that blames a service begins with its role and name.
+		_leave(int(fields["reason"].begins_with("world '%s' " % name)), fields["reason"])
 	elif type == "REFUSE" and _state == CONNECTING:
 		_refused(fields)
 	elif type == "STALE" or type == "ERROR":
