@@ -42,6 +42,7 @@ def test_train_and_evaluate(tmp_path: Path) -> None:
     assert re.findall(r"^(\S+) +all \d", printed, re.MULTILINE) == ["policy", "los-beam", "random", "optimum"]
 
 
+@pytest.mark.exhaustive
 def test_learned_beams(tmp_path: Path) -> None:
     """A few frames, all in sight, and too few steps to win by."""
     pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
