@@ -9,6 +9,7 @@ import sys
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,6 +28,7 @@ from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.radio_map.mapping import transmitters_of
+from caviar_services.mesh.shapes import box, ply
 
 pytestmark = pytest.mark.slow
 
@@ -240,6 +242,19 @@ def test_what_is_unusual_about_the_cells_is_said(tmp_path: Path) -> None:
     assert buried == "50.0% of the cells are below what is taken as ground"
     beside = _surface(tmp_path, area=(1000.0, 1000.0, 1100.0, 1100.0))[0]
     assert beside == ("warning: the area is beside the scenery, which reaches x 0 to 100 m, y 0 to 50 m")
+
+
+def test_a_plane_is_above_the_top_of_a_slab(tmp_path: Path) -> None:
+    slab = box((0.0, 100.0), (0.0, 50.0), (-2.0, 0.0))
+    (tmp_path / "slab.ply").write_bytes(ply(slab))
+    (tmp_path / "a.xml").write_text(
+        '<scene version="2.1.0"><shape type="ply" id="mesh-slab">'
+        '<string name="filename" value="slab.ply"/></shape></scene>'
+    )
+    channel: Any = SimpleNamespace(scene=_Scenery())
+    surface, about, notes = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(height=1.5))
+    assert (about, notes) == ("plane at z = 1.5 m", ())
+    assert np.unique(surface.z).tolist() == [1.5]
 
 
 @pytest.mark.parametrize(

@@ -244,6 +244,9 @@ def _plane(
 ) -> tuple[MeasurementSurface, tuple[str, ...]]:
     """A level surface above the lowest ground, and notes about ground that is above it."""
     triangles = ground((shape.file, shape.to_world) for shape in shapes)
+    # Where the ground is a slab, its top alone; a sheet may be wound either way.
+    upward = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] > 0.0
+    triangles = triangles[upward] if upward.any() else triangles
     level = triangles[..., 2]
     surface = level_surface(area, wanted.cell, wanted.height + (float(level.min()) if level.size else 0.0))
     notes = []

@@ -205,7 +205,7 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
             axes.scatter([], [], s=30, facecolors="none", edgecolors=GREY, label="hollow: NLOS")
         axes.grid()
         axes.set_xlabel("AoA θ [°]")
-        axes.set_ylabel("|y| below the optimum [dB]")
+        axes.set_ylabel("|y| relative to the optimum [dB]")
         axes.set_ylim(top=max(0.5, -0.03 * axes.get_ylim()[0]))
         axes.set_title(f"|y| over the angle of arrival: {data.rx}, served by {data.tx} ({data.carrier})")
         legend_below(drawn, axes)
