@@ -188,9 +188,15 @@ class _Reading(threading.local):
 _reading = _Reading()
 
 
+_making = threading.Lock()
+
+
 @cache
 def _payload_decoder(cls: type[Payload]) -> msgspec.msgpack.Decoder[Payload]:
-    return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.read(reference))
+    # msgspec has what it knows of a class in place before it is whole: a decoder that another thread makes
+    # meanwhile would read past it, and Python would die.
+    with _making:
+        return msgspec.msgpack.Decoder(cls, dec_hook=lambda _, reference: _reading.reader.read(reference))
 
 
 def decode_payload(topic: str, header: Buffer, body: Buffer) -> Payload:
