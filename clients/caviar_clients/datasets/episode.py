@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import socket
 import tempfile
 import time
@@ -188,11 +187,8 @@ def work_folder(out: str, prefix: str) -> Iterator[Path]:
         return
     work = DatasetDirectory(Path(out)).work
     work.mkdir(exist_ok=True)
-    made = Path(tempfile.mkdtemp(prefix=f"{prefix}-", dir=work))
-    try:
-        yield made
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f"{prefix}-", dir=work, ignore_cleanup_errors=True) as made:
+        yield Path(made)
 
 
 def _put_into_place(

@@ -103,7 +103,7 @@ def generate(
                 ledger.upload()
         finally:
             began = ledger.began
-            # SQLite refuses to close one that was deleted, and the error of that is told already.
+            # SQLite refuses to close a catalogue that was deleted; the command reports the deletion itself.
             with nullcontext() if directory.catalogue.exists() else suppress(CaviarError):
                 catalogue.close()
             if not began:  # it was refused before anything was there
