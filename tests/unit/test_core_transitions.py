@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from core_harness import MS, SECOND, Simulation, agent, loop, sensors, world
 
-from caviar_broker.core import run, tasks, transitions
 from caviar_broker.core import events as ev
+from caviar_broker.core import run, tasks, transitions
 from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import (
     DECIDED,
