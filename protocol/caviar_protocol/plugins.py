@@ -4,6 +4,7 @@
 | --- | --- | --- |
 | ``caviar.services`` | ``role:name`` | a subclass of `Service` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
+| ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 
 What is built in stands in a table of its own and goes first; a distribution adds names, and changes none.

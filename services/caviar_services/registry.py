@@ -16,7 +16,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -268,11 +268,13 @@ def scenario_schema() -> dict[str, Any]:
     """
     # Every service reads this module at its start, and the schema's rows would take 7 ms of it.
     from caviar_protocol.spec import structs_below
+    from caviar_services.sensors.noise import SENSORS, noise_models
 
     settings = settings_classes()
-    classes: list[type[msgspec.Struct]] = [Scenario, *settings.values()]
+    noises = {(sensor, use): cls for sensor in SENSORS for use, cls in noise_models(sensor).items()}
+    classes: list[type[msgspec.Struct]] = [Scenario, *settings.values(), *noises.values()]
     references, definitions = msgspec.json.schema_components(classes, ref_template="#/$defs/{name}")
-    by_implementation = dict(zip(settings, references[1:], strict=True))
+    by_implementation = dict(zip([*settings, *noises], references[1:], strict=True))
     # msgspec has the descriptions of structs; meanings of fields are the strings below them in the source.
     for cls in structs_below(classes):
         if cls.__name__ in definitions:
@@ -280,6 +282,7 @@ def scenario_schema() -> dict[str, Any]:
     for definition in definitions.values():
         if {"use", "settings"} <= definition.get("properties", {}).keys():
             definition["allOf"] = list(_conditions(definition, by_implementation))
+    _describe_noise(definitions, by_implementation, noises)
     _accept_instants(definitions[Run.__name__])
     del definitions[Scenario.__name__]["properties"]["source"]  # where the file was read from
     del definitions["Source"]
@@ -323,6 +326,23 @@ def _conditions(
             settings = {"properties": {"settings": by_implementation[role, name]}}
             found.append({"if": {"allOf": [of_role, chosen]}, "then": settings})
     return found
+
+
+def _describe_noise(
+    definitions: Mapping[str, Any],
+    references: Mapping[tuple[str, str], Any],
+    noises: Iterable[tuple[str, str]],
+) -> None:
+    """Put the keys of each noise model, and ``use`` with its name, into key ``noise`` of its sensor."""
+    tables: dict[str, list[Any]] = {}
+    for sensor, use in noises:
+        model = definitions[references[sensor, use]["$ref"].rpartition("/")[2]]
+        properties = {"use": {"const": use}} | model["properties"]
+        required = ["use", *model.get("required", ())]
+        tables.setdefault(sensor, []).append(model | {"properties": properties, "required": required})
+    for sensor, choices in tables.items():
+        settings = definitions[references["sensors", sensor]["$ref"].rpartition("/")[2]]
+        settings["properties"]["noise"]["anyOf"] = choices
 
 
 def _accept_instants(run: dict[str, Any]) -> None:

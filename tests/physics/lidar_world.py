@@ -50,10 +50,12 @@ def prepared(
     return service
 
 
-def observed(service: LidarSensors, scene: Scene, number: int = 0) -> Lidar:
+def observed(service: LidarSensors, scene: Scene, number: int = 0, seed: int = 0) -> Lidar:
     """What the service makes of a scene."""
     provenance = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=number)
-    frame = Frame(episode=0, number=number, t_ns=0, inputs=(FrameInput(provenance, payload=scene),))
+    frame = Frame(
+        episode=0, number=number, t_ns=0, seed=seed, inputs=(FrameInput(provenance, payload=scene),)
+    )
     product = service.step(frame).products["lidar"]
     assert isinstance(product, Lidar)
     return product

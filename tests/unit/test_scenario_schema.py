@@ -44,6 +44,12 @@ def test_it_accepts_every_scenario_of_the_repository(file: Path) -> None:
     assert not problems(tomllib.loads(file.read_text()))
 
 
+def test_it_accepts_noise_of_a_sensor_as_the_reader_does() -> None:
+    text = noisy('use = "gaussian", range_std_m = 0.02, dropout = 0.01')
+    checked(text)
+    assert not problems(tomllib.loads(text))
+
+
 def test_there_are_scenarios_to_accept() -> None:
     assert set(shipped_scenarios().values()) <= set(FILES)
 
@@ -52,6 +58,11 @@ def replaced(old: str, new: str, scenario: str = "smoke") -> str:
     text = find_scenario(scenario).read_text()
     assert old in text
     return text.replace(old, new, 1)
+
+
+def noisy(table: str) -> str:
+    """A scenario with noise of its LIDAR."""
+    return replaced('use = "lidar"\n', f'use = "lidar"\nsettings.noise = {{ {table} }}\n', "cameras")
 
 
 @pytest.mark.parametrize(
@@ -65,8 +76,10 @@ def replaced(old: str, new: str, scenario: str = "smoke") -> str:
         (lambda: replaced("max_depth = ", "max_depht = ", "street-canyon"), "max_depht"),
         (lambda: replaced('kind = "antenna"', 'kind = "antena"'), "antena"),
         (lambda: replaced('label = "', 'labl = "', "adaptive"), "labl"),
+        (lambda: noisy('use = "gausian"'), "gausian"),
+        (lambda: noisy('use = "gaussian", range_std_m = -1'), "range_std_m"),
     ],
-    ids=["key", "table", "range", "implementation", "role", "setting", "word", "rung"],
+    ids=["key", "table", "range", "implementation", "role", "setting", "word", "rung", "noise", "deviation"],
 )
 def test_it_refuses_what_the_reader_refuses(text: Callable[[], str], named: str) -> None:
     assert named in problems(tomllib.loads(text()))

@@ -97,6 +97,8 @@ class Sensors(Service[S]):
 
     traced: TracedScene | None = None
     """The scene for rays; None where nothing is asked for."""
+    frame = Frame(episode=0, number=0, t_ns=0)
+    """That which is observed, for its number and its generators; before the first an empty one."""
     shapes: tuple[SceneryShape, ...] = ()
     """Shapes of the scenery, in the order of their owners in `traced`."""
     # Objects that may be in the scene at once, by asset name.
@@ -148,6 +150,7 @@ class Sensors(Service[S]):
         """Move the bodies to the objects of the frame, and observe."""
         if self.traced is None:
             return StepResult()
+        self.frame = frame
         scene = frame.scene()
         started = time.perf_counter_ns()
         with active_variant(self.variant) as mi:

@@ -10,8 +10,17 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
+from caviar_protocol.arrays import (
+    Float32Array,
+    Float64Array,
+    Int32Array,
+    Int64Array,
+    Payload,
+    UInt8Array,
+    quantity,
+)
 from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import (
     Camera,
@@ -34,6 +43,7 @@ from caviar_services.sensors.base import (
     sensor_poses,
     visible_names,
 )
+from caviar_services.sensors.noise import SensorNoise, measured, noise_model
 from caviar_services.sensors.shading import Colour, Painter, View, object_colour, shape_colour
 from caviar_services.service import Preparation, Prepared
 
@@ -49,6 +59,10 @@ class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_f
         float, quantity("°", "where the sun stands, counter-clockwise from +x")
     ] = -55.0
     sun_elevation_deg: Annotated[float, quantity("°", "of the sun above the horizon", ge=-90, le=90)] = 45.0
+    noise: dict[str, Any] | None = None
+    """Errors of the pictures of topic ``camera``: ``{ use = "gaussian", std_counts = 2.0 }``, or another
+    model of `caviar_services.sensors.noise` or of a plug-in; absent: none. Depth and segmentation have
+    none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +94,15 @@ class CameraSensors(Sensors[CameraSettings]):
         ('camera', 'depth', 'segmentation')
     """
 
+    _noise: SensorNoise | None = None
     outputs: ClassVar[tuple[str, ...]] = ("camera", "depth", "segmentation")
     uses_scenery: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = CameraSettings
+
+    @classmethod
+    def check_settings(cls, settings: CameraSettings, place: Place) -> None:
+        """See `Service.check_settings`."""
+        noise_model("camera", settings.noise, place.at("noise"))
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """See `Sensors.prepare`; `ScenarioError` where a colour is none."""
@@ -92,6 +112,7 @@ class CameraSensors(Sensors[CameraSettings]):
                     f"colour {list(colour)} of {name!r} is not sRGB; give red, green and blue from 0 to 1",
                     key=f"services.{self.run.name}.settings.colours.{name}",
                 )
+        self._noise = noise_model("camera", self.settings.noise, Place("settings.noise"))
         self._demand = preparation.demand  # before `super`, whose warm-up observes
         return super().prepare(preparation)
 
@@ -129,7 +150,21 @@ class CameraSensors(Sensors[CameraSettings]):
         )
         # One painter for all cameras of a frame: normals and colours of all faces are uploaded once.
         painter = Painter(mi, traced, self._albedo(traced, scene), sun)
-        return Camera(images=tuple(CameraImage(**view.fields, rgb=painter.paint(view)) for view in views))
+        return Camera(
+            images=tuple(
+                CameraImage(**view.fields, rgb=self._taken(view, painter.paint(view))) for view in views
+            )
+        )
+
+    def _taken(self, view: View, rgb: UInt8Array) -> UInt8Array:
+        """The picture as the camera takes it, Shape ``[H, W, 3]``."""
+        if self._noise is None:
+            return rgb
+        random = self.frame.generator(f"noise/{view.device.name}")
+        counts = measured(self._noise, rgb.astype(np.float32), random)
+        if not np.isfinite(counts).all():
+            raise PayloadError(f"{type(self._noise).__name__}.apply made counts that are no number")
+        return np.clip(np.rint(counts), 0, 255).astype(np.uint8)
 
     def _albedo(self, traced: TracedScene, scene: Scene) -> Float64Array:
         """Linear sRGB of each owner, Shape ``[owners, 3]``."""

@@ -8,7 +8,7 @@ sets of the ITU ML5G-PHY beam-selection challenge).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
 from caviar_protocol.errors import ScenarioError
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, Vector, rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Lidar, LidarDevice, LidarScan, OccupancyGrid, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.drjit_setup import aligned_doubles, aligned_indices, several
+from caviar_services.drjit_setup import aligned_columns, aligned_doubles, aligned_indices, several
 from caviar_services.sensors.base import Sensors, SensorSettings, TracedScene, sensor_poses, visible_names
-from caviar_services.service import Frame, Preparation, Prepared, StepResult
+from caviar_services.sensors.noise import SensorNoise, measured, noise_model
+from caviar_services.service import Preparation, Prepared
 
 
 class LidarSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -41,6 +43,9 @@ class LidarSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_fi
     points_world: bool = True
     """Whether scans have their points in world axes too. Without them a scan is a third smaller, and
     `LidarScan.in_world` computes them."""
+    noise: dict[str, Any] | None = None
+    """Errors of the ranges: ``{ use = "gaussian", range_std_m = 0.02, dropout = 0.01 }``, or another model of
+    `caviar_services.sensors.noise` or of a plug-in; absent: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +97,17 @@ class LidarSensors(Sensors[LidarSettings]):
     """
 
     _with_grid = False
-    _with_points = True
+    _noise: SensorNoise | None = None
     # Of the last frame; those of the next are mostly the same.
     _rays: _Rays | None = None
     outputs: ClassVar[tuple[str, ...]] = ("lidar",)
     uses_scenery: ClassVar[bool] = True
     Settings: ClassVar[type[msgspec.Struct]] = LidarSettings
+
+    @classmethod
+    def check_settings(cls, settings: LidarSettings, place: Place) -> None:
+        """See `Service.check_settings`."""
+        noise_model("lidar", settings.noise, place.at("noise"))
 
     def prepare(self, preparation: Preparation) -> Prepared:
         """See `Sensors.prepare`; `ScenarioError` where a grid is asked for that is not described."""
@@ -109,14 +119,8 @@ class LidarSensors(Sensors[LidarSettings]):
                 key=f"services.{self.run.name}.settings.grid",
             )
         self._with_grid = "grid" in parts
+        self._noise = noise_model("lidar", self.settings.noise, Place("settings.noise"))
         return super().prepare(preparation)
-
-    def step(self, frame: Frame) -> StepResult:
-        """See `Sensors.step`."""
-        # By the number of the frame, not counted: a service that was started again goes on in step.
-        every = self.settings.points_every
-        self._with_points = every > 0 and frame.number % every == 0
-        return super().step(frame)
 
     def example_devices(self) -> tuple[Device, ...]:
         """One small LIDAR at the origin."""
@@ -134,7 +138,8 @@ class LidarSensors(Sensors[LidarSettings]):
         if self._rays is None or self._rays.patterns != patterns:
             self._rays = _rays(mi, patterns)
         with_world = self._with_grid or (self._with_points and self.settings.points_world)
-        returns = _trace(mi, traced, self._rays, sensors, with_world)
+        measure = self._measure if self._noise is not None else None
+        returns = _trace(mi, traced, self._rays, sensors, with_world, measure)
         # Faces, not rays, are looked up: there are fewer of them, and most rays share theirs.
         hit = np.zeros(len(traced.face_owner), dtype=np.bool_)
         hit[returns.face if self._with_points else slice(0)] = True
@@ -149,6 +154,21 @@ class LidarSensors(Sensors[LidarSettings]):
             for i, (device, pose) in enumerate(sensors)
         )
         return {"lidar": Lidar(object_names=names, scans=scans)}
+
+    @property
+    def _with_points(self) -> bool:
+        # By the number of the frame, not counted: a service that was started again goes on in step.
+        every = self.settings.points_every
+        return every > 0 and self.frame.number % every == 0
+
+    def _measure(self, device: LidarDevice, distance: Float32Array) -> Float32Array:
+        """Ranges of a device's returns as it measures them [m], Shape ``[H]``; NaN: lost."""
+        if self._noise is None:
+            return distance
+        # A generator for each device: the noise of one is the same whatever others there are.
+        ranges = measured(self._noise, distance, self.frame.generator(f"noise/{device.name}"))
+        ranges[~((ranges >= device.min_range) & (ranges <= device.max_range))] = np.nan
+        return ranges
 
     def _scan(
         self,
@@ -230,9 +250,14 @@ def _rays(mi: Any, patterns: tuple[tuple[int, int, float, float], ...]) -> _Rays
 
 
 def _trace(
-    mi: Any, traced: TracedScene, rays: _Rays, sensors: list[tuple[LidarDevice, Pose]], with_world: bool
+    mi: Any,
+    traced: TracedScene,
+    rays: _Rays,
+    sensors: list[tuple[LidarDevice, Pose]],
+    with_world: bool,
+    measure: Callable[[LidarDevice, Float32Array], Float32Array] | None,
 ) -> _Returns:
-    """What comes back of rays from sensors at these poses.
+    """What comes back of rays from sensors at these poses, at ranges that ``measure`` may change.
 
     Positions and directions are float64 until they are those of a ray or a point.
     """
@@ -264,6 +289,20 @@ def _trace(
     if not dr.width(number):
         return _nothing(with_world)
     distance, face = dr.gather(mi.Float, distance, number), dr.gather(mi.UInt32, face, number)
+    if measure is not None:
+        # Before points are made of ranges: points, grid and ranges agree with each other.
+        bounds = np.searchsorted(number.numpy(), rays.first)
+        ranges = np.split(distance.numpy(), bounds[1:-1])
+        noisy = np.concatenate(
+            [measure(device, own) for (device, _), own in zip(sensors, ranges, strict=True)]
+        )
+        kept = np.flatnonzero(np.isfinite(noisy))
+        if not len(kept):
+            return _nothing(with_world)
+        number, face = (
+            mi.UInt32(aligned_indices(rows.numpy()[kept].astype(np.int64))) for rows in (number, face)
+        )
+        distance = mi.Float(aligned_columns(noisy[None, kept])[0])
     sensor: Any = dr.gather(mi.UInt32, rays.sensor, number)
     local = [dr.gather(mi.Float64, row, number) for row in rays.local]
     away = mi.Float64(distance)

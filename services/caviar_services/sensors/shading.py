@@ -355,11 +355,11 @@ SHAPE_SHADES, OBJECT_SHADES = 0.2, 0.45
 """Things of one colour differ by up to this share, so that neighbours look different."""
 
 
-def linear(colour: Colour) -> Float64Array:
-    """Decode an sRGB colour to linear sRGB, 0…1 (IEC 61966-2-1).
+def linear(colour: Colour | Float32Array | Float64Array) -> Float64Array:
+    """Decode sRGB to linear sRGB, 0…1 (IEC 61966-2-1).
 
     Args:
-        colour: sRGB, 0…1.
+        colour: sRGB, 0…1, of any shape.
 
     Example:
         >>> linear((1.0, 0.5, 0.0)).round(3).tolist()
