@@ -260,7 +260,7 @@ def _plane(
 
 
 def _upward(piece: Float64Array) -> Float64Array:
-    """Triangles of a piece of ground that face upward: of a slab the top. A sheet may face down: all of it."""
+    """Upward triangles of a piece of ground: of a slab its top; all of a sheet that faces down."""
     upward = np.cross(piece[:, 1] - piece[:, 0], piece[:, 2] - piece[:, 0])[:, 2] > 0.0
     return piece[upward] if upward.any() else piece
 
