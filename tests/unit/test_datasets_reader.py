@@ -506,6 +506,13 @@ def test_samples_are_read_by_position(folder: Path) -> None:
     assert samples[-1]["rx"] == users["rx"][-1]
     with pytest.raises(IndexError, match="user 36 of 36"):
         samples[36]
+    words = (
+        r"channel\.h has the shape \(4, 32\) for 'car/rx' and \(1, 32\) for 'uav/rx-uav': take torch_batches"
+    )
+    with pytest.raises(ValueError, match=words):
+        users.torch(["channel.h"])
+    assert users[users["rx"] == "car/rx"].torch(["channel.h"])[2]["channel.h"].shape == (4, 32)
+    assert len(users[:0].torch(["channel.h"])) == 0
 
 
 def test_a_scenario_that_draws_nothing_at_random_is_named(folder: Path, tmp_path: Path) -> None:
