@@ -75,7 +75,9 @@ def of_type(hint: Any, limits: dict[str, Any] | None = None) -> st.SearchStrateg
     if hint is float:
         return st.floats(
             limits.get("gt", limits.get("ge")),
+            limits.get("lt", limits.get("le")),
             exclude_min="gt" in limits,
+            exclude_max="lt" in limits,
             allow_infinity=False,
             allow_nan=False,
         )
