@@ -12,14 +12,12 @@ from typing import TypeAlias
 from caviar_protocol.arrays import Payload
 from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.topics import (
+    TOPICS,
     Carrier,
     Channel,
     ChannelMatrix,
     ChannelResponse,
     ChannelTaps,
-    Depth,
-    Lidar,
-    Segmentation,
 )
 
 Indices: TypeAlias = tuple[int, int, int]
@@ -58,9 +56,11 @@ class PartCheck:
         demand = self.demand.get(topic, frozenset())
         if isinstance(payload, Channel):
             return self._wrong_channel(payload, demand)
-        for part in sorted(demand):
-            if sensor := _first_without(payload, part):
-                return f"{_undelivered(part)} of {sensor!r}"
+        readings = getattr(payload, "images", getattr(payload, "scans", ()))
+        for part in sorted(demand & TOPICS[topic].parts.keys()):
+            for reading in readings:
+                if getattr(reading, TOPICS[topic].parts[part]) is None:
+                    return f"{_undelivered(part)} of {reading.sensor!r}"
         return ""
 
     def _wrong_channel(self, channel: Channel, demand: frozenset[str]) -> str:
@@ -156,15 +156,3 @@ def _pair_name(place: Indices, channel: Channel) -> str:
 
 def _elements(spec: DeviceSpec) -> int:
     return 1 if spec.array is None else spec.array.size
-
-
-def _first_without(payload: Payload, part: str) -> str:
-    """The first sensor without a part that is in demand; empty: each has it."""
-    match payload, part:
-        case Lidar(), "grid":
-            return next((scan.sensor for scan in payload.scans if scan.grid is None), "")
-        case Depth(), "normals":
-            return next((image.sensor for image in payload.images if image.normals is None), "")
-        case Segmentation(), "materials":
-            return next((image.sensor for image in payload.images if image.material is None), "")
-    return ""

@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any, cast, get_type_hints
+from pkgutil import resolve_name
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -30,6 +31,7 @@ from caviar_protocol.scene_validation import (
     wrong_number,
 )
 from caviar_protocol.topics import (
+    TOPICS,
     Action,
     Camera,
     Carrier,
@@ -39,10 +41,11 @@ from caviar_protocol.topics import (
     Lidar,
     Link,
     Segmentation,
+    topics_of,
 )
 from caviar_protocol.topics.scene import Scene
 
-_MADE_OF_SCENES = frozenset({"channel", "link", "lidar", "camera", "depth", "segmentation"})
+_MADE_OF_SCENES = frozenset(topics_of("channel", "link", "sensors"))
 FIRST_LOOKS = 16
 """Products of each source that every consumer looks at, and of which it compares the digest."""
 
@@ -195,7 +198,8 @@ def wrong_values(payload: Payload) -> str:
     return "" if judge is None else judge(payload)
 
 
-def _wrong_channel(channel: Channel) -> str:
+def wrong_channel(channel: Channel) -> str:
+    """What is wrong with a channel; empty: nothing."""
     found = _not_finite(channel)
     if not found and channel.tau.size and not _least(channel.tau) >= 0:
         index = int(np.argmin(channel.tau))
@@ -232,7 +236,8 @@ def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
     return ""
 
 
-def _wrong_link(link: Link) -> str:
+def wrong_link(link: Link) -> str:
+    """What is wrong with a link; empty: nothing."""
     found = _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
     found = found or _negative(link.sinr, "sinr", "1")
     if not found and link.arrived is not None:
@@ -255,7 +260,8 @@ _PACKETS = (
 )
 
 
-def _wrong_lidar(lidar: Lidar) -> str:
+def wrong_lidar(lidar: Lidar) -> str:
+    """What is wrong with scans; empty: nothing."""
     for scan in lidar.scans:
         found = _wrong_pose(scan) or _not_finite(scan) or _negative(scan.range, "range", "m")
         if found:
@@ -263,7 +269,8 @@ def _wrong_lidar(lidar: Lidar) -> str:
     return ""
 
 
-def _wrong_images(payload: Camera | Depth | Segmentation) -> str:
+def wrong_images(payload: Camera | Depth | Segmentation) -> str:
+    """What is wrong with images; empty: nothing."""
     for image in payload.images:
         found = _wrong_pose(image) or _not_finite(image)
         if found := found or _negative(getattr(image, "depth", None), "depth", "m"):
@@ -271,7 +278,8 @@ def _wrong_images(payload: Camera | Depth | Segmentation) -> str:
     return ""
 
 
-def _wrong_action(action: Action) -> str:
+def wrong_action(action: Action) -> str:
+    """What is wrong with an action; empty: nothing."""
     for index, command in enumerate(action.commands):
         if not _has_numbers(type(command)):
             continue
@@ -333,15 +341,6 @@ def _float_arrays(cls: type[Payload]) -> Callable[[Payload], tuple[Any, ...]]:
     return attributes([name for name, field in array_fields(cls).items() if field.dtype in _FLOATS])
 
 
-_JUDGES = cast(
-    dict[type, Callable[[msgspec.Struct], str]],
-    {
-        Channel: _wrong_channel,
-        Link: _wrong_link,
-        Lidar: _wrong_lidar,
-        Camera: _wrong_images,
-        Depth: _wrong_images,
-        Segmentation: _wrong_images,
-        Action: _wrong_action,
-    },
-)
+_JUDGES: dict[type[Payload], Callable[[Any], str]] = {
+    topic.payload: resolve_name(f"caviar_protocol.{topic.check}") for topic in TOPICS.values() if topic.check
+}

@@ -13,12 +13,13 @@ from caviar_broker import launch as broker_main
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
-from caviar_clients.session.checks import TOPICS_OF, checked_scenario
+from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.keys import credentials, read_authorized, read_public
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import ServiceSpec, load_scenario
 from caviar_protocol.scenario.rules import refuse_remote
+from caviar_protocol.topics import topics_of
 from caviar_services.registry import BUILT_IN, load
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
@@ -87,7 +88,7 @@ def test_remote_services_may_produce_all_that_those_of_their_role_do() -> None:
         role, _, name = key.partition(":")
         # The engine draws its own pictures; a remote world has none that a scenario could count on.
         own = {"camera"} if key == "world:panda3d" else set()
-        assert set(load(role, name).outputs) - own <= set(TOPICS_OF[role])
+        assert set(load(role, name).outputs) - own <= set(topics_of(role))
 
 
 def test_a_run_without_a_broker_refuses_remote_services_by_place_and_remedy() -> None:

@@ -29,6 +29,7 @@ from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_ma
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import (
     PARTS,
+    TOPICS,
     Action,
     AntennaArray,
     AntennaDevice,
@@ -82,16 +83,8 @@ CAMERA_ORIENTATION = quaternion_from_euler(math.radians(70.0), math.radians(25.0
 WORLD = "traffic"
 """The world that publishes the devices."""
 
-SOURCES = {
-    "scene": ["traffic"],
-    "channel": ["propagation"],
-    "lidar": ["eyes"],
-    "camera": ["eyes"],
-    "depth": ["eyes"],
-    "segmentation": ["eyes"],
-    "action": ["pilot"],
-    "link": ["radio"],
-}
+_NAMES = {"world": WORLD, "channel": "propagation", "sensors": "eyes", "agent": "pilot", "link": "radio"}
+SOURCES = {name: [_NAMES[topic.role]] for name, topic in TOPICS.items()}
 """Names of the services that produce each topic."""
 PREFIXES = {"air": ["uav."], "traffic": ["bs", "car."]}
 """Prefixes of object names that the worlds of the kit declare."""

@@ -18,7 +18,7 @@ from caviar_protocol.host import install_command
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.arrays import TopicArrays
 from caviar_protocol.recording.topics import TOPIC_ARRAYS
-from caviar_protocol.topics import Lidar, Link
+from caviar_protocol.topics import Lidar, Link, topics_of
 
 if TYPE_CHECKING:
     from caviar_clients.datasets.reader import Dataset
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _DTYPES: dict[type, Any] = {int: np.int64, float: np.float64, bool: np.bool_, str: np.str_}
 _NONE: dict[type, Any] = {int: -1, float: np.nan}
-SENSORS = ("lidar", "camera", "depth", "segmentation")
+SENSORS = topics_of("sensors")
 """Topics with a row for each sensor: a user has the one on its own object, or that of all."""
 _WITH_USERS = ("channel", "link", *SENSORS)
 

@@ -20,20 +20,11 @@ from caviar_protocol.scenario.airsim import with_airsim
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.topics import topics_of
 from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.registry import find_modules_in, load, registered_names
 from caviar_services.service import Service
 from caviar_services.world.scenery import Obstacles, scenery_triangles
-
-TOPICS_OF: Mapping[str, tuple[str, ...]] = {
-    "world": ("scene",),
-    "channel": ("channel",),
-    "sensors": ("lidar", "camera", "depth", "segmentation"),
-    "link": ("link",),
-    "agent": ("action",),
-    "recorder": (),
-}
-"""What a remote service may produce, by its role; what it does produce it says when it joins."""
 
 
 def checked_scenario(
@@ -138,7 +129,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
     produced: set[str] = set()
     for name, spec in scenario.services.items():
         if spec.remote:  # another program, which says what it produces when it joins
-            produced.update(TOPICS_OF[spec.role])
+            produced.update(topics_of(spec.role))
             continue
         try:
             implementation = load(spec.role, spec.use)

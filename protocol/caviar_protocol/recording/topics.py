@@ -7,6 +7,7 @@ object, device or sensor.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pkgutil import resolve_name
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import msgspec
@@ -15,17 +16,10 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording.arrays import Column, Rows, TopicArrays, payload_column
-from caviar_protocol.recording.scene import (
-    CameraArrays,
-    DepthArrays,
-    LidarArrays,
-    MotionArrays,
-    SceneArrays,
-    SegmentationArrays,
-)
+from caviar_protocol.recording.scene import MotionArrays
 from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.space.beams import beam_gains
-from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Link
+from caviar_protocol.topics import TOPICS, Action, AntennaArray, BeamChoice, Carrier, Channel, Link
 
 P = TypeVar("P", bound=Payload)
 
@@ -380,13 +374,6 @@ class ActionArrays(UserArrays[Action]):
 # --- all topics --------------------------------------------------------------------------------------------
 
 TOPIC_ARRAYS: dict[str, type[TopicArrays[Any, Any]]] = {
-    "scene": SceneArrays,
-    "channel": ChannelArrays,
-    "lidar": LidarArrays,
-    "camera": CameraArrays,
-    "depth": DepthArrays,
-    "segmentation": SegmentationArrays,
-    "action": ActionArrays,
-    "link": LinkArrays,
+    name: resolve_name(f"caviar_protocol.{topic.arrays}") for name, topic in TOPICS.items()
 }
 """Class of the arrays of each topic."""

@@ -57,6 +57,7 @@ from caviar_protocol.recording.integrity import RecordedSegments, follows
 from caviar_protocol.recording.segment import Segment
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario.conversion import FILE
+from caviar_protocol.topics import topics_of
 from caviar_protocol.validation import check_digest
 from caviar_services.recorder.base import (
     Recorder,
@@ -73,7 +74,7 @@ from caviar_services.service import Frame, FrameInput, Preparation, Prepared, Ru
 
 # Topics that may have no other consumer: a data set needs no agent. All others have one that checks them,
 # but for parts that are asked for by the recorder alone.
-_LOOKED_INTO = frozenset({"scene", "lidar", "camera", "depth", "segmentation"})
+_LOOKED_INTO = frozenset(topics_of("world", "sensors"))
 
 
 class McapSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
