@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from caviar_clients.conform import Rules, conform
+from caviar_labs.conform import Rules, conform
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Depth
 from caviar_services.frame import Frame, StepResult

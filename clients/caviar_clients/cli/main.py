@@ -23,7 +23,6 @@ from caviar_clients.cli.datasets import (
 )
 from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
-from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
     AirSim,
     Embedded,
@@ -46,6 +45,7 @@ from caviar_clients.cli.shared import (
     SummaryFile,
     keys_set,
 )
+from caviar_labs.cli.paper import app as paper
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
 
@@ -286,7 +286,7 @@ def stability(
     traced: Annotated[bool, typer.Option(help="also the cases that need the ray tracer")] = True,
 ) -> None:
     """Ask the channel models at their extremes, and compare with formulas; status 1 where one is wrong."""
-    from caviar_clients.cli.measure import stability as ask
+    from caviar_labs.cli.measure import stability as ask
 
     raise typer.Exit(ask(_console, group or (), json, markdown, traced))
 
@@ -303,7 +303,7 @@ def bench_broker(
     json: Annotated[Path | None, typer.Option(help="write the figures to this file")] = None,
 ) -> None:
     """A frame's way through the broker, with clients that do nothing but exchange products."""
-    from caviar_clients.cli.measure import measure_broker
+    from caviar_labs.cli.measure import measure_broker
 
     measure_broker(_console, topology, services, payload, frames, curve, json)
 
@@ -337,8 +337,8 @@ def conform(
     list_cases: Annotated[bool, typer.Option("--list", help="only list the cases")] = False,
 ) -> None:
     """Judge a client in any language against the protocol, clause by clause; status 1 where one fails."""
-    from caviar_clients.cli import measure as kit
-    from caviar_clients.conform.client import Rules
+    from caviar_labs.cli import measure as kit
+    from caviar_labs.conform.client import Rules
 
     if list_cases:
         kit.list_cases(_console)
@@ -491,7 +491,7 @@ def budget(
     json: FiguresFile = None,
 ) -> None:
     """Tell from a recorded run the frame rate that each policy sustains, and which service bounds it."""
-    from caviar_clients.cli.measure import budget_run
+    from caviar_labs.cli.measure import budget_run
 
     budget_run(run, _console, json)
 
@@ -523,7 +523,7 @@ def tradeoff(
     ] = None,
 ) -> None:
     """Compare channel settings: time and error of each over the same scenes."""
-    from caviar_clients.cli.measure import trade, tradeoff_options
+    from caviar_labs.cli.measure import trade, tradeoff_options
 
     options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part, error_db, time_ms)
     trade(source, frames, options, json, out, _console)

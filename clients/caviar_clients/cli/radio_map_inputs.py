@@ -13,7 +13,7 @@ import numpy as np
 from caviar_clients.cli.shared import require_known
 from caviar_clients.plots.rays import ground
 from caviar_clients.session.plausibility import in_hertz
-from caviar_clients.tradeoff.scenes import Scenes
+from caviar_clients.session.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
