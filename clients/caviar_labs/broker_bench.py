@@ -1,8 +1,8 @@
 """What a frame costs in the broker: a run of clients that do nothing but exchange products.
 
 The broker is that of any run: port, frame clock, deadlines, journal and latency record. A client speaks the
-protocol, and nothing else: ``python -m caviar_labs.broker_bench TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``, with
-keys where CAVIAR_KEY and CAVIAR_BROKER_KEY name them.
+protocol, and nothing else: ``python -m caviar_labs.broker_bench TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``,
+with keys where CAVIAR_KEY and CAVIAR_BROKER_KEY name them.
 """
 
 from __future__ import annotations
