@@ -44,8 +44,8 @@ def _command(command: Any, parent: Any, path: str, level: int) -> Iterator[str]:
         found = [_row(parameter) for parameter in shown if parameter.param_type_name == kind]
         if found:
             yield from markdown.table((kind, "default", "meaning"), found)
-    for name in getattr(command, "commands", {}):
-        yield from _command(command.commands[name], context, f"{path} {name}", level + 1)
+    for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
+        yield from _command(command.get_command(context, name), context, f"{path} {name}", level + 1)
 
 
 def _row(parameter: Any) -> tuple[str, str, str]:
