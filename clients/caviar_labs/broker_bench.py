@@ -1,4 +1,4 @@
-"""What a frame costs in the broker: a run of clients that do nothing but exchange products.
+"""Cost of a frame in the broker: a run of clients that do nothing but exchange products.
 
 The broker is that of any run: port, frame clock, deadlines, journal and latency record. A client speaks the
 protocol, and nothing else: ``python -m caviar_labs.broker_bench TOPOLOGY SERVICES NUMBER PAYLOAD ENDPOINT``,
@@ -58,7 +58,7 @@ class MicrosecondsPerFrame(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run cost."""
+    """Costs of a run."""
 
     topology: Topology
     services: int
@@ -279,7 +279,10 @@ def speak(part: Part, payload: int, endpoint: str) -> None:
 
 
 class _Received(msgspec.Struct):
-    """What is read of a message: enough to answer it. What a service does with its inputs is its own cost."""
+    """Fields that a client reads of a message: those that an answer needs.
+
+    What a service does with its inputs is its own cost.
+    """
 
     type: str
     epoch: int = 0
@@ -290,7 +293,7 @@ class _Received(msgspec.Struct):
 
 
 class _Done(msgspec.Struct, tag="DONE"):
-    """What this client fills in of `caviar_protocol.messages.Done`, anew in every frame."""
+    """Fields of `caviar_protocol.messages.Done` that this client fills in, anew in every frame."""
 
     epoch: int
     attempt: int

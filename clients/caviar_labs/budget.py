@@ -45,7 +45,7 @@ Takes = Callable[[str, int, int], int]
 
 
 class ServiceForecast(msgspec.Struct, frozen=True, kw_only=True):
-    """What a service takes, and what the run would be without it."""
+    """Time of a service, and frame rates of the run with it alone and without it."""
 
     name: str
     p50_ms: float
@@ -62,7 +62,7 @@ class ServiceForecast(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Bound(msgspec.Struct, frozen=True, kw_only=True):
-    """Which service bounds the frame rate under wait."""
+    """The service that bounds the frame rate under wait."""
 
     service: str
     gain: float
@@ -72,7 +72,7 @@ class Bound(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Forecast(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recorded run tells about runs like it."""
+    """Frame rates that runs like a recorded one sustain, by policy."""
 
     run: str
     frames: int
@@ -245,7 +245,7 @@ def _notes(run: RecordedRun, timings: Mapping[str, Timing], frames: int) -> list
 
 @dataclass
 class Played:
-    """What became of a run in virtual time."""
+    """Frames and misses of a run in virtual time."""
 
     finished_ns: list[int] = field(default_factory=list)
     """When each frame was finished [ns]."""

@@ -436,7 +436,7 @@ def conform_client(
 
 
 def _gateway(listen: str, tell: Callable[[str], None]) -> Callable[[str], AbstractContextManager[str]]:
-    """What serves WebSockets at ``listen``, an address of this machine, for the kit."""
+    """A server of WebSockets at ``listen``, an address of this machine, in front of the kit."""
     from caviar_broker.http.process import gateway_in_front
 
     address = listen.partition("://")[2].partition("/")[0] or listen

@@ -19,7 +19,7 @@ Outcome = Literal["pass", "fail", "not applicable"]
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """How a client did in one case.
+    """Outcome of one case for a client.
 
     Args:
         case: Name of the case.
@@ -80,7 +80,7 @@ HOPELESS_AFTER = 2
 
 
 class Kit:
-    """What a case works with: the present life of the client, or a new one.
+    """Access of a case to the client: its present life, or a new one.
 
     Args:
         wire: Socket that the client comes to.

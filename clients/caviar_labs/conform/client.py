@@ -88,7 +88,7 @@ class NotApplicable(Exception):  # noqa: N818 - a verdict, not an error of this 
 
 @dataclass(frozen=True)
 class Rules:
-    """What the user of the kit states about the client.
+    """Statements of the kit's user about the client.
 
     Args:
         timeout_s: Time [s] that the client has for each answer.
@@ -208,7 +208,7 @@ CRASHES = (signal.SIGILL, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.S
 
 @dataclass(frozen=True)
 class End:
-    """How a client ended.
+    """End of a client's process.
 
     Args:
         status: Exit status as `subprocess` states it; None for a client that was started by hand.
@@ -241,7 +241,7 @@ class End:
 
 
 class Client(Protocol):
-    """What the kit does with a client."""
+    """A client under test, as the kit drives it."""
 
     start_s: float
     """[s] until HELLO has to be there."""

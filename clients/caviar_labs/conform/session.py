@@ -50,7 +50,7 @@ CONNECTING, JOINED, READY, ACTIVE, OVER = range(5)
 
 @dataclass
 class Seen:
-    """What is remembered over all lives of a client."""
+    """Findings that are kept over all lives of a client."""
 
     headers: int = 0
     """Number of messages that came."""
@@ -68,7 +68,7 @@ class Seen:
 
 @dataclass
 class Pulse:
-    """What came over the heartbeat connection."""
+    """Messages that came over the heartbeat connection."""
 
     route: bytes | None = None
     attached: list[Fields] = field(default_factory=list)
@@ -224,7 +224,7 @@ class Session:
 
     @property
     def who(self) -> Fields:
-        """What stands in every message of this life (clause 1)."""
+        """Fields of every message of this life (clause 1)."""
         return {"epoch": EPOCH, "attempt": ATTEMPT}
 
     def send(self, kind: str, fields: Fields | None = None, *parts: bytes) -> None:

@@ -427,7 +427,7 @@ HELD_FOR = 2
 
 @dataclass(frozen=True)
 class Inputs:
-    """How the inputs of a grant are to be.
+    """Form of the inputs of a grant.
 
     Args:
         sources: Services that produce each topic.

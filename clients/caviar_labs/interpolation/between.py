@@ -195,7 +195,7 @@ class Interpolation:
         ends: tuple[list[Antenna], list[Antenna]] | None,
         known: bool,
     ) -> Float64Array:
-        """Of each path's amplitude, as a root mean square over the elements, Shape ``[C, K]``."""
+        """Error of each path's amplitude, as a root mean square over the elements, Shape ``[C, K]``."""
         joined = self._joined
         first, last = (np.abs(end.gain) for end in joined.ends)
         most = np.maximum(first, last)
@@ -417,7 +417,7 @@ class _Table:
 
 
 def _end(tables: Sequence[_Table], rows: Int64Array) -> End:
-    """What one keyframe says: ``rows`` are those of both tables, one after the other."""
+    """Ends of the paths at one keyframe: ``rows`` are those of both tables, one after the other."""
     channels = [table.channel for table in tables]
     frequency = np.array([carrier.frequency_hz for carrier in channels[0].carriers])[:, None]
     # Of a path that this keyframe lacks, ``rows`` point to the other keyframe.

@@ -37,7 +37,7 @@ from caviar_services.channel.propagation.geometry import path_geometry
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """What a keyframe says about the K joined paths; where it lacks one, what the other keyframe says."""
+    """State of the K joined paths at a keyframe; of one that it lacks, the state at the other keyframe."""
 
     tau: Float64Array
     """[s], Shape ``[K]``."""
@@ -179,7 +179,7 @@ def normals(corners: Float64Array, joined: Joined) -> Float64Array:
 
 
 def image_moves(moved: Places, normals: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """How the vectors TX → image of RX and RX → image of TX [m] change, Shape ``[K, 3]`` each.
+    """Changes of the vectors TX → image of RX and RX → image of TX [m], Shape ``[K, 3]`` each.
 
     A mirror with normal n that moves by o moves the image of a point that moves by x by
     x − 2n(n·x) + 2n(n·o): exact while the mirror does not turn.
@@ -310,7 +310,7 @@ class Courses:
         return bends
 
     def _of_images(self) -> Float64Array:
-        """How far the image of the later keyframe is from where the moves put that of the earlier [m]."""
+        """Distance of the later keyframe's image from where the moves put that of the earlier [m]."""
         if self._at_ends is None:
             return np.zeros(len(self._kept))
         before, after = self._at_ends

@@ -1,4 +1,4 @@
-"""What an experiment of the paper reports: tables of its figures beside published ones, and what differs."""
+"""Report of an experiment of the paper: tables of its figures beside published ones, and what differs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Comparison:
     """What differs from what was published, and why: a sentence or two each."""
 
     def markdown(self) -> str:
-        """As Markdown, below a heading of its own."""
+        """Write the table as Markdown, below a heading of its own."""
         lines = [self.columns, ("---",) * len(self.columns), *self.rows]
         # A bar within a cell would end it.
         cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]

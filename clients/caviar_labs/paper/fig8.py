@@ -60,7 +60,7 @@ _START_S, _TRACING_S, _JUDGING_S = 4.0, 45.0, 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What is trained and judged."""
+    """Trainings and evaluations of the experiment."""
 
     folder: Path
     """Of experiments, recording and trainings; what is there already is not done again."""
@@ -81,7 +81,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Report:
-    """What was played, by channel."""
+    """Results of the experiment, by channel."""
 
     played: Mapping[ChannelName, Episodes]
     steps: Mapping[str, int]

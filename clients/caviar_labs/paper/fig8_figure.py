@@ -76,7 +76,7 @@ def _draw(channel: ChannelName, played: Episodes, file: Path, label: str) -> Pat
 
 
 def _label(method: str, values: Float64Array, los: BoolArray) -> str:
-    """Of a curve: with its means with and without a line of sight."""
+    """Label of a curve, with its means with and without a line of sight."""
     known = ~np.isnan(values)
     kinds = (("LOS", known & los), ("NLOS", known & ~los))
     means = [f"{values[mine].mean():.2f} {kind}" for kind, mine in kinds if mine.any()]

@@ -39,7 +39,7 @@ PAIRS = (BASELINE, "nearest, trained beams", "trained flight, los-beam", TRAINED
 
 @dataclass(frozen=True)
 class Settings:
-    """What is trained and played."""
+    """Trainings and episodes of the experiment."""
 
     episodes: int = 20
     """That are held out."""
@@ -91,7 +91,7 @@ class Trained:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What was trained and played."""
+    """Trained agents, and the episodes that they and others played."""
 
     settings: Settings
     trained: Trained

@@ -36,7 +36,7 @@ _FLIGHTS = 1500
 
 @dataclass(frozen=True, eq=False)
 class Experience:
-    """What became of the training."""
+    """Spectral efficiency in the training."""
 
     efficiency: Float64Array
     """[bit/s/Hz] that the trained choices had near each receiver of the table, Shape ``[P]``."""

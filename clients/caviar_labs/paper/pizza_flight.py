@@ -51,7 +51,7 @@ class Legs:
 
     @property
     def costs(self) -> Float64Array:
-        """What flying a way costs, Shape ``[P, P, kinds]``."""
+        """Costs of flying a way, Shape ``[P, P, kinds]``."""
         return self.frames + MISSED * self.missed
 
 

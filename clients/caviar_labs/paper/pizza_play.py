@@ -68,7 +68,7 @@ class Flies(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What became of one episode; F frames."""
+    """Course of one episode of F frames."""
 
     seconds: float
     """Until the last delivery, or until the episode ended without."""
@@ -214,7 +214,7 @@ class Loop(AbstractContextManager["Loop"]):
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What is known of a frame afterwards."""
+    """Record of a frame."""
 
     place: Float64Array
     beam: int

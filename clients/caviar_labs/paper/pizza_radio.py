@@ -1,4 +1,4 @@
-"""What every beam achieves in every place of the neighbourhood: what the pair of agents is trained in.
+"""Table of what every beam achieves in every place of the neighbourhood, in which the agents are trained.
 
 The run's own channel and link give the figures: receivers stand on a grid, and their rays are traced at once,
 which takes seconds where a flight over the same places would take minutes.

@@ -1,4 +1,4 @@
-"""Where the drone of ``caviar paper pizza`` flies: blocks, addresses, and ways around the blocks."""
+"""Neighbourhood of ``caviar paper pizza``: blocks, addresses, and ways around the blocks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _TRIES = 10_000
 
 @dataclass(frozen=True)
 class Round:
-    """What an episode asks for."""
+    """Addresses and start of an episode."""
 
     seed: int
     start: Float64Array

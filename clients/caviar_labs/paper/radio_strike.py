@@ -38,7 +38,7 @@ TRAINING_EPISODES = 20
 
 @dataclass(frozen=True)
 class Settings:
-    """What is played."""
+    """Agents, episodes and trainings of the experiment."""
 
     episodes: Source | Sequence[Source] | None = None
     """Sources of trajectories; None: made-up ones."""
@@ -80,7 +80,7 @@ class Played:
 
 @dataclass(frozen=True)
 class Report:
-    """What was played, by rules and agent, an entry for each episode; and the published run, once more."""
+    """Returns by rules and agent, an entry for each episode; and the published run, once more."""
 
     played: dict[RulesName, dict[AgentName, list[Played]]]
     published: PublishedRun | None = None

@@ -52,7 +52,7 @@ def two_rays(heights: tuple[float, float], distance: float, frequency: float) ->
 
 
 def amplitude(channel: Channel) -> float:
-    """Of the only path; 0 where there is none."""
+    """Amplitude of the only path; 0 where there is none."""
     return abs(total(channel))
 
 

@@ -161,7 +161,7 @@ def _marked(columns: Columns, front: Sequence[Row]) -> Columns:
 
 
 def answer_sentences(report: Report) -> list[str]:
-    """What to take for each error and each time that was asked for, a sentence each."""
+    """Name the setting to take for each error and each time that was asked for, a sentence each."""
     ladder = [row for row in report.rows if row.block == "ladder"]
     by_setting = {row.setting: row for row in ladder}
     sentences = []
