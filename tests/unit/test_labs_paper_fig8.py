@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from caviar_clients.cli.main import app
 from caviar_clients.learning import campaign
 from caviar_clients.learning.experiment import Experiment, load_experiment
-from caviar_clients.learning.held_out import Episodes, recorded_episodes
 from caviar_clients.learning.training import LOWEST_SEED
 from caviar_labs.paper.fig8 import (
     FIRST_EPISODE,
@@ -28,6 +27,7 @@ from caviar_labs.paper.fig8 import (
 )
 from caviar_labs.paper.fig8_figure import draw
 from caviar_labs.paper.fig8_tables import comparisons, figures_of, ratios
+from caviar_labs.paper.held_out import Episodes, recorded_episodes
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.scenario import find_scenario, load_scenario
 

@@ -20,8 +20,8 @@ from typing import Literal, TypeAlias
 from caviar_clients.files import write_file, writing
 from caviar_clients.learning.campaign import train_experiments
 from caviar_clients.learning.experiment import Experiment, load_experiment
-from caviar_clients.learning.held_out import Episodes, batch_episodes, recorded_episodes
 from caviar_clients.learning.training import POLICY, Progress, read_result, seed_folder
+from caviar_labs.paper.held_out import Episodes, batch_episodes, recorded_episodes
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.learning.held_out import Episodes
 from caviar_clients.plots.style import (
     AGENT,
     BASELINE,
@@ -20,6 +19,7 @@ from caviar_clients.plots.style import (
     shade_frames,
 )
 from caviar_labs.paper.fig8 import CHANNELS, ChannelName, Report
+from caviar_labs.paper.held_out import Episodes
 from caviar_protocol.arrays import BoolArray, Float64Array
 
 _STYLES: dict[str, dict[str, Any]] = {

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.learning.held_out import KINDS, Episodes
 from caviar_labs.paper.comparison import NOTHING, Comparison, number, with_interval
 from caviar_labs.paper.fig8 import CHANNELS, ChannelName, Report
+from caviar_labs.paper.held_out import KINDS, Episodes
 
 PAPER = {"optimum": "6.81", "los-beam": "1.7", "DQN, defaults": "2.3"}
 """Averages of |y| that the paper states."""

@@ -224,12 +224,24 @@ def carriers(*frequencies: float) -> tuple[Carrier, ...]:
 
 
 def free_space(*frequencies: float) -> Model:
-    """Rung ``free-space`` at these carriers [Hz]."""
+    """Rung ``free-space`` at these carriers [Hz].
+
+    Example:
+        >>> channel = link(free_space(28e9), (0, 0, 10), (60, 80, 10))  # 100 m
+        >>> round(float(-20 * np.log10(abs(channel.a[0, 0]))), 2)  # path loss [dB]
+        101.39
+    """
     return _prepared(FreeSpaceChannel(FreeSpaceSettings(), _run(frequencies)), {})
 
 
 def geometric(*frequencies: float, seed: int = 1, **settings: Any) -> Model:
-    """Rung ``geometric`` at these carriers [Hz]."""
+    """Rung ``geometric`` at these carriers [Hz].
+
+    Example:
+        >>> channel = link(geometric(28e9, components=3, k_factor_db=10.0), (0, 0, 10), (30, 40, 1.5))
+        >>> len(channel.tau), round(float(abs(channel.a[0, 0]) ** 2), 3)  # the straight path has K / (K + 1)
+        (3, 0.909)
+    """
     converted = convert_settings(GeometricSettings, settings)
     return _prepared(GeometricChannel(converted, _run(frequencies, seed)), {})
 
