@@ -19,7 +19,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, get_args
 
@@ -27,6 +26,7 @@ import msgspec
 
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import Input, Role
+from caviar_protocol.plugins import plugins
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
 from caviar_services.service import NoSettings, Service
 
@@ -82,16 +82,13 @@ def registered() -> dict[str, str]:
         >>> registered()["agent:random"]
         'caviar_services.agent.baselines:RandomAgent'
     """
-    found = dict(BUILT_IN)
-    for point in entry_points(group=ENTRY_POINT_GROUP):
-        # The same value twice is one distribution that is installed twice, in editable mode for instance.
-        if point.name in found and found[point.name] != point.value:
+    added = {name: point.value for name, point in plugins(ENTRY_POINT_GROUP).items()}
+    for name, value in added.items():
+        if BUILT_IN.get(name, value) != value:
             raise DeclarationError(
-                f"{point.name} is registered twice, as {found[point.name]} and as {point.value}; "
-                "uninstall or rename one of them"
+                f"{name} is registered twice, as {BUILT_IN[name]} and as {value}; uninstall or rename one"
             )
-        found[point.name] = point.value
-    return found
+    return BUILT_IN | added
 
 
 def with_inputs(cls: type[Service[Any]], inputs: Sequence[Input]) -> type[Service[Any]]:

@@ -25,8 +25,8 @@ def fresh_registry() -> Iterator[None]:
 
 
 def register(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
-    found = [EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points]
-    monkeypatch.setattr(registry, "entry_points", lambda *, group: found)
+    found = {name: EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points}
+    monkeypatch.setattr(registry, "plugins", {registry.ENTRY_POINT_GROUP: found}.get)
 
 
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str) -> None:

@@ -1,0 +1,81 @@
+"""Plug-ins: what other installed distributions add, found through Python's entry points.
+
+| group | name | value |
+| --- | --- | --- |
+| ``caviar.services`` | ``role:name`` | a subclass of `Service` |
+| ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
+| ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
+
+What is built in stands in a table of its own and goes first; a distribution adds names, and changes none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import TypeVar
+
+from caviar_protocol.errors import DeclarationError
+
+T = TypeVar("T")
+
+PREFIX = "caviar."
+"""Of the names of all groups."""
+
+
+# Once a process: looking for entry points reads the metadata of every installed distribution.
+@cache
+def _all() -> Mapping[str, tuple[EntryPoint, ...]]:
+    found = entry_points()
+    return {group: tuple(found.select(group=group)) for group in found.groups if group.startswith(PREFIX)}
+
+
+@cache
+def plugins(group: str) -> Mapping[str, EntryPoint]:
+    """The entry points of a group, by name.
+
+    Args:
+        group: Its name.
+
+    Raises:
+        DeclarationError: Two distributions register one name for different objects; names both.
+
+    Example:
+        >>> plugins("caviar.none")
+        {}
+    """
+    found: dict[str, EntryPoint] = {}
+    for point in _all().get(group, ()):
+        # The same value twice is one distribution that is installed twice, in editable mode for instance.
+        other = found.setdefault(point.name, point)
+        if other.value != point.value:
+            both = (f"{each.value} by {_distribution(each)}" for each in (other, point))
+            raise DeclarationError(
+                f"{point.name} is registered twice in {group}, as {' and as '.join(both)}; uninstall one"
+            )
+    return found
+
+
+def load_plugin(point: EntryPoint, kind: type[T]) -> T:
+    """Import the object of an entry point.
+
+    Args:
+        point: One of `plugins`.
+        kind: Of which it has to be an instance.
+
+    Raises:
+        DeclarationError: It cannot be imported, or is something else; names the distribution and the object.
+    """
+    what = f"{point.name} of {point.group} is {point.value} of {_distribution(point)}, which"
+    try:
+        found = point.load()
+    except Exception as error:  # whatever a module that is not ours does when it is imported
+        raise DeclarationError(f"{what} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not isinstance(found, kind):
+        raise DeclarationError(f"{what} is no {kind.__name__}")
+    return found
+
+
+def _distribution(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else "an unnamed distribution"
