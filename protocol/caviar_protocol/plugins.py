@@ -4,6 +4,7 @@
 | --- | --- | --- |
 | ``caviar.services`` | ``role:name`` | a subclass of `Service` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
+| ``caviar.commands`` | what is typed after ``caviar`` | a function for Typer, or a ``typer.Typer`` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 
 What is built in stands in a table of its own and goes first; a distribution adds names, and changes none.
@@ -31,6 +32,15 @@ def _all() -> Mapping[str, tuple[EntryPoint, ...]]:
     return {group: tuple(found.select(group=group)) for group in found.groups if group.startswith(PREFIX)}
 
 
+def claims(group: str) -> tuple[EntryPoint, ...]:
+    """The entry points of a group, also several of one name.
+
+    Args:
+        group: Its name.
+    """
+    return _all().get(group, ())
+
+
 @cache
 def plugins(group: str) -> Mapping[str, EntryPoint]:
     """The entry points of a group, by name.
@@ -46,7 +56,7 @@ def plugins(group: str) -> Mapping[str, EntryPoint]:
         {}
     """
     found: dict[str, EntryPoint] = {}
-    for point in _all().get(group, ()):
+    for point in claims(group):
         # The same value twice is one distribution that is installed twice, in editable mode for instance.
         other = found.setdefault(point.name, point)
         if other.value != point.value:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from caviar_clients.cli import commands
 from caviar_clients.cli.main import app
+from caviar_protocol import plugins
 from caviar_protocol.errors import DeclarationError
 
 runner = CliRunner()
@@ -40,6 +41,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     (tmp_path / "others_exit.py").write_text("raise SystemExit(3)\n")
 
     def forget() -> None:
+        plugins._all.cache_clear()
         commands.added.cache_clear()
         commands.added_command.cache_clear()
 

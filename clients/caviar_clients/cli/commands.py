@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import pkgutil
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import typer
@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from caviar_protocol.errors import DeclarationError, one_line
 from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.plugins import claims
 
 PANELS = RUN, LOOK, DATASETS, POLICIES, OPERATE, LABORATORIES, PLUG_INS = (
     "Run", "Look at a run", "Datasets", "Policies", "Operate", "Laboratories", "Plug-ins"
@@ -97,7 +98,7 @@ class Commands(TyperGroup):
 def added() -> dict[str, list[EntryPoint]]:
     """Entry points by the command that they add: one, or those of all distributions that claim the name."""
     found: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=ENTRY_POINT_GROUP):
+    for point in claims(ENTRY_POINT_GROUP):
         found.setdefault(point.name, []).append(point)
     return {name: [p for p in points if _is_own(p)] or points for name, points in found.items()}
 
