@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from caviar_bridges.airsim.attachment import with_airsim
 from caviar_broker.assets import pattern_files
 from caviar_broker.control.launcher import LauncherPipe, Reporter, stop_on_signals
 from caviar_broker.control.server import ControlServer
@@ -53,7 +54,6 @@ from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.airsim import with_airsim
 from caviar_protocol.scenario.rules import with_overrides
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ from airsim_harness import PERIOD_NS, Body, scene
 from link_builders import given
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.agent import AirSimAgent, AirSimSettings
+from caviar_bridges.airsim.attachment import with_airsim
+from caviar_bridges.airsim.rpc import RpcClient
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.airsim import with_airsim
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
-from caviar_services.agent.airsim import AirSimAgent, AirSimSettings
-from caviar_services.airsim.rpc import RpcClient
 from caviar_services.connection import RunOver
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 

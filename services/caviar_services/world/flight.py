@@ -428,7 +428,7 @@ def _plant(engine: str | None, airframe: Airframe) -> Plant:
     if engine != "mujoco":
         return Plant(airframe)
     # Only here: a world without such a quadrotor needs no MuJoCo.
-    from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
+    from caviar_bridges.mujoco import MujocoPlant
 
     return MujocoPlant(airframe)
 

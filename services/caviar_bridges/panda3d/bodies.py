@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from caviar_bridges.panda3d.level import PANDA3D, panda3d_core
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector
-from caviar_services.world.panda3d_level import PANDA3D, panda3d_core
 
 TICK_NS = 10_000_000
 """Length of a step of the physics [ns]."""

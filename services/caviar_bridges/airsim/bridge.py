@@ -10,13 +10,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from caviar_bridges.airsim.images import Products
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import NedFrame
+from caviar_bridges.manoeuvres import Command, Flown, Hover, Manoeuvre
 from caviar_protocol.space.coordinates import Pose, Vector, euler_from_quaternion
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Lidar, Scene, WaypointCommand
-from caviar_services.airsim.images import Products
-from caviar_services.airsim.manoeuvres import Command, Flown, Hover, Manoeuvre
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import NedFrame
 
 OVER = "the run is over"
 ANEW = "a new episode has begun"

@@ -19,6 +19,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.wire import GEO_ORIGIN, NedFrame
+from caviar_bridges.manoeuvres import Flown, FlyPath, Land, Manoeuvre
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
@@ -30,8 +32,6 @@ from caviar_protocol.topics import AttitudeCommand, BeamChoice, Scene, VelocityC
 from caviar_protocol.topics.link import MotionCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import straight_choices
-from caviar_services.airsim.manoeuvres import Flown, FlyPath, Land, Manoeuvre
-from caviar_services.airsim.wire import GEO_ORIGIN, NedFrame
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 SETPOINTS = "mavlink-setpoints"

@@ -10,23 +10,10 @@ from typing import Annotated, Any
 
 import msgspec
 
-from caviar_protocol.arrays import quantity
-from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
-from caviar_services.airsim.bridge import Bridge, Vehicle
-from caviar_services.airsim.calls import Call
-from caviar_services.airsim.manoeuvres import (
-    ALONG,
-    Flown,
-    FlyPath,
-    FlyVelocity,
-    Heading,
-    Hover,
-    Land,
-    Manoeuvre,
-    Turn,
-)
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import (
+from caviar_bridges.airsim.bridge import Bridge, Vehicle
+from caviar_bridges.airsim.calls import Call
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import (
     LEVEL,
     flag,
     ned_yaw,
@@ -37,6 +24,19 @@ from caviar_services.airsim.wire import (
     vector,
     vector_map,
 )
+from caviar_bridges.manoeuvres import (
+    ALONG,
+    Flown,
+    FlyPath,
+    FlyVelocity,
+    Heading,
+    Hover,
+    Land,
+    Manoeuvre,
+    Turn,
+)
+from caviar_protocol.arrays import quantity
+from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 
 MOST_POINTS = 10_000
 """Of a path."""
