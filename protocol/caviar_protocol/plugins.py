@@ -16,7 +16,7 @@ SERVICES = "caviar.services"
 ATTACHMENTS = "caviar.attachments"
 """Group of what the command line attaches to a scenario, as of `caviar_protocol.scenario.attachments`."""
 PLANTS = "caviar.plants"
-"""Group of what moves the rigid body of a quadrotor: value ``module:Class``, a plant of the world ``flight``."""
+"""Group of what moves the rigid body of a quadrotor in the world ``flight``: value ``module:Class``."""
 
 
 # Once a process: it reads the metadata of every installed distribution.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
@@ -31,6 +32,9 @@ class MujocoPlant(Plant):
     Raises:
         SetupError: MuJoCo is not installed.
     """
+
+    extra: ClassVar[str] = "mujoco"
+    packages: ClassVar[tuple[str, ...]] = ("mujoco",)
 
     def __init__(self, airframe: Airframe, gravity: float = GRAVITY) -> None:
         super().__init__(airframe, gravity)

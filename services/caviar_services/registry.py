@@ -145,7 +145,9 @@ def load(role: str, name: str) -> type[Service[Any]]:
         classes = [key for key, value in vars(module).items() if _is_of_role(value, role)]
         found = suggestion(class_name, classes) if classes else f"it has no class of role {role!r}"
         place = getattr(module, "__file__", None) or module_name
-        raise DeclarationError(f"{role} {name!r} is {where}: {place} has no attribute {class_name!r}; {found}")
+        raise DeclarationError(
+            f"{role} {name!r} is {where}: {place} has no attribute {class_name!r}; {found}"
+        )
     if not (isinstance(cls, type) and issubclass(cls, Service)):
         raise DeclarationError(f"{role} {name!r} is {where}, which is not a Service")
     declared = getattr(cls, "role", None)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
 import pytest
 
+from caviar_protocol import plugins
 from caviar_protocol.errors import DeclarationError
 from caviar_services import registry
 from caviar_services.agent.base import AgentSettings
@@ -19,14 +20,14 @@ from caviar_services.registry import BUILT_IN, load, registered
 
 @pytest.fixture(autouse=True)
 def fresh_registry() -> Iterator[None]:
-    registered.cache_clear()
     yield
     registered.cache_clear()
 
 
 def register(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
-    found = [EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points]
-    monkeypatch.setattr(registry, "entry_points", lambda *, group: found)
+    found = EntryPoints(EntryPoint(name, value, plugins.SERVICES) for name, value in points)
+    registered.cache_clear()
+    monkeypatch.setattr(plugins, "_installed", lambda: found)
 
 
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str) -> None:
@@ -57,7 +58,7 @@ def test_other_distributions_add_theirs(monkeypatch: pytest.MonkeyPatch) -> None
 def test_two_of_one_name_are_refused_naming_both(monkeypatch: pytest.MonkeyPatch) -> None:
     register(monkeypatch, ("channel:free-space", "other:Channel"))
     with pytest.raises(DeclarationError, match=r"registered twice.*FreeSpaceChannel.*other:Channel"):
-        load("channel", "free-space")
+        registered()
 
 
 def test_an_unknown_name_comes_with_the_nearest_and_all_known() -> None:

@@ -156,8 +156,9 @@ def run(
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
         ended = run_scenario(
-            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, attach or (), keys_given
-        )
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace,
+            attach or (), keys_given,
+        )  # fmt: skip
     raise typer.Exit(ended.status)
 
 

@@ -132,7 +132,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
         ScenarioError: As of `checked_scenario`.
     """
     refuse_carriers(scenario)
-    registered()  # two of one name are refused here: a service that is built in starts without looking for others
+    registered()  # refuses two of one name: the process of a service that is built in looks for no other
     # Before classes are loaded; the processes of services get the same folders on their command lines.
     for folder in module_folders(scenario):
         find_modules_in(folder)

@@ -1,8 +1,8 @@
 """Attachments: services that the command line attaches to a scenario, ``caviar run --attach NAME=VALUE``.
 
-An installed distribution adds one by an entry point of the group ``caviar.attachments``: a function that is given
-the checked scenario and ``VALUE``, and returns the scenario with what it attaches. The first line of its docstring
-is the help of ``caviar run --NAME VALUE``. Every process that reads the scenario calls it: its module imports
+An installed distribution adds one by an entry point of the group ``caviar.attachments``: a function that is
+given the scenario and ``VALUE``, and returns the scenario with what it attaches. The first line of its
+docstring is the help of ``caviar run --NAME VALUE``. The command and the broker both call it: its module imports
 nothing heavy.
 """
 

@@ -1,4 +1,4 @@
-"""Attachment of the agent ``airsim`` in place of those that fly a scenario's objects: ``caviar run --airsim``."""
+"""Attachment of the agent ``airsim``, in place of those that fly a scenario's objects: ``--airsim``."""
 
 from __future__ import annotations
 

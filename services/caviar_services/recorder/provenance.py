@@ -20,21 +20,30 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.plugins import PLANTS, load_plugin, plugins
 from caviar_protocol.scenario.schema import REMOTE
 from caviar_services.registry import BUILT_IN, load, registered
 
 ALWAYS = (DISTRIBUTION, "msgspec", "numpy")
 """Distributions that every run computes with."""
 OWN = frozenset(
-    ("caviar", "caviar_broker", "caviar_clients", "caviar_protocol", "caviar_scenarios", "caviar_services")
+    (
+        "caviar",
+        "caviar_bridges",
+        "caviar_broker",
+        "caviar_clients",
+        "caviar_protocol",
+        "caviar_scenarios",
+        "caviar_services",
+    )
 )
 """Packages of this distribution."""
 _BY_SETTING: Mapping[tuple[str, str], tuple[str, ...]] = {
-    ("engine", "mujoco"): ("mujoco",),
     ("rate_model", "nr"): ("sionna", "torch"),
 }
 _BUNDLED = "sionna:"
@@ -78,6 +87,7 @@ def used_versions(scenario: Mapping[str, Any]) -> dict[str, str]:
             names.update(_BY_SETTING.get((key, value), ()))
             if key == "scenery" and value.startswith(_BUNDLED):
                 names.add("sionna-rt")
+        names.update(*(load_plugin(point).packages for point in _plants(settings)))
     return _versions([*names, *_imported_distributions(_own_modules(scenario))])
 
 
@@ -130,6 +140,12 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from _texts(item, key)
 
 
+def _plants(settings: Mapping[str, Any]) -> Iterator[EntryPoint]:
+    """Plug-ins that move the quadrotors of a world."""
+    engines = {value for key, value in _texts(settings) if key == "engine"} - {"caviar"}
+    return (plugins(PLANTS)[name] for name in engines if name in plugins(PLANTS))
+
+
 def _versions(names: Iterable[str]) -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in names:
@@ -145,8 +161,9 @@ def _versions(names: Iterable[str]) -> dict[str, str]:
 
 def _own_modules(scenario: Mapping[str, Any]) -> list[str]:
     """Modules of classes that are none of this distribution, in order."""
-    found = set()
-    for role, use, _ in _services(scenario):
+    found = set[str]()
+    for role, use, settings in _services(scenario):
+        found.update(point.value.partition(":")[0] for point in _plants(settings))
         if f"{role}:{use}" not in BUILT_IN:
             target = use if ":" in use else registered().get(f"{role}:{use}", "")
             found.add(target.partition(":")[0])
