@@ -81,7 +81,7 @@ class MujocoPlant(Plant):
         return moved, end, h / 6.0 * (w0[4] + 4.0 * w1[4] + w2[4])
 
     def _force(self, velocity: Vector, q: UnitQuaternion, thrust: float, air: Vector) -> Vector:
-        """Of rotors and air, in body axes [N]."""
+        """Force of rotors and air, in body axes [N]."""
         x, y, z = (a - b for a, b in zip(velocity, air, strict=True))
         speed = math.sqrt(x * x + y * y + z * z)
         frame = self.airframe

@@ -2,8 +2,8 @@
 
 An installed distribution adds one by an entry point of the group ``caviar.attachments``: a function that is
 given the scenario and ``VALUE``, and returns the scenario with what it attaches. The first line of its
-docstring is the help of ``caviar run --NAME VALUE``. The command and the broker both call it: its module imports
-nothing heavy.
+docstring is the help of ``caviar run --NAME VALUE``. The command and the broker both call it: its module
+imports nothing heavy.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ class AirSimAgent(Agent[AirSimSettings]):
         return await self._bridge.decide(snapshot)
 
     def close(self) -> None:
-        """Answer what is under way with an error, and hang up."""
+        """Answer calls under way with an error, and hang up."""
         loop, self._loop = self._loop, None
         if loop is not None:
             try:
@@ -229,11 +229,11 @@ class _LoopThread:
         self._thread.start()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
-        """Have it run in the loop."""
+        """Run a coroutine in the loop."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def run(self, work: Coroutine[Any, Any, T], timeout_s: float) -> T:
-        """Have it run in the loop, and wait for its result."""
+        """Run a coroutine in the loop, and wait for its result."""
         return self.submit(work).result(timeout_s)
 
     def close(self) -> None:

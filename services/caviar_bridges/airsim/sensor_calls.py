@@ -60,7 +60,7 @@ def atmosphere(altitude: float) -> tuple[float, float, float]:
 
 
 class Motion(NamedTuple):
-    """What the sensors of a vehicle measure."""
+    """Motion of a vehicle, as its sensors measure it."""
 
     t_ns: int
     kinematics: Map

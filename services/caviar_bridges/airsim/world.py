@@ -109,7 +109,7 @@ class AirSimWorld(World[AirSimWorldSettings]):
         return (*self._vehicles, *self._objects)
 
     def mesh_classes(self) -> tuple[str, ...]:
-        """None: all are boxes."""
+        """No classes: all objects are boxes."""
         return ()
 
     def prepare(self, preparation: Preparation) -> Prepared:

@@ -179,7 +179,7 @@ class Pictures:
 
 
 def _optics(device: CameraDevice) -> CameraDevice:
-    """What of a camera its buffer depends on."""
+    """Properties of a camera on which its buffer depends."""
     return CameraDevice(
         name=device.name, width=device.width, height=device.height, field_of_view=device.field_of_view
     )
