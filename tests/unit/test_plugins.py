@@ -1,4 +1,4 @@
-"""Plug-ins of other distributions: found by entry points, attached by the command line, named where broken."""
+"""Plug-ins of other distributions: found by entry points, attached by the command line, named if broken."""
 
 from __future__ import annotations
 
