@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from caviar_broker.core.decisions import Decision, Task
 from caviar_broker.core.events import Product
 from caviar_broker.core.run import Resumption
+from caviar_broker.core.tasks import Decision, Task
 from caviar_broker.core.transitions import TaskState
 from caviar_broker.journal import CheckpointFiles
 from caviar_broker.journal_format import JournalEntry, JournalReader

@@ -24,7 +24,7 @@ from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import PUT_BACK, read_regular, refuse_other_kinds, replace_file, sync_file
 from caviar_protocol.messages import PROTOCOL_VERSION, GrantInput, Status
-from caviar_protocol.plugins import SERVICES, plugins
+from caviar_protocol.plugins import plugins
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ReplaySpec, Scenario
 from caviar_protocol.scenario.conversion import Source
@@ -34,6 +34,8 @@ PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_bridg
 LIBRARIES = ("numpy", "msgspec", "pyzmq", "mcap")
 TRACING = ("sionna-rt", "mitsuba", "drjit")
 TRAFFIC = ("libsumo", "eclipse-sumo")
+ENTRY_POINTS = "caviar.services"
+"""Group through which other distributions add services."""
 
 
 def versions_of(scenario: Scenario) -> dict[str, str]:
@@ -55,7 +57,7 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
     for package in sorted({use.partition(".")[0].partition(":")[0] for use in used if ":" in use}):
         found[f"code of {package}"] = _hash_of(_sources(package))
     # A service of another distribution changes with that distribution's version.
-    for point in plugins(SERVICES).values():
+    for point in plugins(ENTRY_POINTS).values():
         if point.name.partition(":")[2] in used and point.dist is not None:
             found[point.dist.name] = point.dist.version
     for path in sorted(set(_files_in(msgspec.to_builtins(read)))):

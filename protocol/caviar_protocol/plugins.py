@@ -1,74 +1,89 @@
-"""Plug-ins: what installed distributions add to CAVIAR, by the entry points that their metadata declare."""
+"""Plug-ins: what other installed distributions add, found through Python's entry points.
+
+| group | name | value |
+| --- | --- | --- |
+| ``caviar.services`` | ``role:name`` | a subclass of `Service` |
+| ``caviar.plants`` | engine of a quadrotor in the world ``flight`` | a subclass of its `Plant` |
+| ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
+| ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
+| ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
+
+What is built in stands in a table of its own and goes first; a distribution adds names, and changes none.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from caviar_protocol.errors import DeclarationError
 
-# The module takes longer to load than the metadata: only a process that asks loads it.
+# It takes longer to load than the metadata: only a process that looks for plug-ins loads it.
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-SERVICES = "caviar.services"
-"""Group of implementations: name ``role:name``, value ``module:Class``."""
-ATTACHMENTS = "caviar.attachments"
-"""Group of what the command line attaches to a scenario, as of `caviar_protocol.scenario.attachments`."""
-PLANTS = "caviar.plants"
-"""Group of what moves the rigid body of a quadrotor in the world ``flight``: value ``module:Class``."""
+T = TypeVar("T")
+
+PREFIX = "caviar."
+"""Of the names of all groups."""
 
 
-# Once a process: it reads the metadata of every installed distribution.
+# Once a process: looking for entry points reads the metadata of every installed distribution.
 @cache
-def _installed() -> Any:
+def _all() -> Mapping[str, tuple[EntryPoint, ...]]:
     from importlib.metadata import entry_points
 
-    return entry_points()
+    found = entry_points()
+    return {group: tuple(found.select(group=group)) for group in found.groups if group.startswith(PREFIX)}
 
 
-def plugins(group: str) -> dict[str, EntryPoint]:
-    """Entry points of a group, by name.
+@cache
+def plugins(group: str) -> Mapping[str, EntryPoint]:
+    """The entry points of a group, by name.
 
     Args:
-        group: `SERVICES`, `ATTACHMENTS` or `PLANTS`.
+        group: Its name.
 
     Raises:
-        DeclarationError: Two distributions register the same name.
+        DeclarationError: Two distributions register one name for different objects; names both.
 
     Example:
-        >>> plugins(PLANTS)["mujoco"].value
-        'caviar_bridges.mujoco:MujocoPlant'
+        >>> plugins("caviar.none")
+        {}
     """
     found: dict[str, EntryPoint] = {}
-    for point in _installed().select(group=group):
-        other = found.setdefault(point.name, point)
+    for point in _all().get(group, ()):
         # The same value twice is one distribution that is installed twice, in editable mode for instance.
+        other = found.setdefault(point.name, point)
         if other.value != point.value:
-            raise registered_twice(point.name, origin(other), origin(point))
+            both = (origin(each) for each in (other, point))
+            raise DeclarationError(
+                f"{point.name} is registered twice in {group}, as {' and as '.join(both)}; uninstall one"
+            )
     return found
 
 
-def registered_twice(name: str, *origins: str) -> DeclarationError:
-    """Error for a name that two register."""
-    return DeclarationError(
-        f"{name} is registered twice, as {' and as '.join(origins)}; uninstall or rename one of them"
-    )
+def load_plugin(point: EntryPoint, kind: type[T]) -> T:
+    """Import the object of an entry point.
+
+    Args:
+        point: One of `plugins`.
+        kind: Of which it has to be an instance.
+
+    Raises:
+        DeclarationError: It cannot be imported, or is something else; names the distribution and the object.
+    """
+    what = f"{point.name} of {point.group} is {origin(point)}, which"
+    try:
+        found = point.load()
+    except Exception as error:  # whatever a module that is not ours does when it is imported
+        raise DeclarationError(f"{what} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not isinstance(found, kind):
+        raise DeclarationError(f"{what} is no {kind.__name__}")
+    return found
 
 
 def origin(point: EntryPoint) -> str:
-    """Value of an entry point, and the distribution that declares it, for errors."""
-    return f"{point.value} ({point.dist.name})" if point.dist is not None else point.value
-
-
-def load_plugin(point: EntryPoint) -> Any:
-    """Object that an entry point names.
-
-    Raises:
-        DeclarationError: It cannot be imported; the text has value, distribution and cause.
-    """
-    try:
-        return point.load()
-    except Exception as error:  # whatever a module that is not ours does when it is imported
-        text = f"{type(error).__name__}: {error}"
-        raise DeclarationError(f"{point.name!r} cannot be loaded from {origin(point)}: {text}") from error
+    """Object of an entry point, and the distribution that declares it, for errors."""
+    return f"{point.value} of {point.dist.name if point.dist is not None else 'an unnamed distribution'}"

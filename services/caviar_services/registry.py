@@ -27,7 +27,7 @@ import msgspec
 
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.plugins import SERVICES, origin, plugins, registered_twice
+from caviar_protocol.plugins import origin, plugins
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
 from caviar_services.service import NoSettings, Service
 
@@ -64,6 +64,8 @@ BUILT_IN: dict[str, str] = {
 }
 """``role:name`` to ``module:Class``. To add an implementation: one file, one line here."""
 
+ENTRY_POINT_GROUP = "caviar.services"
+
 
 @cache
 def registered() -> dict[str, str]:
@@ -79,11 +81,14 @@ def registered() -> dict[str, str]:
         >>> registered()["agent:random"]
         'caviar_services.agent.baselines:RandomAgent'
     """
-    found = dict(BUILT_IN)
-    for name, point in plugins(SERVICES).items():
-        if found.setdefault(name, point.value) != point.value:
-            raise registered_twice(name, found[name], origin(point))
-    return found
+    added = plugins(ENTRY_POINT_GROUP)
+    for name, point in added.items():
+        if BUILT_IN.get(name, point.value) != point.value:
+            raise DeclarationError(
+                f"{name} is registered twice, as {BUILT_IN[name]} and as {origin(point)}; "
+                "uninstall or rename one of them"
+            )
+    return BUILT_IN | {name: point.value for name, point in added.items()}
 
 
 def with_inputs(cls: type[Service[Any]], inputs: Sequence[Input]) -> type[Service[Any]]:
@@ -223,7 +228,7 @@ def _added(role: str, name: str) -> EntryPoint:
     roles = sorted({key.split(":", 1)[0] for key in registered()})
     if role not in roles:
         raise DeclarationError(f"no service has the role {role!r}; one of {', '.join(roles)}")
-    point = plugins(SERVICES).get(f"{role}:{name}")
+    point = plugins(ENTRY_POINT_GROUP).get(f"{role}:{name}")
     if point is None:
         names = registered_names(role)
         near = difflib.get_close_matches(name, names, n=1)

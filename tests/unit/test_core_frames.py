@@ -8,8 +8,8 @@ import pytest
 from core_harness import MS, SECOND, Simulation, agent, channel, link, loop, recorder, sensors, world
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.decisions import Ledger
 from caviar_broker.core.plan import Timeouts
+from caviar_broker.core.tasks import Ledger
 from caviar_broker.core.transitions import RunState
 from caviar_protocol import messages as m
 from caviar_protocol.digest import RunDigest

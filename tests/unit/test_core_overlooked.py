@@ -23,16 +23,16 @@ def done_so_far(dispatcher: Dispatcher) -> tuple[Any, ...]:
     """What a look at a service could change."""
     table = dispatcher.table
     eligible = {(task.service, task.frame): task.eligible_at for task in table.tasks() if task.eligible_at}
-    notices, entries = len(dispatcher._actions), dispatcher._ledger.last
+    actions, entries = len(dispatcher._run.actions), dispatcher._ledger.last
     reached = [participant.next_frame for participant in table.participants.values()]
-    return notices, entries, len(dispatcher.grants), reached, eligible
+    return actions, entries, reached, eligible
 
 
 def advance_twice(dispatcher: Dispatcher, now: int) -> None:
     """Advance, look at every service, and put back what each waits for."""
     advance(dispatcher, now)
     before = done_so_far(dispatcher)
-    remembered = [dispatcher.ready, *dispatcher.waiting()]
+    remembered = [dispatcher.table.ready, *dispatcher.waiting()]
     kept = [set(waiting) for waiting in remembered]
     gathered = {task: task.inputs for task in dispatcher.table.tasks()}
     for task in gathered:
@@ -40,7 +40,7 @@ def advance_twice(dispatcher: Dispatcher, now: int) -> None:
     # A frame whose time has come meanwhile is begun by the timer, not by a look.
     for_the_timer = kept[2].difference(*kept[:2], *kept[3:])
     dispatcher.wake_all()
-    dispatcher.ready -= for_the_timer
+    dispatcher.table.ready -= for_the_timer
     advance(dispatcher, now)
     assert done_so_far(dispatcher) == before
     for task, inputs in gathered.items():

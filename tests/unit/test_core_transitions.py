@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from core_harness import MS, SECOND, Simulation, agent, loop, sensors, world
 
-from caviar_broker.core import decisions, run, transitions
 from caviar_broker.core import events as ev
+from caviar_broker.core import run, tasks, transitions
 from caviar_broker.core.plan import Timeouts
 from caviar_broker.core.transitions import (
     DECIDED,
@@ -162,7 +162,7 @@ def test_every_entry_of_every_table_happens(monkeypatch: pytest.MonkeyPatch) -> 
         seen.add((state, event))
         return step(table, state, event)
 
-    for module in (decisions, run):
+    for module in (tasks, run):
         monkeypatch.setattr(module, "step", recording)
     for scenario in SCENARIOS:
         scenario().run()

@@ -64,10 +64,10 @@ def acme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(tmp_path)
-    for cached in (plugins._installed, registered):
+    for cached in (plugins._all, plugins.plugins, registered):
         cached.cache_clear()
     yield
-    for cached in (plugins._installed, registered):
+    for cached in (plugins._all, plugins.plugins, registered):
         cached.cache_clear()
 
 
@@ -94,8 +94,8 @@ def test_launcher_and_broker_attach_the_same(tmp_path: Path) -> None:
     [
         ("acme", ["acme", "NAME=VALUE"]),
         ("acne=1", ["'acne'", "'acme'"]),
-        ("acme-gone=1", ["'acme-gone'", "acme_gone:attach (acme)"]),
-        ("acme-nothing=1", ["acme-nothing=1", "acme_plugin:nothing (acme)"]),
+        ("acme-gone=1", ["acme-gone", "acme_gone:attach of acme"]),
+        ("acme-nothing=1", ["acme-nothing=1", "acme_plugin:nothing of acme"]),
     ],
 )
 def test_what_cannot_be_attached_is_refused_by_name(text: str, words: list[str]) -> None:
@@ -112,7 +112,7 @@ def test_an_attachment_is_an_option_of_its_name_unless_there_is_one(monkeypatch:
     runner.invoke(app, ["run", "smoke", "--acme", "1", "--attach", "airsim=2", "--seed", "3", "--acme=4"])
     assert given == ["airsim=2", "acme=1", "acme=4"]
     shown = " ".join(runner.invoke(app, ["run", "-h"], env={"COLUMNS": "200", "TERM": "dumb"}).output.split())
-    for text in ("NUMBER of frames, all of them attached", "cannot be loaded from acme_gone:attach (acme)"):
+    for text in ("NUMBER of frames, all of them attached", "acme_gone:attach of acme"):
         assert text in shown
     assert shown.count("--seed") == 1
 
@@ -121,7 +121,7 @@ def test_an_attachment_is_an_option_of_its_name_unless_there_is_one(monkeypatch:
 def test_an_engine_of_another_distribution_moves_quadrotors() -> None:
     plant = plant_named("acme")(Airframe())
     assert (isinstance(plant, Plant), plant.extra) == (True, "acme")
-    for engine, words in (("acmee", "'acme'"), ("acme-text", "acme_plugin:__name__ (acme)")):
+    for engine, words in (("acmee", "'acme'"), ("acme-text", "acme_plugin:__name__ of acme")):
         with pytest.raises(DeclarationError) as caught:
             plant_named(engine)
         assert words in str(caught.value)
@@ -131,4 +131,4 @@ def test_an_engine_of_another_distribution_moves_quadrotors() -> None:
 def test_a_service_that_cannot_be_loaded_is_named_with_its_distribution() -> None:
     with pytest.raises(DeclarationError) as caught:
         load("agent", "acme-gone")
-    assert "acme_gone:Agent (acme)" in str(caught.value)
+    assert "acme_gone:Agent of acme" in str(caught.value)

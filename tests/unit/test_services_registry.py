@@ -5,12 +5,11 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint, EntryPoints
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from caviar_protocol import plugins
 from caviar_protocol.errors import DeclarationError
 from caviar_services import registry
 from caviar_services.agent.base import AgentSettings
@@ -20,14 +19,14 @@ from caviar_services.registry import BUILT_IN, load, registered
 
 @pytest.fixture(autouse=True)
 def fresh_registry() -> Iterator[None]:
+    registered.cache_clear()
     yield
     registered.cache_clear()
 
 
 def register(monkeypatch: pytest.MonkeyPatch, *points: tuple[str, str]) -> None:
-    found = EntryPoints(EntryPoint(name, value, plugins.SERVICES) for name, value in points)
-    registered.cache_clear()
-    monkeypatch.setattr(plugins, "_installed", lambda: found)
+    found = {name: EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in points}
+    monkeypatch.setattr(registry, "plugins", {registry.ENTRY_POINT_GROUP: found}.get)
 
 
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str) -> None:

@@ -12,6 +12,7 @@ From a DONE to the next GRANT:
 4. each decision is entered into the ledger and becomes a Journal action.
 5. When all events of a turn are handled, the shell calls `FrameClock.settle`:
 6. `Episodes.pump` and `Dispatcher.advance` find the services whose inputs are all decided, and order a GRANT.
-7. The shell takes `FrameClock.actions`, and sends; a GRANT that depends on a journal entry waits until the
-   entry is written.
+7. Whatever a step wants done (a message, a notice, a journal entry) is appended to the one list
+   `Run.actions`, in order. The shell takes `FrameClock.actions`, and sends; a GRANT that depends on a journal
+   entry waits until the entry is written.
 """

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.decisions import DecisionTable, GrantOrder, Ledger
+from caviar_broker.core.decisions import DecisionTable
 from caviar_broker.core.graph import Graph
+from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.run import Member, Resumption, Run
+from caviar_broker.core.tasks import GrantOrder
 from caviar_broker.core.transitions import ServiceEvent, ServiceState
-from caviar_protocol.digest import RunDigest
 from caviar_protocol.messages import Checkpoint, Done, Fault, Restore
 
 CAPABILITY = "checkpoint"
@@ -96,7 +97,6 @@ class Checkpoints:
 
     Args:
         run: The run.
-        grant: Sends a grant, with decisions imposed.
         return_service: Called with a service that is where it was.
         payload_size: Size of a payload [B].
     """
@@ -104,11 +104,10 @@ class Checkpoints:
     def __init__(
         self,
         run: Run,
-        grant: Callable[[GrantOrder, Mapping[str, str]], None],
         return_service: Callable[[Member, int], None],
         payload_size: PayloadSize,
     ) -> None:
-        self._run, self._grant, self._return_service = run, grant, return_service
+        self._run, self._return_service = run, return_service
         self._payload_size = payload_size
         self.histories: dict[str, CheckpointHistory] = {}
         """Of each service that is asked to save its state."""
@@ -232,7 +231,7 @@ class Checkpoints:
         pending = history.pending
         if pending is not None:
             member.restored = True
-            self._grant(pending.order, pending.chosen)
+            self._run.grant(pending.order, pending.chosen)
         else:
             member.move(ServiceEvent.RESTORED, now)
             self._return_service(member, now)
@@ -282,7 +281,9 @@ def histories_of(
 ) -> dict[str, CheckpointHistory]:
     """The histories of the services of a run that goes on, as they were under the broker before."""
     # A table of its own, thrown away: it knows how the inputs of a frame are made from decisions.
-    table = DecisionTable(graph, plan, before.episode, RunDigest(), Ledger(), [])
+    run = Run(plan, 0, before)
+    run.graph = graph
+    table = DecisionTable(run, Pacer(plan))
     table.resume(before.finished, before.frames, before.tasks, before.newest)
     found = {}
     for name, (frame, state) in before.states.items():

@@ -1,192 +1,21 @@
-"""Tasks of an episode and what is decided about their products: once, in order, entered in the journal.
-
-A *task* is one service's part of one frame. Once it is decided, each of its topics has a `Decision`: what
-consumers get: a fresh product, a *held* one (the newest of an earlier frame again), or its absence.
-`DecisionTable` holds both; `Ledger` says which decisions are safe in the journal.
-"""
+"""The table of an episode's decisions: each made once, in order, and entered in the journal."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
 
-import msgspec
 from msgspec.structs import replace
 
-from caviar_broker.core.events import Action, FrameFinished, Journal, Product
-from caviar_broker.core.graph import Edge, Graph
-from caviar_broker.core.plan import RunPlan, ServicePlan
-from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TASK, TaskEvent, TaskState, step
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import GrantInput, Report, Status
+from caviar_broker.core.events import FrameFinished, Journal, Product
+from caviar_broker.core.graph import Edge
+from caviar_broker.core.pace import Pacer
+from caviar_broker.core.run import Run
+from caviar_broker.core.tasks import Decision, Participant, Task, TaskInputs, provenance_of
+from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskState
+from caviar_protocol.messages import GrantInput, Status
 
 _ABSENT, _FRESH = Status.ABSENT, Status.FRESH
 _NO_EARLIER_FRAME = "there is no earlier frame"
-
-
-class Ledger:
-    """Counts the entries of the run's journal (contract, clause 18).
-
-    Entries become safe in order, so one number says which are: all up to and including `written`.
-
-    Args:
-        kept: Whether there is a journal; without one every entry is as safe as it will be.
-    """
-
-    def __init__(self, *, kept: bool = True) -> None:
-        self._kept = kept
-        self.last = 0
-        """Number of the last entry; 0: none yet."""
-        self.written = 0
-        """All entries up to this number are with the operating system."""
-        self.waiting_since: int | None = None
-        """Since when no entry was confirmed though some are outstanding [ns]; None: none is."""
-
-    def enter(self, now: int) -> int:
-        """Number of a new entry, made at the time ``now`` [ns]."""
-        self.last += 1
-        if not self._kept:
-            self.written = self.last
-        elif self.waiting_since is None:
-            self.waiting_since = now
-        return self.last
-
-    def confirm(self, number: int, now: int) -> bool:
-        """Note that entries up to ``number`` are written; whether that is news."""
-        if number <= self.written:
-            return False
-        self.written = number
-        self.waiting_since = now if number < self.last else None
-        return True
-
-
-class Decision(msgspec.Struct, frozen=True):
-    """What consumers of a frame get of one (topic, source)."""
-
-    provenance: GrantInput
-    """As a consumer in the same frame is granted it, and as the journal has it."""
-    product: Product | None = None
-    journal: int = 0
-    """Number of the journal entry in which a held product stands; 0: in this decision's own entry."""
-
-    @property
-    def status(self) -> Status:
-        """Fresh, held, absent or late."""
-        return self.provenance.status
-
-
-class GrantOrder(msgspec.Struct, frozen=True):
-    """A grant that the dispatcher wants sent."""
-
-    service: str
-    frame: int
-    previous: int
-    """Frame that the service completed before; −1: none."""
-    final: bool
-    inputs: tuple[GrantInput, ...]
-    products: tuple[Product, ...]
-    reports: tuple[Report, ...] = ()
-
-
-class TaskInputs(msgspec.Struct, frozen=True):
-    """Inputs of a task, all of them decided."""
-
-    inputs: tuple[GrantInput, ...]
-    products: tuple[Product, ...]
-    """Those of the inputs that are not absent, in the same order."""
-    cause: str | None
-    """Why the first required input is absent (clause 10); frame 0 has no earlier one."""
-    entry: int
-    """Number of the last journal entry that a grant relies on from before its frame (clause 18): the
-    service's own, lag 1 inputs and held products."""
-
-
-@dataclass(slots=True, eq=False)
-class Task:
-    """One service's part of one frame."""
-
-    service: str
-    frame: int
-    state: TaskState = TaskState.PENDING
-    eligible_at: int | None = None
-    """When it could first have been granted, or skipped, had its service been there and not late [ns]."""
-    started_at: int = 0
-    """When it was granted or, where grants queue, when the one before it was answered [ns]."""
-    inputs: TaskInputs | None = None
-    """Kept while its grant waits for the journal."""
-    overran: bool = False
-    """Whether its budget is up."""
-    order: GrantOrder | None = None
-    """As granted, until it is answered: a service that rejoins gets it again."""
-    decisions: dict[str, Decision] = field(default_factory=dict)
-    """By topic, once decided."""
-    journal: int = 0
-    """Number of the journal entry of its decisions; 0: not decided."""
-    report: Report | None = None
-
-    def move(self, event: TaskEvent) -> None:
-        """Take a transition of the table in `caviar_broker.core.transitions`."""
-        self.state = step(TASK, self.state, event)
-
-
-@dataclass(slots=True, eq=False)
-class Participant:
-    """One service in an episode."""
-
-    plan: ServicePlan
-    rank: int
-    """Place in the graph's order: producers come before the consumers of their frame."""
-    outputs: tuple[str, ...]
-    """Topics in demand."""
-    capacity: int = 1
-    """Grants that may be outstanding (clause 7)."""
-    tasks: dict[int, Task] = field(default_factory=dict)
-    """By frame, as far as anything still needs them."""
-    next_frame: int = 0
-    """First frame that is not decided."""
-    completed: int = -1
-    """Last frame that the service answered."""
-    outstanding: list[Task] = field(default_factory=list)
-    """Tasks for which DONE or FAULT is due, oldest first."""
-    suspended: bool = False
-    """Whether the service is gone: its outstanding grants stay owed, no new ones are made."""
-    saving: bool = False
-    """Whether the service saves its state, and is granted nothing until it has."""
-    inputs: tuple[tuple[Edge, Participant], ...] = ()
-    """Its edges with their sources, sorted by (topic, source)."""
-    lagged: tuple[tuple[Edge, Participant], ...] = ()
-    """Those of lag 1, which alone count after the last frame (clause 16)."""
-    latest: tuple[tuple[Edge, Participant], ...] = ()
-    """All of them, those first that are decided last in a frame."""
-    waiting: set[Participant] = field(default_factory=set)
-    """Services that can be granted nothing before this one's next decision."""
-
-    def task(self, frame: int) -> Task:
-        """Its task in a frame; a new one where there is none."""
-        found = self.tasks.get(frame)
-        if found is None:
-            found = self.tasks[frame] = Task(self.plan.name, frame)
-        return found
-
-    def has_decided(self, edge: Edge, frame: int) -> bool:
-        """Whether it is known what a consumer gets over one of this source's edges in a frame."""
-        return frame - edge.lag < self.next_frame or frame < edge.lag
-
-
-def provenance_of(product: Product, status: Status, frame: int, cause: str = "") -> GrantInput:
-    """Provenance of a product, as a consumer in ``frame`` is granted it."""
-    return GrantInput(
-        topic=product.topic,
-        source=product.source,
-        status=status,
-        frame=product.frame,
-        t_ns=product.t_ns,
-        age=frame - product.frame,
-        fidelity=product.fidelity,
-        digest=product.digest,
-        cause=cause,
-        geometry=product.geometry,
-    )
 
 
 class DecisionTable:
@@ -196,42 +25,31 @@ class DecisionTable:
     decided it; the fresh products of finished frames make the digest of the run.
 
     Args:
-        graph: Which service takes what from which.
-        plan: The run.
-        episode: Number of the episode.
-        digest: The run's chain; finished frames are added to it.
-        ledger: The run's journal.
-        actions: Where journal entries and finished frames are put.
+        run: The run, whose graph is known.
+        pacer: Says how far real time has slipped, for the report on a frame.
         sources: Services whose products stand in the journal because those that take them save their state.
     """
 
-    def __init__(
-        self,
-        graph: Graph,
-        plan: RunPlan,
-        episode: int,
-        digest: RunDigest,
-        ledger: Ledger,
-        actions: list[Action],
-        sources: Collection[str] = (),
-    ) -> None:
+    def __init__(self, run: Run, pacer: Pacer, sources: Collection[str] = ()) -> None:
+        assert run.graph is not None
+        plan, graph = run.plan, run.graph
         self.frames = plan.frames
         """Frames of the episode; becomes less when an agent ends it early."""
         self.finished_frames = 0
-        self.lag_ns: Callable[[], int] = lambda: 0
-        """How far real time has slipped, for the report on a frame."""
-        self.on_decision: Callable[[Participant], None] = lambda participant: None
-        """Called with each service that has decided one more frame."""
         plans = {service.name: service for service in plan.services}
         self.participants = {
             name: Participant(plans[name], rank, graph.outputs[name]) for rank, name in enumerate(graph.order)
         }
+        self.ready = set(self.participants.values())
+        """Services for which something may have changed, to be looked at by the dispatcher."""
+        self.waiting_for_frames: set[Participant] = set()
+        """Services that wait for frames to be finished."""
         for name, participant in self.participants.items():
             participant.inputs = self._with_sources(graph.inputs[name])
             participant.lagged = tuple(pair for pair in participant.inputs if pair[0].lag)
             participant.latest = self._with_sources(graph.latest[name])
-        self._graph, self._plan, self._episode = graph, plan, episode
-        self._digest, self._ledger, self._actions = digest, ledger, actions
+        self._graph, self._plan, self._episode, self._pacer = graph, plan, run.episode, pacer
+        self._digest, self._ledger, self._actions = run.digest, run.ledger, run.actions
         self._holding = frozenset(p.name for p in plan.services if p.holds_last_product)
         self._kept = self._holding | graph.retained | frozenset(sources)
         # A service that has not decided the first frame yet that is not finished.
@@ -413,7 +231,23 @@ class DecisionTable:
         participant.next_frame = task.frame + 1
         if self._last.next_frame > self.finished_frames:
             self._finish_frames()
-        self.on_decision(participant)
+        self._note_decision(participant)
+
+    def _note_decision(self, participant: Participant) -> None:
+        """Have the dispatcher look again at the services that a decision may concern."""
+        latest, frame = participant.latest, participant.next_frame
+        # Most services wait for the last input of their next frame now, and need not be looked at for that.
+        if latest and frame < self.frames and not latest[0][1].has_decided(latest[0][0], frame):
+            latest[0][1].waiting.add(participant)
+        else:
+            self.ready.add(participant)
+        self.wake(participant.waiting)
+
+    def wake(self, waiting: set[Participant]) -> None:
+        """Have the dispatcher look again at services that waited; empties the set."""
+        if waiting:
+            self.ready |= waiting
+            waiting.clear()
 
     def _journal(self, task: Task, decisions: Collection[Decision], outcome: str, number: int) -> None:
         """Products of earlier frames stand in entries of their own; others only if they may be used later."""
@@ -442,12 +276,13 @@ class DecisionTable:
             if not self._plan.ephemeral:
                 self._digest.add_frame(self._episode, frame, self._fresh(frame))
             t_ns = self._plan.t_ns(frame)
-            self._actions.append(FrameFinished(self._episode, frame, t_ns, self.lag_ns()))
+            self._actions.append(FrameFinished(self._episode, frame, t_ns, self._pacer.lag_ns))
             self.finished_frames += 1
             for participant in participants:  # lag 1 still needs this frame, nothing needs the one before
                 old = participant.tasks.get(frame - 1)
                 if old is not None and old.state not in OUTSTANDING:
                     del participant.tasks[frame - 1]
+        self.wake(self.waiting_for_frames)
         # Looked for from the last on: as long as this service lags, no other can have finished one.
         self._last = min(reversed(participants), key=lambda participant: participant.next_frame)
 
@@ -457,7 +292,7 @@ class DecisionTable:
             (topic, participant.plan.name, decision.product.digest)
             for participant in self.participants.values()
             for topic, decision in participant.tasks[frame].decisions.items()
-            if decision.status is _FRESH and decision.product is not None
+            if decision.provenance.status is _FRESH and decision.product is not None
         ]
 
     # --- invariants ----------------------------------------------------------------------------------
@@ -488,7 +323,7 @@ def _absent(task: Task, topic: str, cause: str) -> Decision:
 def _validate_decision(what: str, frame: int, decision: Decision) -> None:
     """Raise AssertionError where a decision contradicts itself (clauses 9 to 12)."""
     product, cause = decision.product, decision.provenance.cause
-    match decision.status:
+    match decision.provenance.status:
         case Status.FRESH:
             assert product is not None, f"{what} is fresh without a product"
             assert product.frame == frame, f"{what} is not fresh"

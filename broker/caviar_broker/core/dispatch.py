@@ -6,27 +6,20 @@ dying or messages; `caviar_broker.core.episodes.Episodes` does that around it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
 from msgspec.structs import replace
 
-from caviar_broker.core.deadlines import Deadlines, PauseGate
-from caviar_broker.core.decisions import (
-    DecisionTable,
-    GrantOrder,
-    Ledger,
-    Participant,
-    Task,
-    TaskInputs,
-    provenance_of,
-)
-from caviar_broker.core.events import Action, Notice, Product
-from caviar_broker.core.graph import Graph
-from caviar_broker.core.plan import RunPlan, milliseconds
-from caviar_broker.core.run import Resumption
+from caviar_broker.core.deadlines import Deadlines
+from caviar_broker.core.decisions import DecisionTable
+from caviar_broker.core.events import Product
+from caviar_broker.core.geometry import GeometryLedger
+from caviar_broker.core.pace import Pacer
+from caviar_broker.core.plan import milliseconds
+from caviar_broker.core.run import Resumption, Run
+from caviar_broker.core.tasks import GrantOrder, Participant, Task, TaskInputs, provenance_of
 from caviar_broker.core.transitions import OUTSTANDING, TaskEvent, TaskState
-from caviar_protocol.digest import RunDigest
-from caviar_protocol.messages import Report, Status
+from caviar_protocol.messages import Cancel, Report, Status
 
 # On the path of every frame: a member that is looked up in its class costs four times as much.
 _GRANTED, _OVERDUE, _ABANDONED = TaskState.GRANTED, TaskState.OVERDUE, TaskState.ABANDONED
@@ -36,47 +29,29 @@ _GRANT, _ANSWER = TaskEvent.GRANT, TaskEvent.ANSWER
 class Dispatcher:
     """Grants the frames of one episode.
 
-    What it wants done collects in ``actions``, `grants` and `cut`, and in its `deadlines`, for the caller to
-    carry out. After an event only services that it may concern are looked at again. A service that waits for
-    another one's decision, for the journal, for real time or for frames to be finished is noted until that
-    comes. One that lacks several inputs waits for one of them at a time, for the last one of a frame first:
-    few answers bring it back in vain.
+    After an event only services that it may concern are looked at again. A service that waits for another
+    one's decision, for the journal, for real time or for frames to be finished is noted until that comes. One
+    that lacks several inputs waits for one of them at a time, for the last one of a frame first: few answers
+    bring it back in vain.
 
     Args:
-        graph: Which service takes what from which.
-        plan: The run.
+        run: The run, whose actions it appends to.
         capacity: Grants that each service can have outstanding (clause 7).
-        episode: Number of the episode.
-        digest: The run's digest.
-        ledger: The run's journal.
-        actions: Where notices, latencies and journal entries go, in order.
-        gate: Whether the run is paused.
+        geometry: Meshes that services have yet to load.
         stateful: Services that save their state.
     """
 
     def __init__(
-        self,
-        graph: Graph,
-        plan: RunPlan,
-        capacity: Mapping[str, int],
-        episode: int,
-        digest: RunDigest,
-        ledger: Ledger,
-        actions: list[Action],
-        gate: PauseGate | None = None,
-        stateful: Collection[str] = (),
+        self, run: Run, capacity: Mapping[str, int], geometry: GeometryLedger, stateful: Collection[str] = ()
     ) -> None:
-        self.graph, self.plan, self.episode = graph, plan, episode
-        self.grants: list[GrantOrder] = []
-        self.cut: list[Task] = []
-        """Granted tasks that an early end made useless; to be cancelled."""
-        self._ledger, self._actions = ledger, actions
-        self._first_entry = ledger.last
-        self._gate = gate or PauseGate()
-        sources = {edge.source for name in stateful for edge in graph.inputs[name]}
-        self.table = DecisionTable(graph, plan, episode, digest, ledger, actions, sources)
-        self.table.on_decision = self._note_decision
-        self.deadlines = Deadlines(plan, episode, self.table, self._gate, actions)
+        assert run.graph is not None
+        self.graph, self.plan, self.episode = run.graph, run.plan, run.episode
+        self._run, self._ledger, self._gate, self._geometry = run, run.ledger, run.gate, geometry
+        self._first_entry = run.ledger.last
+        pacer = Pacer(run.plan)
+        sources = {edge.source for name in stateful for edge in run.graph.inputs[name]}
+        self.table = DecisionTable(run, pacer, sources)
+        self.deadlines = Deadlines(run, self.table, pacer)
         self._participants = self.table.participants
         for name, participant in self._participants.items():
             participant.capacity = capacity[name]
@@ -87,16 +62,9 @@ class Dispatcher:
         self._others = tuple(p for p in reversed(everyone) if p.plan.role != "recorder")
         # Late products that no recorder has been granted (clause 11).
         self._late: list[Product] = []
-        self.ready = set(everyone)
-        """Services for which something may have changed."""
         self._waiting_for_journal: set[Participant] = set()
         self._waiting_for_pace: set[Participant] = set()
-        self._waiting_for_frames: set[Participant] = set()
         self._waiting_for_geometry: set[Participant] = set()
-        self.lacks_geometry: Callable[[str, int], bool] | None = None
-        """Whether a service has yet to load the meshes of a frame; None: there is nothing but scenery."""
-        # Finished frames when services were last woken for them.
-        self._seen_finished = 0
 
     def resume(self, before: Resumption, completed: Mapping[str, int]) -> None:
         """Continue after the last finished frame; ``completed`` says how far services got that have state."""
@@ -175,7 +143,7 @@ class Dispatcher:
             participant.outstanding[0].started_at = now  # it was queued until now
         task.order = None
         if task.state is not _GRANTED:
-            self.ready.add(participant)  # it was decided before; else its decision brings it back
+            self.table.ready.add(participant)  # it was decided before; else its decision brings it back
         return task
 
     def _record_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
@@ -197,7 +165,9 @@ class Dispatcher:
         for task in self.table.end_after(max(frame, *reached)):
             if task.state in OUTSTANDING:
                 task.move(TaskEvent.CUT)
-                self.cut.append(task)
+                member = self._run.members[task.service]
+                if member.present:
+                    self._run.send(member, Cancel(**self._run.ids(member), frame=task.frame))
         self.wake_all()
 
     # --- services that come and go -------------------------------------------------------------------
@@ -221,7 +191,7 @@ class Dispatcher:
         """
         participant = self._participants[service]
         participant.suspended = participant.saving = False
-        self.ready.add(participant)
+        self.table.ready.add(participant)
         participant.completed = previous = completed
         again = []
         for task in participant.outstanding:
@@ -240,7 +210,7 @@ class Dispatcher:
         """Grant again to a service that has saved its state."""
         participant = self._participants[service]
         participant.saving = False
-        self.ready.add(participant)
+        self.table.ready.add(participant)
         task = participant.tasks.get(participant.next_frame)
         if task is not None and participant.plan.ends_run_when_late and task.eligible_at is not None:
             task.eligible_at = now  # it could not have been granted before
@@ -254,21 +224,21 @@ class Dispatcher:
 
     def wake_for_journal(self) -> None:
         """Look again at what waited for entries of the ledger to be safe."""
-        self._wake(self._waiting_for_journal)
+        self.table.wake(self._waiting_for_journal)
 
     def wake_for_pace(self) -> None:
         """Look again at what waited for real time, or for the user's pause to end."""
-        self._wake(self._waiting_for_pace)
+        self.table.wake(self._waiting_for_pace)
 
     def wake_for_geometry(self) -> None:
         """Look again at what waited for meshes to be loaded."""
-        self._wake(self._waiting_for_geometry)
+        self.table.wake(self._waiting_for_geometry)
 
     def wake_all(self) -> None:
         """Look at every service again, and forget what they waited for."""
         for waiting in self.waiting():
             waiting.clear()
-        self.ready.update(self._participants.values())
+        self.table.ready.update(self._participants.values())
 
     def waiting(self) -> list[set[Participant]]:
         """The sets of services that wait: for the journal, real time, frames, meshes, and each decision."""
@@ -276,35 +246,16 @@ class Dispatcher:
         return [
             self._waiting_for_journal,
             self._waiting_for_pace,
-            self._waiting_for_frames,
+            self.table.waiting_for_frames,
             self._waiting_for_geometry,
             *decisions,
         ]
-
-    def _wake(self, waiting: set[Participant]) -> None:
-        if waiting:
-            self.ready |= waiting
-            waiting.clear()
-
-    def _note_decision(self, participant: Participant) -> None:
-        """Look again at what a service's decision may concern; `DecisionTable` calls this."""
-        table = self.table
-        latest, frame = participant.latest, participant.next_frame
-        # Most services wait for the last input of their next frame now, and need not be looked at for that.
-        if latest and frame < table.frames and not latest[0][1].has_decided(latest[0][0], frame):
-            latest[0][1].waiting.add(participant)
-        else:
-            self.ready.add(participant)
-        self._wake(participant.waiting)
-        if table.finished_frames != self._seen_finished:
-            self._seen_finished = table.finished_frames
-            self._wake(self._waiting_for_frames)
 
     # --- granting ------------------------------------------------------------------------------------
 
     def advance(self, now: int) -> None:
         """Grant and skip whatever can be, until nothing changes."""
-        ready = self.ready
+        ready = self.table.ready
         while ready:
             batch = sorted(ready, key=_rank) if len(ready) > 1 else tuple(ready)
             ready.clear()
@@ -347,7 +298,7 @@ class Dispatcher:
                 # After another frame of the service, which is not decided yet, it will rely on more.
                 task.inputs = None if in_flight else inputs
                 return
-            if self.lacks_geometry is not None and self._awaits_geometry(participant, frame):
+            if self._geometry.has_changed and self._awaits_geometry(participant, frame):
                 task.inputs = None if in_flight else inputs
                 return
             if (self.plan.realtime or self._gate.closed) and not self._release(participant, task, now):
@@ -375,7 +326,7 @@ class Dispatcher:
         if frame >= table.frames and (role != "agent" or frame > table.frames):
             return False
         if frame >= table.finished_frames + self.plan.frames_in_flight + (frame == table.frames):
-            self._waiting_for_frames.add(participant)
+            table.waiting_for_frames.add(participant)
             return False
         if role == "agent":
             before, reached = self._agents, frame
@@ -391,10 +342,10 @@ class Dispatcher:
 
     def _awaits_geometry(self, participant: Participant, frame: int) -> bool:
         """Whether a frame waits until its service has loaded its meshes; one that may miss it need not."""
-        if self.lacks_geometry is None or not participant.plan.is_indispensable:
+        if not participant.plan.is_indispensable:
             return False
         # One that is gone is sent the meshes again when it comes back, and its grants after them.
-        if not self.lacks_geometry(participant.plan.name, frame):
+        if not self._geometry.is_lacking(participant.plan.name, frame):
             return False
         self._waiting_for_geometry.add(participant)
         return True
@@ -415,7 +366,7 @@ class Dispatcher:
         order = GrantOrder(task.service, task.frame, previous, final, inputs.inputs, inputs.products)
         task.order = order if participant.plan.role != "recorder" else self._with_reports(order)
         owed.append(task)
-        self.grants.append(task.order)
+        self._run.grant(task.order)
 
     def _with_reports(self, order: GrantOrder) -> GrantOrder:
         """A recorder's grant, with what came late and what the services of its frame reported."""
@@ -512,7 +463,7 @@ class Dispatcher:
                         assert known, f"{task} granted before {edge} (clause 7)"
 
     def _notice(self, kind: str, task: Task, text: str) -> None:
-        self._actions.append(Notice(kind, task.service, text, self.episode, task.frame))
+        self._run.notice(kind, task.service, text, task.frame)
 
 
 def _rank(participant: Participant) -> int:

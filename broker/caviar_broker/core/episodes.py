@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.checkpoints import Checkpoints, PayloadSize
-from caviar_broker.core.decisions import GrantOrder
 from caviar_broker.core.dispatch import Dispatcher
 from caviar_broker.core.geometry import GeometryLedger
 from caviar_broker.core.run import Member, Run
@@ -14,12 +13,10 @@ from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, Ser
 from caviar_protocol.errors import one_line
 from caviar_protocol.messages import (
     RUN_COMPLETE,
-    Cancel,
     Done,
     EpisodeEnd,
     Fault,
     GeometryChange,
-    Grant,
     Report,
     Reset,
 )
@@ -39,7 +36,7 @@ class Episodes:
 
     def __init__(self, run: Run, payload_size: PayloadSize = lambda payload: 0) -> None:
         self._run = run
-        self.checkpoints = Checkpoints(run, self._grant, self._return_service, payload_size)
+        self.checkpoints = Checkpoints(run, self._return_service, payload_size)
         """What is kept for services that may come back."""
         self.geometry = GeometryLedger(run)
         """Meshes that worlds announced in the episode."""
@@ -116,7 +113,7 @@ class Episodes:
         run, history = self._run, self.checkpoints.histories.get(member.name)
         if self.dispatcher is not None:
             for order in self.dispatcher.resume_service(member.name, now, history.last if history else -1):
-                self._grant(order)
+                run.grant(order)
         elif all(p.state is ServiceState.ACTIVE for p in self._members()):
             run.enter(RunEvent.ALL_RESET, now)
             self._start(now)
@@ -126,18 +123,7 @@ class Episodes:
         run, histories = self._run, self.checkpoints.histories
         assert run.graph is not None
         capacity = {p.name: _capacity(p) for p in self._members()}
-        dispatcher = self.dispatcher = Dispatcher(
-            run.graph,
-            run.plan,
-            capacity,
-            run.episode,
-            run.digest,
-            run.ledger,
-            run.actions,
-            run.gate,
-            histories,
-        )
-        self._note_geometry(dispatcher)
+        dispatcher = self.dispatcher = Dispatcher(run, capacity, self.geometry, histories)
         # After the dispatcher, so that frame 0 need not wait for these entries.
         facts = {"seed": run.seed, "seed_episode": run.seed_episode, "frames": dispatcher.table.frames}
         before, run.resumption = run.resumption, None
@@ -148,11 +134,6 @@ class Episodes:
         run.enter_journal("episode", "", 0, now, facts=facts, members=run.graph.order)
         for name in histories:
             run.enter_journal("checkpoint", name, -1, now)
-
-    def _note_geometry(self, dispatcher: Dispatcher) -> None:
-        """Let frames wait for meshes, once there are any: a run without them asks no question about them."""
-        if self.geometry.has_changed:
-            dispatcher.lacks_geometry = self.geometry.is_lacking
 
     def _end(self, frames: int, now: int) -> None:
         """Send EPISODE_END, and begin the next episode or end the run."""
@@ -263,9 +244,7 @@ class Episodes:
             return None
         bases = [h.frame for h in self.checkpoints.histories.values()]
         needed = min([dispatcher.table.finished_frames - 1, *bases]) + 1
-        announced = self.geometry.announce(member, message, refused, needed, now)
-        self._note_geometry(dispatcher)
-        return announced
+        return self.geometry.announce(member, message, refused, needed, now)
 
     def _refuse_products(self, member: Member, message: Done, now: int) -> None:
         topics = [header.topic for header in message.products]
@@ -281,7 +260,7 @@ class Episodes:
             self.checkpoints.add(member, order, answer)
 
     def _save_if_due(self, member: Member, dispatcher: Dispatcher, now: int) -> None:
-        if self.checkpoints.is_due(member) and not dispatcher.is_through(member.name):
+        if not self._run.over and self.checkpoints.is_due(member) and not dispatcher.is_through(member.name):
             dispatcher.begin_save(member.name)
             if not dispatcher.outstanding(member.name):
                 self.checkpoints.request(member, now)
@@ -377,68 +356,15 @@ class Episodes:
             dispatcher.wake_for_pace()
 
     def pump(self, now: int) -> None:
-        """Let the dispatcher act, and carry out what it wants."""
+        """Let the dispatcher grant, and end an episode that is over."""
         run, dispatcher = self._run, self.dispatcher
         if dispatcher is None or run.state is not _RUNNING:
             return
-        # Grants first: services work while notices are written.
         dispatcher.advance(now)
-        for order in dispatcher.grants:
-            self._grant(order)
-        dispatcher.grants.clear()
-        deadlines = dispatcher.deadlines
-        if deadlines.overruns or deadlines.skips or dispatcher.cut or deadlines.aborted:
-            self._blame_overruns(dispatcher, now)
         # Cheap tests first: this is asked after every event, and holds once an episode.
         table = dispatcher.table
         if table.finished_frames >= table.frames and not run.over and dispatcher.finished:
             self._end(table.frames, now)
-
-    def _blame_overruns(self, dispatcher: Dispatcher, now: int) -> None:
-        """Say which budgets are up, cancel what is cut, and end the run where the policy is abort."""
-        run, deadlines = self._run, dispatcher.deadlines
-        for task, remedy in deadlines.overruns:
-            member = run.members[task.service]
-            waiting = dispatcher.table.describe_waiting(task.service)
-            text = member.blame_task(task, "overran its budget", now, waiting)
-            run.notice("miss", task.service, f"{text}; {remedy}", task.frame)
-        for task, cause in deadlines.skips:
-            heard = run.members[task.service].last_words(now)
-            run.notice("skipped", task.service, f"{cause}; {heard}", task.frame)
-        for task in dispatcher.cut:
-            member = run.members[task.service]
-            if member.present:
-                run.send(member, Cancel(**run.ids(member), frame=task.frame))
-        deadlines.overruns.clear()
-        deadlines.skips.clear()
-        dispatcher.cut.clear()
-        if deadlines.aborted is not None:
-            member = run.members[deadlines.aborted.service]
-            waiting = dispatcher.table.describe_waiting(member.name)
-            text = member.blame_task(deadlines.aborted, "overran its budget (policy abort)", now, waiting)
-            run.fail(text, member.name, now)
-
-    def _grant(self, order: GrantOrder, chosen: Mapping[str, str] | None = None) -> None:
-        """Send GRANT; with ``chosen`` it was answered before, after these decisions."""
-        run, member = self._run, self._run.members[order.service]
-        # A replay imposes what was recorded; what a service chose before its restart goes before that.
-        decisions = run.plan.imposed.get((order.service, run.episode, order.frame), {})
-        if order.service in run.plan.policies:
-            decisions = {**run.swaps.announced(order.service), **decisions}
-        grant = Grant(
-            epoch=run.plan.epoch,
-            attempt=member.attempt,
-            episode=run.episode,
-            frame=order.frame,
-            previous_frame=order.previous,
-            t_ns=run.plan.t_ns(order.frame),
-            budget_ns=member.plan.budget_ns,
-            inputs=order.inputs,
-            final=order.final,
-            decisions={**decisions, **chosen} if chosen else dict(decisions),
-            reports=order.reports,
-        )
-        run.actions.append(ev.Send(member.name, grant, order.products))
 
 
 def _capacity(member: Member) -> int:

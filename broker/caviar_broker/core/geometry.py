@@ -79,6 +79,8 @@ class GeometryLedger:
         self._refused: set[tuple[str, str]] = set()
         # Of the geometry from each frame on in which it changes, in ascending order.
         self._digests: list[tuple[int, str]] = []
+        self.has_changed = False
+        """Whether any frame of the episode has other geometry than its scenery."""
 
     def begin_episode(self) -> None:
         """Start with scenery alone, or with what another broker left of the episode."""
@@ -90,11 +92,6 @@ class GeometryLedger:
         for world, change in before.geometry if before is not None else ():
             self._put(world, change)
         self._note_digests()
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether any frame of the episode has other geometry than its scenery."""
-        return bool(self._digests)
 
     def digest_at(self, frame: int) -> str:
         """Digest of the geometry of a frame; empty where the run has none."""
@@ -206,6 +203,7 @@ class GeometryLedger:
         scenery = self._run.scenery()
         frames = sorted({change.frame for changes in self._changes.values() for change in changes})
         self._digests = [(frame, geometry_digest([*scenery, *self.meshes_at(frame)])) for frame in frames]
+        self.has_changed = bool(frames)
 
     # --- services that load them ---------------------------------------------------------------------
 

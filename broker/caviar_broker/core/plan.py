@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -77,28 +78,28 @@ class ServicePlan:
     features: tuple[Feature, ...] = ()
     """Of its devices: what the service has to know of later minor versions than 1.0."""
 
-    # What a policy means, contract clause 9. At the deadline
+    # What a policy means, contract clause 9; cached, as they are asked in every frame. At the deadline
     #   wait   the frame waits for the answer;
     #   abort  the run ends;
     #   hold   consumers get the newest earlier product, held; without one it is absent;
     #   drop   the product is absent.
 
-    @property
+    @cached_property
     def waits_for_answer(self) -> bool:
         """Whether frames wait for it after its deadline."""
         return self.policy == "wait"
 
-    @property
+    @cached_property
     def ends_run_when_late(self) -> bool:
         """Whether the run ends at its deadline."""
         return self.policy == "abort"
 
-    @property
+    @cached_property
     def is_indispensable(self) -> bool:
         """Whether no frame goes on without its answer."""
         return self.waits_for_answer or self.ends_run_when_late
 
-    @property
+    @cached_property
     def holds_last_product(self) -> bool:
         """Whether its newest product is held for frames that it misses."""
         return self.policy == "hold"

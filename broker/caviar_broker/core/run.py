@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_broker.core.deadlines import PauseGate
-from caviar_broker.core.decisions import Ledger, Task
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
+from caviar_broker.core.pace import PauseGate
 from caviar_broker.core.plan import RunPlan, ServicePlan, Timeouts, duration
 from caviar_broker.core.policy_swaps import PolicySwaps
+from caviar_broker.core.tasks import GrantOrder, Ledger, Task
 from caviar_broker.core.transitions import (
     PRESENT,
     RUN,
@@ -28,6 +28,7 @@ from caviar_protocol.messages import (
     Asset,
     Error,
     GeometryChange,
+    Grant,
     Hello,
     Message,
     Ready,
@@ -340,6 +341,28 @@ class Run:
             attachment: State of the service, in one part.
         """
         self.actions.append(Send(member.name, message, products, attachment))
+
+    def grant(self, order: GrantOrder, chosen: Mapping[str, str] | None = None) -> None:
+        """Have GRANT sent; with ``chosen`` it was answered before, after these decisions."""
+        plan, member = self.plan, self.members[order.service]
+        # A replay imposes what was recorded; what a service chose before its restart goes before that.
+        decisions = plan.imposed.get((order.service, self.episode, order.frame), {})
+        if order.service in plan.policies:
+            decisions = {**self.swaps.announced(order.service), **decisions}
+        grant = Grant(
+            epoch=plan.epoch,
+            attempt=member.attempt,
+            episode=self.episode,
+            frame=order.frame,
+            previous_frame=order.previous,
+            t_ns=plan.t_ns(order.frame),
+            budget_ns=member.plan.budget_ns,
+            inputs=order.inputs,
+            final=order.final,
+            decisions={**decisions, **chosen} if chosen else dict(decisions),
+            reports=order.reports,
+        )
+        self.actions.append(Send(member.name, grant, order.products))
 
     def ids(self, member: Member) -> dict[str, int]:
         """What every message of an episode to a service carries (clause 1)."""

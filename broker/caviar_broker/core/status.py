@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import msgspec
 
-from caviar_broker.core.decisions import Task
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.plan import duration
 from caviar_broker.core.run import Member, Run
+from caviar_broker.core.tasks import Task
 from caviar_broker.core.transitions import RunState, ServiceState, TaskState
 
 _UNDER_WAY = {

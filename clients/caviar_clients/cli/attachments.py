@@ -6,7 +6,7 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperOption
 
-from caviar_protocol.plugins import ATTACHMENTS, plugins
+from caviar_protocol.plugins import plugins
 
 
 class _Alias(TyperOption):
@@ -25,7 +25,7 @@ class _Alias(TyperOption):
     @property
     def help(self) -> str:  # type: ignore[override]
         """What the attachment says of itself; its module is imported where that is shown."""
-        from caviar_protocol.scenario.attachments import summary  # not with `caviar --help`, nor with a run
+        from caviar_protocol.scenario.attachments import summary
 
         return summary(self.attachment)
 
@@ -35,6 +35,8 @@ class AttachingCommand(TyperCommand):
 
     def get_params(self, ctx: Any) -> list[Any]:
         """List the parameters, with the aliases after ``--attach``."""
+        from caviar_protocol.scenario.attachments import ATTACHMENTS  # `caviar --help` loads no scenarios
+
         found = super().get_params(ctx)
         taken = {flag for parameter in found for flag in parameter.opts}
         at = next(i for i, parameter in enumerate(found) if parameter.name == "attach")

@@ -8,18 +8,17 @@ has piece by piece. ``constant`` traffic and ``trace`` send a packet whenever th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.plugins import load_plugin, plugins
 from caviar_protocol.scenario.conversion import FILE, Place, csv_rows
-
-TrafficModel = Literal["full", "constant", "poisson", "alternating", "trace"]
 
 COLUMNS = ("t_s", "rate_bit_s")
 """Header of a trace: an instant, and the rate that holds from it on."""
@@ -42,9 +41,10 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     users: tuple[str, ...] = ("*",)
     """Receivers, as names with ``*`` for any text and ``?`` for any character; of several entries that fit a
     receiver, the first counts."""
-    model: TrafficModel = "full"
+    model: str = "full"
     """``full``: there is always something to send; ``constant``: packets at equal intervals; ``poisson``;
-    ``alternating``: Poisson, dense and light by turns; ``trace``: rates over time from a file."""
+    ``alternating``: Poisson, dense and light by turns; ``trace``: rates over time from a file; or the name of
+    a plug-in."""
     rate_bit_s: _Rate | None = None
     """Of ``constant`` and ``poisson``; of ``alternating`` while it is dense."""
     light_rate_bit_s: _Rate | None = None
@@ -61,14 +61,6 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Packets that find the buffer full are dropped; absent: it has no bound."""
 
 
-# What each model needs; all other keys of a rate have no effect on it.
-_NEEDED: dict[TrafficModel, tuple[str, ...]] = {
-    "full": (),
-    "constant": ("rate_bit_s",),
-    "poisson": ("rate_bit_s",),
-    "alternating": ("rate_bit_s", "light_rate_bit_s", "period_s"),
-    "trace": ("file",),
-}
 _KEYS = ("rate_bit_s", "light_rate_bit_s", "period_s", "file")
 _LIMITS = ("max_age_s", "max_packets")
 
@@ -89,13 +81,13 @@ def check_traffic(traffic: Traffic, place: Place) -> None:
             ...
         caviar_protocol.errors.ScenarioError: traffic[0].rate_bit_s: is missing; 'constant' needs rate_bit_s
     """
-    needed = _NEEDED[traffic.model]
+    model = traffic_model(traffic.model, place)
     for key in _KEYS:
         given = getattr(traffic, key) not in (None, "")
-        if key in needed and not given:
-            raise place.at(key).error(f"is missing; {traffic.model!r} needs {', '.join(needed)}")
-        if given and key not in needed:
-            models = ", ".join(repr(model) for model in get_args(TrafficModel) if key in _NEEDED[model])
+        if key in model.needs and not given:
+            raise place.at(key).error(f"is missing; {traffic.model!r} needs {', '.join(model.needs)}")
+        if given and key not in model.needs:
+            models = ", ".join(repr(name) for name, row in MODELS.items() if key in row.needs)
             raise place.at(key).error(
                 f"has no effect with model {traffic.model!r}; leave it out, or choose {models}"
             )
@@ -104,8 +96,8 @@ def check_traffic(traffic: Traffic, place: Place) -> None:
         for key in _LIMITS:
             if getattr(traffic, key) is not None:
                 raise place.at(key).error("has no effect with model 'full', of which nothing is dropped")
-    if traffic.model == "trace":
-        read_trace(traffic.file, place.at("file"))
+    else:
+        model.offered(traffic, place)
 
 
 class Offered(msgspec.Struct, frozen=True):
@@ -123,8 +115,8 @@ class Offered(msgspec.Struct, frozen=True):
     period: float = math.inf
     """After which the pieces begin again [s]."""
 
-    @classmethod
-    def of(cls, traffic: Traffic, place: Place | None = None) -> Offered:
+    @staticmethod
+    def of(traffic: Traffic, place: Place | None = None) -> Offered:
         """What traffic offers.
 
         Args:
@@ -134,17 +126,8 @@ class Offered(msgspec.Struct, frozen=True):
         Raises:
             ScenarioError: The trace is wrong; names file and line.
         """
-        size = traffic.packet_bits
-        rate = traffic.rate_bit_s or 0.0
-        if traffic.model == "alternating":
-            light, half = traffic.light_rate_bit_s or 0.0, traffic.period_s or 1.0
-            return cls(np.array([0.0, half]), np.array([rate, light]) / size, 2 * half)
-        if traffic.model == "trace":
-            begins, rates = read_trace(traffic.file, place or Place("file"))
-            if begins[0] > 0:
-                begins, rates = np.insert(begins, 0, 0.0), np.insert(rates, 0, 0.0)
-            return cls(begins, rates / size)
-        return cls(np.zeros(1), np.array([rate / size]))
+        place = place or Place("traffic")
+        return traffic_model(traffic.model, place).offered(traffic, place)
 
     def packets(self, t: Float64Array) -> Float64Array:
         """Packets that were offered from 0 to each instant.
@@ -166,13 +149,62 @@ class Offered(msgspec.Struct, frozen=True):
         return found
 
 
-def is_random(model: TrafficModel) -> bool:
-    """Whether the packets of each slot are drawn.
+def _steady(traffic: Traffic, _: Place) -> Offered:
+    return Offered(np.zeros(1), np.array([(traffic.rate_bit_s or 0.0) / traffic.packet_bits]))
+
+
+def _alternating(traffic: Traffic, _: Place) -> Offered:
+    half, rates = traffic.period_s or 1.0, (traffic.rate_bit_s or 0.0, traffic.light_rate_bit_s or 0.0)
+    return Offered(np.array([0.0, half]), np.array(rates) / traffic.packet_bits, 2 * half)
+
+
+def _traced(traffic: Traffic, place: Place) -> Offered:
+    begins, rates = read_trace(traffic.file, place.at("file"))
+    if begins[0] > 0:
+        begins, rates = np.insert(begins, 0, 0.0), np.insert(rates, 0, 0.0)
+    return Offered(begins, rates / traffic.packet_bits)
+
+
+class TrafficModel(NamedTuple):
+    """A traffic model: what it offers over time, and how packets come of that."""
+
+    offered: Callable[[Traffic, Place], Offered]
+    """Called with an entry of the settings and its place, which errors name."""
+    needs: tuple[str, ...] = ()
+    """Keys of `Traffic` that it reads, of the rates, ``period_s`` and ``file``; the others are refused."""
+    random: bool = False
+    """Whether the packets of each slot are drawn from a Poisson distribution of the mean that is offered."""
+
+
+MODELS: Mapping[str, TrafficModel] = {
+    "full": TrafficModel(_steady),
+    "constant": TrafficModel(_steady, ("rate_bit_s",)),
+    "poisson": TrafficModel(_steady, ("rate_bit_s",), random=True),
+    "alternating": TrafficModel(_alternating, ("rate_bit_s", "light_rate_bit_s", "period_s"), random=True),
+    "trace": TrafficModel(_traced, ("file",)),
+}
+"""Traffic models by name; those of plug-ins are registered in `TRAFFIC_PLUGINS`."""
+TRAFFIC_PLUGINS = "caviar.traffic"
+"""Group of entry points, each a `TrafficModel`."""
+
+
+def traffic_model(name: str, place: Place) -> TrafficModel:
+    """The traffic model of a name.
 
     Args:
-        model: Of the traffic.
+        name: Of the model, built in or of a plug-in.
+        place: Of the entry that names it, for errors.
+
+    Raises:
+        ScenarioError: There is none of this name; names the key, and the models there are.
+        DeclarationError: The plug-in cannot be loaded, or is no `TrafficModel`.
     """
-    return model in ("poisson", "alternating")
+    if name in MODELS:
+        return MODELS[name]
+    added = plugins(TRAFFIC_PLUGINS)
+    if name not in added:
+        raise place.at("model").error(f"{name!r} is no traffic model; {suggestion(name, [*MODELS, *added])}")
+    return load_plugin(added[name], TrafficModel)
 
 
 def arrivals(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import DeclarationError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.observations.parts import (
     FAR,
@@ -27,6 +27,7 @@ from caviar_protocol.observations.parts import (
     require_packets,
 )
 from caviar_protocol.observations.users import KnownDevices, KnownScenario, Place, Users
+from caviar_protocol.plugins import load_plugin, plugins
 
 __all__ = [
     "FAR",
@@ -44,6 +45,7 @@ __all__ = [
     "inputs_of",
     "is_feedback",
     "part",
+    "part_class",
     "require_packets",
 ]
 
@@ -58,8 +60,8 @@ def is_feedback(name: str) -> bool:
         >>> is_feedback("last_beam"), is_feedback("position")
         (True, False)
     """
-    cls = PARTS.get(name.partition(":")[0])
-    return isinstance(cls, type) and issubclass(cls, OfLink)
+    cls = part_class(name)
+    return cls is not None and issubclass(cls, OfLink)
 
 
 def inputs_of(names: Iterable[str]) -> tuple[Input, ...]:
@@ -72,8 +74,31 @@ def inputs_of(names: Iterable[str]) -> tuple[Input, ...]:
         >>> [given.topic for given in inputs_of(("position", "lidar_grid:top"))]
         ['lidar']
     """
-    found = (PARTS[kind] for name in names if (kind := name.partition(":")[0]) in PARTS)
-    return tuple({i.topic: i for cls in found for i in getattr(cls, "inputs", ())}.values())
+    found = (cls for name in names if (cls := part_class(name)) is not None)
+    return tuple({i.topic: i for cls in found for i in cls.inputs}.values())
+
+
+PART_PLUGINS = "caviar.observations"
+"""Group of entry points, each a subclass of `Part`, named as the part is."""
+
+
+def part_class(name: str) -> type[Part] | None:
+    """The class of a part, built in or of a plug-in; None where there is none.
+
+    Args:
+        name: Of the part; what follows a colon is not looked at.
+
+    Raises:
+        DeclarationError: The plug-in cannot be loaded, or is no `Part`.
+    """
+    kind = name.partition(":")[0]
+    if kind in PARTS or kind not in plugins(PART_PLUGINS):
+        return PARTS.get(kind)
+    point = plugins(PART_PLUGINS)[kind]
+    cls = load_plugin(point, type)
+    if not issubclass(cls, Part):
+        raise DeclarationError(f"{kind} of {PART_PLUGINS} is {point.value}, which is no subclass of Part")
+    return cls
 
 
 def part(scenario: KnownScenario, users: Users, name: str) -> Part:
@@ -88,16 +113,17 @@ def part(scenario: KnownScenario, users: Users, name: str) -> Part:
         ScenarioError: The part does not exist, or its sensor does not; the text has those there are.
     """
     kind, _, sensor = name.partition(":")
-    cls: Any = PARTS.get(kind)
+    cls = part_class(kind)
     if cls is None:
-        near = get_close_matches(kind, PARTS, n=1)
+        known = [*PARTS, *plugins(PART_PLUGINS)]
+        near = get_close_matches(kind, known, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ScenarioError(f"no observation is called {name!r}; {hint}there are: {', '.join(PARTS)}")
+        raise ScenarioError(f"no observation is called {name!r}; {hint}there are: {', '.join(known)}")
     device = cls.needs_sensor
     if not device:
         if sensor:
             raise ScenarioError(f"{name!r}: {kind!r} is not of a sensor; write {kind!r}")
-        return cls(scenario, users, "")  # type: ignore[no-any-return]  # a subclass of Part
+        return cls(scenario, users, "")
     names = [d.name for d in scenario.devices if d.kind == device]
     if not sensor and len(names) == 1:
         sensor = names[0]
@@ -107,7 +133,7 @@ def part(scenario: KnownScenario, users: Users, name: str) -> Part:
             or f"none, as the scenario has no device of kind {device!r}"
         )
         raise ScenarioError(f"observation {name!r} names no {device} of the scenario; there are: {there}")
-    return cls(scenario, users, sensor)  # type: ignore[no-any-return]  # a subclass of Part
+    return cls(scenario, users, sensor)
 
 
 class Observer:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import reduce
 from operator import add
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
@@ -454,7 +454,7 @@ def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:
     raise ScenarioError("observation 'lidar_grid' needs [services.<lidar>.settings.grid] in the scenario")
 
 
-PARTS: Mapping[str, Callable[[KnownScenario, Users, str], Part]] = {
+PARTS: Mapping[str, type[Part]] = {
     "aoa": AngleOfArrival,
     "aod": AngleOfDeparture,
     "departure": Departure,

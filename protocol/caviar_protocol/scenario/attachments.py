@@ -9,10 +9,14 @@ imports nothing heavy.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import FunctionType
 
 from caviar_protocol.errors import DeclarationError, ScenarioError, suggestion
-from caviar_protocol.plugins import ATTACHMENTS, load_plugin, origin, plugins
+from caviar_protocol.plugins import load_plugin, origin, plugins
 from caviar_protocol.scenario.schema import Scenario
+
+ATTACHMENTS = "caviar.attachments"
+"""Group of entry points."""
 
 
 def attached(scenario: Scenario, attachments: Sequence[str]) -> Scenario:
@@ -41,7 +45,7 @@ def attached(scenario: Scenario, attachments: Sequence[str]) -> Scenario:
         if name not in known:
             hint = suggestion(name, sorted(known)) if known else "nothing that is installed can be attached"
             raise ScenarioError(f"--attach {text}: {name!r} does not exist; {hint}")
-        scenario = load_plugin(known[name])(scenario, value)
+        scenario = load_plugin(known[name], FunctionType)(scenario, value)
         if not isinstance(scenario, Scenario):
             raise DeclarationError(f"--attach {text}: {origin(known[name])} returns no scenario")
     return scenario
@@ -50,7 +54,7 @@ def attached(scenario: Scenario, attachments: Sequence[str]) -> Scenario:
 def summary(name: str) -> str:
     """First line of what an attachment says of itself; of one that cannot be loaded, why."""
     try:
-        text: str = load_plugin(plugins(ATTACHMENTS)[name]).__doc__ or ""
+        text = load_plugin(plugins(ATTACHMENTS)[name], FunctionType).__doc__ or ""
     except DeclarationError as error:
         return str(error)
     return text.strip().partition("\n")[0].rstrip(".")

@@ -10,7 +10,8 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.buffers import NEVER, UNBOUNDED, PacketBuffers
-from caviar_protocol.cell.traffic import Offered, Traffic, arrivals, is_random
+from caviar_protocol.cell.traffic import Offered, Traffic, arrivals, traffic_model
+from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
 from caviar_services.checkpoint import Packed
 from caviar_services.link.cell_settings import CellSettings
@@ -145,7 +146,7 @@ class Terminals:
             if traffic.model == "full":
                 continue
             random = None
-            if is_random(traffic.model):
+            if traffic_model(traffic.model, Place("traffic")).random:
                 stream = f"{frame.service}/traffic/{rx}/{carrier}"
                 random = generator(frame.seed, frame.seed_episode, stream, block)
             offered = self._offered[id(traffic)]

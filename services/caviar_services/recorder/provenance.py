@@ -20,27 +20,20 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 from caviar_protocol.host import DISTRIBUTION
-from caviar_protocol.plugins import PLANTS, load_plugin, plugins
+from caviar_protocol.plugins import plugins
 from caviar_protocol.scenario.schema import REMOTE
 from caviar_services.registry import BUILT_IN, load, registered
+from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
 ALWAYS = (DISTRIBUTION, "msgspec", "numpy")
 """Distributions that every run computes with."""
 OWN = frozenset(
-    (
-        "caviar",
-        "caviar_bridges",
-        "caviar_broker",
-        "caviar_clients",
-        "caviar_protocol",
-        "caviar_scenarios",
-        "caviar_services",
-    )
+    f"caviar{name}"
+    for name in ("", "_bridges", "_broker", "_clients", "_protocol", "_scenarios", "_services")
 )
 """Packages of this distribution."""
 _BY_SETTING: Mapping[tuple[str, str], tuple[str, ...]] = {
@@ -87,7 +80,8 @@ def used_versions(scenario: Mapping[str, Any]) -> dict[str, str]:
             names.update(_BY_SETTING.get((key, value), ()))
             if key == "scenery" and value.startswith(_BUNDLED):
                 names.add("sionna-rt")
-        names.update(*(load_plugin(point).packages for point in _plants(settings)))
+            if key == "engine" and value in plugins(PLANTS):
+                names.update(plant_named(value).packages)
     return _versions([*names, *_imported_distributions(_own_modules(scenario))])
 
 
@@ -140,12 +134,6 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from _texts(item, key)
 
 
-def _plants(settings: Mapping[str, Any]) -> Iterator[EntryPoint]:
-    """Plug-ins that move the quadrotors of a world."""
-    engines = {value for key, value in _texts(settings) if key == "engine"} - {"caviar"}
-    return (plugins(PLANTS)[name] for name in engines if name in plugins(PLANTS))
-
-
 def _versions(names: Iterable[str]) -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in names:
@@ -163,7 +151,8 @@ def _own_modules(scenario: Mapping[str, Any]) -> list[str]:
     """Modules of classes that are none of this distribution, in order."""
     found = set[str]()
     for role, use, settings in _services(scenario):
-        found.update(point.value.partition(":")[0] for point in _plants(settings))
+        engines = {value for key, value in _texts(settings) if key == "engine"}
+        found.update(plugins(PLANTS)[name].module for name in engines if name in plugins(PLANTS))
         if f"{role}:{use}" not in BUILT_IN:
             target = use if ":" in use else registered().get(f"{role}:{use}", "")
             found.add(target.partition(":")[0])

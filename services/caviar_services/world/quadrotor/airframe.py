@@ -22,9 +22,11 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import DeclarationError, suggestion
-from caviar_protocol.plugins import PLANTS, load_plugin, origin, plugins
+from caviar_protocol.plugins import load_plugin, origin, plugins
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 
+PLANTS = "caviar.plants"
+"""Group of entry points, each a subclass of `Plant`, named as ``engine`` has it."""
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s²]."""
 
@@ -251,8 +253,8 @@ def plant_named(engine: str) -> type[Plant]:
     point = plugins(PLANTS).get(engine)
     if point is None:
         raise DeclarationError(f"is {engine!r}; {suggestion(engine, ['caviar', *plugins(PLANTS)])}")
-    found = load_plugin(point)
-    if not (isinstance(found, type) and issubclass(found, Plant)):
+    found = load_plugin(point, type)
+    if not issubclass(found, Plant):
         raise DeclarationError(f"{engine!r} is {origin(point)}, which is not a Plant")
     return found
 
