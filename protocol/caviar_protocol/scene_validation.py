@@ -6,6 +6,7 @@ string. `caviar_protocol.validation` applies them to every scene that a service 
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,7 +21,7 @@ from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device, turned_back
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.topics.scene import Device, Scene
+from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
 
 UNIT_TOLERANCE = 1e-3
 """By how much the norm of a unit quaternion may differ from 1: room for single precision, and no more than
@@ -292,6 +293,11 @@ def _wrong_device(device: Device, objects: set[str]) -> str:
         numbers = value if isinstance(value, tuple) else (value,)
         if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
             return f"{what} {field} {_numbers(numbers)} is not finite"
+    if isinstance(device, AntennaDevice):
+        panels = [(*p.position_m, p.yaw_deg, p.pitch_deg, p.roll_deg) for p in device.array.panels]
+        numbers = (device.array.vertical_spacing, device.array.horizontal_spacing, *itertools.chain(*panels))
+        if not all(map(math.isfinite, numbers)):
+            return f"{what} spacings and panels of its array {_numbers(numbers)} are not finite"
     norm = math.hypot(*device.orientation)
     if not abs(norm - 1) <= UNIT_TOLERANCE:
         return f"{what} orientation {_numbers(device.orientation)} {_not_unit(norm)}"

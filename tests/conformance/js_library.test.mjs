@@ -136,6 +136,7 @@ test("what no consumer would accept is named", () => {
     [{ position: [2e9, 0, 0] }, /position is \[2000000000, 0, 0\]; stay within/],
     [{ velocity: undefined }, /"car": velocity is missing/],
     [{ velocity: [3e8, 0, 0] }, /light/],
+    [{ angularVelocity: [0, 0, 1] }, /"car" has a field "angularVelocity"; its fields are name, .*angular_velocity/],
     [
       { orientation: [1, 0, 0, 1] },
       /orientation is \[1, 0, 0, 1\] of norm 1\.41.*unit quaternion \(w, x, y, z\)/,

@@ -11,6 +11,7 @@ from pathlib import Path
 import engine_worlds as worlds
 import pytest
 from scenarios_support import ROOT
+from vector_files import load
 
 from caviar_protocol.recording import Recording
 
@@ -67,6 +68,13 @@ def test_the_transform_of_a_node_is_a_pose(ask: worlds.Ask) -> None:
     position, orientation = ([worlds.number(word) for word in field.split()] for field in answer.split("\t"))
     assert position == pytest.approx([-3, -1, 2])
     assert orientation == pytest.approx([math.cos(half), 0, 0, math.sin(half)], abs=1e-6)
+
+
+def test_a_field_that_objects_do_not_have_is_named(ask: worlds.Ask) -> None:
+    welcome = f"welcome\t{load('welcome_mounts').header.hex()}"
+    fields = "car.1|car|0 0 1|1 0 0 0|0 0 0|4 2 2|angularVelocity"
+    _, answer = ask("mounts", [welcome, fields])
+    assert answer.startswith("object 'car.1': has a field 'angularVelocity'; its fields are name, class, ")
 
 
 def test_the_reference_world_fails_no_case_of_the_kit(godot: str, tmp_path: Path) -> None:

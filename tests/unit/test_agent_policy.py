@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from caviar_clients.cli.main import app
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.learning.evaluate import evaluate, mean_of, student_95
-from caviar_clients.learning.export import card_of, export_module
+from caviar_clients.learning.export import TRIALS, card_of, export_module
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.observations import Moment, Observer, Users
@@ -263,9 +263,17 @@ array = { columns = 8 }
 def test_an_export_that_chooses_otherwise_is_refused(tmp_path: Path) -> None:
     env = BeamSelectionEnv("geometric", observe=("aod",))
     space, file = env.observation_space, tmp_path / "p.onnx"
-    with pytest.raises(SetupError, match="the exported policy chooses"):
-        export_module(Constant(0), space, file, card_of(env), lambda _: np.array([1]))
-    assert not file.exists()
+
+    def export(otherwise: int) -> None:
+        choices = iter([1] * otherwise + [0] * TRIALS)
+        export_module(Constant(0), space, file, card_of(env), lambda _: np.array([next(choices)]))
+
+    for often in (2, TRIALS):
+        with pytest.raises(SetupError, match="the exported policy chooses"):
+            export(otherwise=often)
+        assert not file.exists()
+    export(otherwise=1)  # a tie within rounding
+    assert file.exists()
 
 
 def test_evaluation_beside_the_baselines(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from test_envs_uav_path_v1 import HIGH, LOW, STEP_WAY, flight, towards
+from test_envs_uav_path import HIGH, LOW, STEP_WAY, flight, towards
 
 from caviar_clients.envs.deliveries import Box, Deliveries, rotary_wing_power
-from caviar_clients.envs.uav_path_v1 import UavPathV1Env
+from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_protocol.errors import ScenarioError
 
 REACH = 5.0
@@ -69,7 +69,7 @@ def test_power_is_that_of_the_paper() -> None:
 # --- the environment -------------------------------------------------------------------------------------
 
 
-def delivered_by(env: UavPathV1Env, seed: int) -> tuple[list[dict[str, Any]], float]:
+def delivered_by(env: UavPathEnv, seed: int) -> tuple[list[dict[str, Any]], float]:
     """Information of each step of an episode that flies to the next address, and the sum of rewards."""
     observation, info = env.reset(seed=seed)
     infos, total, ended, truncated = [info], 0.0, False, False

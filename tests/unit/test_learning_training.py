@@ -13,7 +13,6 @@ import pytest
 from caviar_clients.learning import training
 from caviar_clients.learning.campaign import _differences, check_folder, reached, train_experiment
 from caviar_clients.learning.checkpoints import newest_checkpoint
-from caviar_clients.learning.events import EventFile, read_events
 from caviar_clients.learning.experiment import Experiment, parse_experiment
 from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import LinearRate, Progress, read_result, train_seed
@@ -169,6 +168,18 @@ def test_a_damaged_checkpoint_is_named_with_the_remedy(short: Path, tmp_path: Pa
         train_seed(wanted, 1, tmp_path)
 
 
+def curves_of(file: Path) -> dict[str, tuple[int, float]]:
+    """Last step and number of each tag of an event file: a length, 4 bytes, the event, and 4 bytes."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    data, found = file.read_bytes(), {}
+    while data:
+        end = 12 + int.from_bytes(data[:8], "little")
+        event, data = Event.FromString(data[12:end]), data[end + 4 :]
+        found |= {value.tag: (event.step, value.simple_value) for value in event.summary.value}
+    return found
+
+
 def test_the_policy_has_its_card_and_the_curves_those_of_the_library(short: Path, tmp_path: Path) -> None:
     wanted = experiment(short, members=3)
     result = train_seed(wanted, 2, tmp_path)
@@ -181,7 +192,7 @@ def test_the_policy_has_its_card_and_the_curves_those_of_the_library(short: Path
     assert (card.algorithm, card.seeds, card.steps) == ("Stable-Baselines3 DQN", (2,), result.steps)
     assert card.figures == {"mean_reward": pytest.approx(result.mean_reward)}
     (file,) = (mine / "curves").iterdir()
-    curves = {tag: (step, value) for tag, step, value in read_events(file)}
+    curves = curves_of(file)
     assert {"rollout/ep_rew_mean", "train/loss", "beams/abs_y", "beams/los_beam", "beams/optimum"} <= set(
         curves
     )
@@ -376,26 +387,6 @@ def test_an_algorithm_that_does_not_fit_the_actions_is_refused(tmp_path: Path) -
         ScenarioError, match=r"algorithm: DQN of Stable-Baselines3 does not take this: .*Discrete"
     ):
         train_seed(parse_experiment(text), 1, tmp_path)
-
-
-def test_events_are_records_with_checksums(tmp_path: Path) -> None:
-    """The checksum of a known text, so that reader and writer are not wrong alike (RFC 3720, B.4)."""
-    from caviar_clients.learning import events
-
-    crc = 0x8A9136AA  # of 32 bytes of zeros
-    masked = ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
-    assert events._checksum(bytes(32)) == masked.to_bytes(4, "little")
-    with EventFile(tmp_path) as written:
-        written.write(7, {"a/b": 0.5, "c": -2.0})
-        written.write(300, {"a/b": 1.5})
-    assert list(read_events(written.file)) == [("a/b", 7, 0.5), ("c", 7, -2.0), ("a/b", 300, 1.5)]
-    content = bytearray(written.file.read_bytes())
-    written.file.write_bytes(content[:-3])  # as a kill leaves it
-    assert len(list(read_events(written.file))) == 2
-    content[30] ^= 1
-    written.file.write_bytes(content)
-    with pytest.raises(ValueError, match="the checksum at byte 0 is wrong"):
-        list(read_events(written.file))
 
 
 def test_the_learning_rate_falls_over_the_whole_experiment() -> None:

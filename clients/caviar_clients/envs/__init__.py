@@ -5,10 +5,9 @@
 * ``caviar/RecordedBeams-v0``: a beam pair for one recorded user after the other, single and many together
   (`caviar_clients.learning.recorded`);
 * ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
-  reward of comparable parts (`uav_path_v1`);
+  reward of comparable parts (`uav_path`);
 * ``caviar/RadioStrike-v0``: a user and a beam in each slot, as in the ITU challenge of 2021
-  (`radio_strike`), also many of them computed together (`radio_strike.vector_env.RadioStrikeVectorEnv`);
-* ``caviar/UavPath-v0``: the same with a reward of |y| and metres (`uav_path`), replaced by version 1.
+  (`radio_strike`), also many of them computed together (`radio_strike.vector_env.RadioStrikeVectorEnv`).
 
 `pair.UavPairEnv` is one of PettingZoo: one agent flies, another one chooses the beams.
 
@@ -28,8 +27,7 @@ gymnasium.register(
     "caviar_clients.learning.recorded:RecordedBeamsEnv",
     vector_entry_point="caviar_clients.learning.recorded:RecordedBeamsVectorEnv",
 )
-gymnasium.register("caviar/UavPath-v0", "caviar_clients.envs.uav_path:UavPathEnv")
-gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path_v1:UavPathV1Env")
+gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register(
     "caviar/RadioStrike-v0",
     "caviar_clients.envs.radio_strike.env:RadioStrikeEnv",

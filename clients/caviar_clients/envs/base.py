@@ -307,11 +307,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     def _rewarded(self, before: Moment, now: Moment, link: Link) -> float:
         """Work out the reward of the decision between two moments; ``link`` is what it led to."""
         served = {(pair.tx.name, pair.rx.name) for _, pair in before.users}
-        return self.reward.mean(link, served) + self._further_reward(before, now)
-
-    def _further_reward(self, before: Moment, now: Moment) -> float:
-        """Work out what is rewarded beside the link."""
-        return 0.0
+        return self.reward.mean(link, served)
 
     def _terminated(self, moment: Moment) -> bool:
         """Tell whether the goal is reached, or cannot be any more."""

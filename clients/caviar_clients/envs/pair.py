@@ -15,8 +15,8 @@ import gymnasium
 
 from caviar_clients.envs.arguments import checked_path
 from caviar_clients.envs.base import BeamSelectionEnv, Observation, SessionEnv
-from caviar_clients.envs.uav_path import MOTION
-from caviar_clients.envs.uav_path_v1 import UavPathV1Env
+from caviar_clients.envs.flight import MOTION
+from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_clients.session.base import Session
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import open_session
@@ -42,7 +42,7 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
         scenario: Scenario file, or the name of a scenario that ships.
         pilot: Name of the agent that flies; None: the only one that owns a motion.
         beams: Name of the agent that chooses beams; None: the only other one.
-        flight: Arguments of `UavPathV1Env`, by name.
+        flight: Arguments of `UavPathEnv`, by name.
         selection: Arguments of `BeamSelectionEnv`, by name: ``observe``, ``reward``, …
         broker: ZeroMQ address of a broker where both agents are remote; None: the run is in this process.
         directory: Where a run in this process records; None: nowhere, which is faster.
@@ -83,7 +83,7 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
     ) -> None:
         pilot, beams = _roles(checked_scenario(checked_path("scenario", scenario)), pilot, beams)
         _check_options("selection", selection, BeamSelectionEnv)
-        _check_options("flight", flight, UavPathV1Env)
+        _check_options("flight", flight, UavPathEnv)
         at = {"broker": broker, "directory": directory, "render_mode": render_mode}
         self._selection = BeamSelectionEnv(scenario, agent=beams, **(selection or {}))
         self._pilot = _Pilot(scenario, self._selection, agent=pilot, **{**(flight or {}), **at})
@@ -107,14 +107,14 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
 
         Args:
             seed: The same seed leads to the same episode. None: the episode that follows on the one before.
-            options: Those of `UavPathV1Env`; others are warned of, since PettingZoo lets programs pass any.
+            options: Those of `UavPathEnv`; others are warned of, since PettingZoo lets programs pass any.
 
         Returns:
             Observation and information of each agent.
         """
-        known = {name: value for name, value in (options or {}).items() if name in UavPathV1Env.reset_options}
+        known = {name: value for name, value in (options or {}).items() if name in UavPathEnv.reset_options}
         if unknown := sorted(set(options or {}) - set(known)):
-            there = ", ".join(UavPathV1Env.reset_options)
+            there = ", ".join(UavPathEnv.reset_options)
             warnings.warn(f"no options of reset are called {unknown}; there are: {there}", stacklevel=2)
         of_pilot = self._pilot.reset(seed=seed, options=known)
         of_beams = self._selection.entered(self._pilot.frame)
@@ -169,7 +169,7 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
         self.agents = []
 
 
-class _Pilot(UavPathV1Env):
+class _Pilot(UavPathEnv):
     """The pilot's environment, whose session takes the other agent's place too."""
 
     def __init__(self, scenario: str | Path, selection: BeamSelectionEnv, **options: Any) -> None:

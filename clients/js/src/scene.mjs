@@ -7,6 +7,8 @@ import { byBytes } from "./schema.mjs";
 
 /** @import { Device, Scene, SceneObject, Vector3 } from "./types.d.ts" */
 
+/** Of an object; `centre` comes with what `offerMesh` returns. */
+const FIELDS = "name class position velocity dimensions orientation angular_velocity mesh centre".split(" ");
 const LEVEL = [1, 0, 0, 0];
 const STILL = [0, 0, 0];
 const LIGHT_M_S = 299_792_458;
@@ -32,6 +34,11 @@ export function sceneOf(objects, { prefixes, offered, devices: mounted }) {
     if (index && object.name === sorted[index - 1].name)
       throw new SceneError(`two objects are named ${quoted(object.name)}; names have to differ`);
     checkName(object, prefixes);
+    const unknown = Object.keys(object).find((field) => !FIELDS.includes(field));
+    if (unknown)
+      throw new SceneError(
+        `object ${quoted(object.name)} has a field ${quoted(unknown)}; its fields are ${FIELDS.join(", ")}`,
+      );
     checkNumbers(object);
     const { mesh = "" } = object;
     if (typeof mesh !== "string" || (mesh && !isMeshName(mesh) && !offered(mesh))) {

@@ -23,11 +23,11 @@ from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.multipath import changes
 from caviar_protocol.scenario.schema import PATTERNS
-from caviar_protocol.scene_validation import too_fast
+from caviar_protocol.scene_validation import numbers_are_right, wrong_device, wrong_number
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
-from caviar_protocol.topics.scene import Device, Panel
+from caviar_protocol.topics.scene import Device
 from caviar_services.channel.arrays.channel_matrices import Matrices, check_size, empty_parts
 from caviar_services.channel.assemble import Product, assemble, outage_counts, restricted
 from caviar_services.channel.batch import ChannelBatch
@@ -127,8 +127,8 @@ class ChannelModel(Service[S]):
                 )
         self.absorption_db_per_km = self._absorption()
         """Specific attenuation of the air on each carrier, Shape ``[C]``; None: no atmosphere."""
-        # The devices of the last scene, which mostly are those of the next, and the sum of their numbers.
-        self._summed: tuple[tuple[Device, ...], float] = ((), 0.0)
+        # The devices of the last scene, which mostly are those of the next.
+        self._devices: tuple[Device, ...] = ()
         self.with_h = False
         """Whether the matrices are in demand."""
         self.wideband: frozenset[str] = frozenset()
@@ -262,20 +262,15 @@ class ChannelModel(Service[S]):
             frame: With the scene among its inputs.
 
         Raises:
-            PayloadError: A number of the scene is not finite, something is faster than light, or a path
+            PayloadError: A number of the scene cannot be (`caviar_protocol.scene_validation`), or a path
                 brings more power than was sent.
         """
-        # Devices mostly are the object of the last frame: their numbers are summed once.
         scene = frame.scene()
-        if scene.devices is not self._summed[0]:
-            self._summed = scene.devices, _numbers_of(scene.devices)
-        # A sum is finite only where all of its terms are; where it overflows, the search below finds nothing.
-        if not math.isfinite(self._summed[1] + _numbers_in(scene)):
-            _refuse_not_finite(scene)
-        if not _surely_slow(scene):
-            wrong = too_fast(scene)
-            if wrong:
-                raise PayloadError(f"{wrong}; is it in km/h, or of another unit of time?")
+        wrong = "" if numbers_are_right(scene) else wrong_number(scene)
+        if not wrong and scene.devices is not self._devices:
+            wrong, self._devices = wrong_device(scene), scene.devices
+        if wrong:
+            raise PayloadError(wrong)
         transmitters, receivers = antennas(scene, "tx"), antennas(scene, "rx")
         # Of mounted devices only the scene says how many there are.
         if self.wideband:
@@ -316,63 +311,6 @@ class ChannelModel(Service[S]):
         )
         state = f"{air.temperature_k:g} K, {air.pressure_hpa:g} hPa, {air.water_vapour_g_m3:g} g/m³"
         return (f"atmosphere (ITU-R P.676) at {state}: {of_carriers}",)
-
-
-def _surely_slow(scene: Scene) -> bool:
-    """Whether squares of all objects together show that none has a point as fast as light."""
-    # |v| + |ω|·|d| / 2 bounds the speed of every point: half of it each is enough, and most scenes have far
-    # less.
-    if np.vdot(scene.velocity, scene.velocity) >= SPEED_OF_LIGHT**2 / 4:
-        return False
-    turning = scene.angular_velocity
-    if turning is None:
-        return True
-    corners = np.vdot(turning, turning) * np.vdot(scene.dimensions, scene.dimensions)
-    return bool(corners < SPEED_OF_LIGHT**2)
-
-
-def _numbers_in(scene: Scene) -> float:
-    """The sum of all numbers of objects; most scenes are small, and each frame has a new one."""
-    arrays = [scene.position, scene.orientation, scene.velocity, scene.dimensions]
-    if scene.angular_velocity is not None:
-        arrays.append(scene.angular_velocity)
-    return sum([sum(values.ravel().tolist()) for values in arrays])
-
-
-def _numbers_of(devices: tuple[Device, ...]) -> float:
-    """The sum of all numbers of devices."""
-    # Python sums: of so few numbers each call of NumPy would cost more.
-    numbers = [number for device in devices for number in (*device.position, *device.orientation)]
-    for device in devices:
-        if isinstance(device, AntennaDevice):
-            numbers += (device.array.vertical_spacing, device.array.horizontal_spacing)
-            numbers += [number for panel in device.array.panels for number in _numbers_of_panel(panel)]
-    return sum(numbers)
-
-
-def _numbers_of_panel(panel: Panel) -> tuple[float, ...]:
-    return (*panel.position_m, panel.yaw_deg, panel.pitch_deg, panel.roll_deg)
-
-
-def _refuse_not_finite(scene: Scene) -> None:
-    """Raise `PayloadError` naming a NaN or an infinity of a scene: no channel follows from one."""
-    for name in ("position", "orientation", "velocity", "dimensions", "angular_velocity"):
-        values = getattr(scene, name)
-        if values is None:
-            continue
-        for i in np.flatnonzero(~np.isfinite(values).all(-1))[:1].tolist():
-            raise PayloadError(
-                f"object {scene.names[i]!r} has the {name} {values[i].tolist()}; give finite numbers"
-            )
-    for device in scene.devices:
-        parts = {"position": device.position, "orientation": device.orientation}
-        if isinstance(device, AntennaDevice):
-            parts["element spacing"] = (device.array.vertical_spacing, device.array.horizontal_spacing)
-            for number, panel in enumerate(device.array.panels):
-                parts[f"panel {number}"] = _numbers_of_panel(panel)
-        for name, part in parts.items():
-            if not all(map(math.isfinite, part)):
-                raise PayloadError(f"device {device.name!r} has the {name} {part}; give finite numbers")
 
 
 def _refuse_amplified(channel: Channel) -> None:

@@ -110,6 +110,8 @@ func ask_mounts(fields):
 		var item = Scene.object(words[0], words[1], numbers(words[2]), numbers(words[5]))
 		item["orientation"] = numbers(words[3])
 		item["velocity"] = numbers(words[4])
+		if words.size() > 6:
+			item[words[6]] = words[2]
 		objects.append(item)
 	var product = builder.build(objects)
 	if product == null:

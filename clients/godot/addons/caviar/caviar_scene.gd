@@ -6,6 +6,10 @@ const Axes = preload("caviar_axes.gd")
 const Codec = preload("caviar_codec.gd")
 const RunTimeMeshes = preload("caviar_run_time_meshes.gd")
 const LIGHT_M_S = 299792458.0
+# Of an object; `centre` comes with what `offer_mesh` returns.
+const FIELDS = [
+	"name", "class", "position", "dimensions", "mesh", "orientation", "velocity", "angular_velocity", "centre"
+]
 
 var prefixes = []  # that names have to begin with; empty: any will do
 var scenery = null  # what was offered; null: meshes are not looked at
@@ -89,6 +93,9 @@ func _check(item):
 		begins = begins or name.begins_with(prefix)
 	if not begins:
 		_wrong(who + "no prefix of READY begins its name (%s); add one in prepare" % str(prefixes))
+	for field in item:
+		if not field in FIELDS:
+			_wrong(who + "has a field '%s'; its fields are %s" % [field, PoolStringArray(FIELDS).join(", ")])
 	_check_numbers(who + "position", item["position"], 3, 1e9)
 	_check_numbers(who + "orientation", item["orientation"], 4, 2.0)
 	_check_numbers(who + "velocity", item["velocity"], 3, LIGHT_M_S)

@@ -383,13 +383,13 @@ def _thing(field: str, x: float) -> Scene:
 
 
 SCENES: dict[str, tuple[str, Change]] = {
-    "position of a receiver": ("device 'r' has the position", _antennas),
-    "position of a transmitter": ("device 't' has the position", _transmitter),
-    "spacing of an array": ("device 't' has the element spacing", _spacing),
-    "position of an object": ("object 'car' has the position", partial(_thing, "position")),
-    "velocity of an object": ("object 'car' has the velocity", partial(_thing, "velocity")),
-    "dimensions of an object": ("object 'car' has the dimensions", partial(_thing, "size")),
-    "orientation of an object": ("object 'car' has the orientation", partial(_thing, "quaternion")),
+    "position of a receiver": ("device 'r': position", _antennas),
+    "position of a transmitter": ("device 't': position", _transmitter),
+    "spacing of an array": ("device 't': spacings and panels", _spacing),
+    "position of an object": ("object 'car': position", partial(_thing, "position")),
+    "velocity of an object": ("object 'car': velocity", partial(_thing, "velocity")),
+    "dimensions of an object": ("object 'car': dimensions", partial(_thing, "size")),
+    "orientation of an object": ("object 'car': orientation", partial(_thing, "quaternion")),
 }
 
 

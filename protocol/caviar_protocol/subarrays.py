@@ -1,3 +1,0 @@
-"""Earlier name of `caviar_protocol.space.beams`."""
-
-from caviar_protocol.space.beams import *  # noqa: F403
