@@ -166,7 +166,11 @@ def _clients(
         environment[KEY_VARIABLE] = str(keys / f"{_CLIENTS}.key")
         environment[BROKER_KEY_VARIABLE] = str(keys / f"{BROKER}.pub")
     started: Sequence[subprocess.Popen[bytes]] = [
-        subprocess.Popen([*command, str(number), str(payload), endpoint], env=environment)  # noqa: S603  # our own module
+        subprocess.Popen(  # noqa: S603  # our own module
+            [*command, str(number), str(payload), endpoint],
+            env=environment,
+            start_new_session=True,  # Ctrl-C is this process's, which ends those
+        )
         for number in range(services)
     ]
     try:

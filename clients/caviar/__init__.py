@@ -88,6 +88,7 @@ def run(
         ScenarioError: A key or value of the scenario is wrong.
         SetupError: An extra that the scenario needs is not installed; the text has the command.
         RunError: The run did not come to its end; the text has the cause and the directory.
+        TypeError: ``settings`` is no list of texts.
 
     Example:
         >>> import caviar
@@ -101,6 +102,8 @@ def run(
     from caviar_clients.cli.shared import keys_set
     from caviar_protocol.errors import RunError
 
+    if not (isinstance(settings, list | tuple) and all(isinstance(key, str) for key in settings)):
+        raise TypeError(f"settings is {settings!r:.80}: write a list of KEY=VALUE texts, as ['run.seed=3']")
     console = Console(quiet=not progress)
     topics = record if record is None or isinstance(record, str) else ",".join(record)
     keys = keys_set(settings, topics, episodes)

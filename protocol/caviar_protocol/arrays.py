@@ -130,6 +130,10 @@ def described(doc: str, **constraints: Any) -> Any:
     return msgspec.Meta(description=doc, extra={"unit": ""}, **constraints)
 
 
+MAX_COORDINATE_M = 1e9
+"""[m] from the origin, along an axis. Squares of it are still far from the limits of single precision."""
+Coordinate = Annotated[float, quantity("m", "along an axis", ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+Position = Annotated[tuple[Coordinate, Coordinate, Coordinate], quantity("m", "x (east), y (north), z (up)")]
 Vector3 = Annotated[tuple[float, float, float], quantity("m", "x (east), y (north), z (up)")]
 Quaternion = Annotated[
     tuple[float, float, float, float],

@@ -7,10 +7,15 @@ import ctypes
 import importlib.util
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -150,6 +155,26 @@ def safe_path() -> Iterator[None]:
         yield
     finally:
         os.environ["PYTHONSAFEPATH"] = before  # empty is not set
+
+
+def start_process(process: BaseProcess) -> None:
+    """Start a process of `multiprocessing` that leaves Ctrl-C to this one, also while it imports, and that
+    searches no module in the current folder (`safe_path`).
+
+    Args:
+        process: Made by the context ``spawn``.
+    """
+    from multiprocessing import resource_tracker
+
+    # Python 3.11 starts its tracker with the first process, and unblocks SIGINT after that.
+    resource_tracker.ensure_running()
+    # A process inherits what the thread that starts it blocks; a handler of its own would come too late.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with safe_path():
+            process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 DISTRIBUTION = "caviar-sim"

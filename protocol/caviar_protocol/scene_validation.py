@@ -16,7 +16,7 @@ from typing import cast
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.arrays import MAX_COORDINATE_M, BoolArray, Float64Array
 from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device, turned_back
@@ -26,8 +26,6 @@ from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
 UNIT_TOLERANCE = 1e-3
 """By how much the norm of a unit quaternion may differ from 1: room for single precision, and no more than
 0.02 dB in a gain."""
-MAX_COORDINATE_M = 1e9
-"""[m] from the origin, along an axis."""
 MAX_SPEED = SPEED_OF_LIGHT
 """[m/s]; every object, and every corner of one that turns, is slower."""
 MAX_DIMENSION_M = 1e5
@@ -298,6 +296,8 @@ def _wrong_device(device: Device, objects: set[str]) -> str:
         numbers = (device.array.vertical_spacing, device.array.horizontal_spacing, *itertools.chain(*panels))
         if not all(map(math.isfinite, numbers)):
             return f"{what} spacings and panels of its array {_numbers(numbers)} are not finite"
+    if max(map(abs, device.position)) > MAX_COORDINATE_M:
+        return f"{what} position {_numbers(device.position)} m: at most {MAX_COORDINATE_M:g} m are possible"
     norm = math.hypot(*device.orientation)
     if not abs(norm - 1) <= UNIT_TOLERANCE:
         return f"{what} orientation {_numbers(device.orientation)} {_not_unit(norm)}"

@@ -1,3 +1,9 @@
+import signal
+
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # Ctrl-C while the libraries load ends the process without a traceback; then `serve` handles it.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 from caviar_services.runner import main
 
 if __name__ == "__main__":

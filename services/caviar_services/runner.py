@@ -117,7 +117,7 @@ class Runner:
         """Serve until SHUTDOWN.
 
         Returns:
-            The exit status: 0 after SHUTDOWN, 143 after SIGTERM.
+            The exit status: 0 after SHUTDOWN, 1 where its reason blames this service, 143 after SIGTERM.
 
         Raises:
             RunError: There is no broker, it refuses this service, or it is gone for longer than it waits for
@@ -136,7 +136,8 @@ class Runner:
                 raise RunError(f"the run ended before {self.name!r} was in it: {order}") from order
             self.ended = str(order)
             self._session.leave(self.ended)
-            return 0
+            # A reason that blames a service begins with its role and name.
+            return int(self.ended.startswith(f"{self.cls.role} {self.name!r} "))
         except Terminated as order:
             self._session.leave(str(order) or "SIGTERM")
             return TERMINATED

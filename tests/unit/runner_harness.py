@@ -124,9 +124,9 @@ class Broker:
         grant = m.Grant(**(IDS | ids), episode=episode, frame=frame, t_ns=frame, inputs=(entry,))
         self.send(grant, header, body)
 
-    def shutdown(self) -> None:
-        self.send(m.Shutdown(reason="enough"))
-        assert self.expect(m.Bye).reason == "enough"
+    def shutdown(self, reason: str = "enough") -> None:
+        self.send(m.Shutdown(reason=reason))
+        assert self.expect(m.Bye).reason == reason
 
 
 @pytest.fixture(name="broker")

@@ -66,6 +66,9 @@ def test_a_run_takes_episodes_settings_and_topics_as_the_command_does(tmp_path: 
     assert scenario["services"]["channel"]["budget_ms"] == 77
     with pytest.raises(ScenarioError, match="--set channel: write it as in"):
         caviar.run("smoke", settings=["channel"], out=tmp_path)
+    for wrong in ("run.seed=3", {"run.seed": 3}, 3, [3]):
+        with pytest.raises(TypeError, match=r"settings is .*: write a list of KEY=VALUE texts"):
+            caviar.run("smoke", settings=wrong, out=tmp_path)  # type: ignore[arg-type]
 
 
 def test_a_scenario_is_loaded_by_name_and_by_file(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def recorded(tmp_path_factory):
 def test_every_command_answers_alike_where_a_file_is_in_the_way_of_a_folder(
     monkeypatch, capsys, tmp_path, recorded, arguments
 ):
-    """And before its work: nothing but the message is printed. Missing folders are made by the same code."""
+    """And before its work: nothing but the message is printed."""
     file = tmp_path / "file"
     file.touch()
     words = [str(word).replace("FILE", str(file)).replace("RUN", str(recorded)) for word in arguments]
@@ -119,6 +119,20 @@ def test_every_command_answers_alike_where_a_file_is_in_the_way_of_a_folder(
     err = capsys.readouterr().err
     assert f"{file} is a file, not a folder; choose another folder" in err
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("run", SMOKE, "--embedded"), ("measure", "budget", "RUN"), ("measure", "tradeoff", SMOKE)],
+    ids=lambda arguments: arguments[1],
+)
+def test_a_folder_that_lacks_is_named_where_a_file_of_figures_shall_be(
+    monkeypatch, capsys, tmp_path, recorded, arguments
+):
+    words = [recorded if word == "RUN" else word for word in arguments]
+    err = complaint(monkeypatch, capsys, *words, "--json", tmp_path / "nope" / "x.json")
+    assert f"there is no folder {tmp_path}/nope; make it" in err
+    assert not (tmp_path / "nope").exists()
 
 
 @pytest.mark.parametrize("name", ["run", "broker"])

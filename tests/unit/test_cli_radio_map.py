@@ -28,7 +28,7 @@ from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.radio_map.mapping import transmitters_of
-from caviar_services.mesh.shapes import box, ply
+from caviar_services.mesh.shapes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow
 
@@ -244,17 +244,23 @@ def test_what_is_unusual_about_the_cells_is_said(tmp_path: Path) -> None:
     assert beside == ("warning: the area is beside the scenery, which reaches x 0 to 100 m, y 0 to 50 m")
 
 
-def test_a_plane_is_above_the_top_of_a_slab(tmp_path: Path) -> None:
-    slab = box((0.0, 100.0), (0.0, 50.0), (-2.0, 0.0))
-    (tmp_path / "slab.ply").write_bytes(ply(slab))
-    (tmp_path / "a.xml").write_text(
-        '<scene version="2.1.0"><shape type="ply" id="mesh-slab">'
-        '<string name="filename" value="slab.ply"/></shape></scene>'
+def test_a_plane_is_above_the_top_of_a_slab_and_the_lowest_sheet(tmp_path: Path) -> None:
+    """A slab with its top at 3 m; then a sheet at 2 m beside it, which faces down."""
+    slab = box((0.0, 100.0), (0.0, 50.0), (2.5, 3.0))
+    sheet = Mesh(
+        np.array([[100.0, 0.0, 2.0], [100.0, 50.0, 2.0], [200.0, 0.0, 2.0]]), np.array([[0, 1, 2]], np.int32)
     )
-    channel: Any = SimpleNamespace(scene=_Scenery())
-    surface, about, notes = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(height=1.5))
-    assert (about, notes) == ("plane at z = 1.5 m", ())
-    assert np.unique(surface.z).tolist() == [1.5]
+    for meshes, lowest in (((slab,), 3.0), ((slab, sheet), 2.0)):
+        for number, mesh in enumerate(meshes):
+            (tmp_path / f"{number}.ply").write_bytes(ply(mesh))
+        shapes = (
+            f'<shape type="ply" id="mesh-{number}"><string name="filename" value="{number}.ply"/></shape>'
+            for number in range(len(meshes))
+        )
+        (tmp_path / "a.xml").write_text(f'<scene version="2.1.0">{"".join(shapes)}</scene>')
+        channel: Any = SimpleNamespace(scene=_Scenery())
+        surface, _, _ = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(height=1.5))
+        assert np.unique(surface.z).tolist() == [lowest + 1.5]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import csv
 import pickle
 import re
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +20,7 @@ from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.export import export_tables
+from caviar_clients.datasets.generate import _warn_of_equal_episodes
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset, check_level
 from caviar_clients.datasets.remote import is_address
@@ -503,6 +506,27 @@ def test_samples_are_read_by_position(folder: Path) -> None:
     assert samples[-1]["rx"] == users["rx"][-1]
     with pytest.raises(IndexError, match="user 36 of 36"):
         samples[36]
+    words = (
+        r"channel\.h has the shape \(4, 32\) for 'car/rx' and \(1, 32\) for 'uav/rx-uav': take torch_batches"
+    )
+    with pytest.raises(ValueError, match=words):
+        users.torch(["channel.h"])
+    assert users[users["rx"] == "car/rx"].torch(["channel.h"])[2]["channel.h"].shape == (4, 32)
+    assert len(users[:0].torch(["channel.h"])) == 0
+
+
+def test_a_scenario_that_draws_nothing_at_random_is_named(folder: Path, tmp_path: Path) -> None:
+    notes = list[str]()
+    other = shutil.copy(DatasetDirectory(folder).catalogue, tmp_path)
+    with closing(sqlite3.connect(other)) as changed:
+        changed.execute("UPDATE products SET sha256 = '' WHERE episode = 1 AND scene = 2 AND topic = 'link'")
+        changed.commit()
+    for file in (DatasetDirectory(folder).catalogue, Path(other)):
+        catalogue = Catalogue(file)
+        _warn_of_equal_episodes(catalogue, SimpleNamespace(note=notes.append))  # type: ignore[arg-type]
+        catalogue.close()
+    (note,) = notes
+    assert "episodes 0 and 1 are equal, nothing in the scenario draws at random" in note
 
 
 def test_the_reference_names_every_table_and_column(repository: Path) -> None:

@@ -164,6 +164,7 @@ WRONG_VALUES = [
     ("28e9", "-28e9", "carriers[0].frequency_hz", "write a number > 0 [Hz]"),
     ("[0, 0.5, 10]", "[0, 0.5]", "devices[0].position_m", "has 2 elements, write 3 [m]"),
     ("[0, 0.5, 10]", '[0, 0.5, "x"]', "devices[0].position_m[2]", "is 'x', write a number"),
+    ("[0, 0.5, 10]", "[1e200, 0, 0]", "devices[0].position_m[0]", "≥ -1000000000.0 and ≤ 1000000000.0 [m]"),
     ("[[carriers]]", "[carriers]", "carriers", "write an array: [[carriers]]"),
     ("[0, 0.5, 10]", "10", "devices[0].position_m", "write an array"),
     ("rows = 8", "rows = 2000", "devices[0].array.rows", "≥ 1 and ≤ 1024"),

@@ -220,6 +220,26 @@ def test_a_directory_that_cannot_be_made_is_named_with_errno(tmp_path):
         recorder(tmp_path / "file" / "run")
 
 
+_FULL = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from recording_builders import recorder
+folder = Path(sys.argv[1])
+mesh = folder / "mesh.ply"
+mesh.write_bytes(bytes(50_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
+recorder(folder / "run", assets={"wall.ply": mesh})
+"""
+
+
+def test_a_copy_of_scenery_that_fails_names_its_target(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", _FULL, str(tmp_path), str(HERE)], capture_output=True, text=True, timeout=60
+    )
+    assert f"cannot write {tmp_path}/run/assets/wall.ply: File too large (errno 27)" in done.stderr
+
+
 _LIMITED = """
 import resource, sys
 from pathlib import Path

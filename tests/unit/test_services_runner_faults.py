@@ -47,6 +47,16 @@ def test_a_failure_becomes_a_fault_with_phase_and_text(
         ends(process, 0)
 
 
+@pytest.mark.parametrize(("reason", "status"), [("sensors 'sick' makes no progress", 1), ("sick", 0)])
+def test_a_service_that_is_blamed_ends_with_status_1(broker: Broker, reason: str, status: int) -> None:
+    with service(broker.endpoint) as process:
+        broker.welcome()
+        broker.prepare()
+        broker.expect(m.Ready)
+        broker.shutdown(reason)
+        ends(process, status)
+
+
 def test_a_setting_that_does_not_exist_is_a_fault(broker: Broker) -> None:
     with service(broker.endpoint):
         broker.welcome(settings={"wrogn": "x"})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import pytest
 from runner_harness import Broker, ends, hears, played_broker, service
 
 from caviar_protocol import messages as m
+from caviar_protocol.host import start_process
 
 pytestmark = pytest.mark.slow
 
@@ -27,6 +30,15 @@ def terminated(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> 
     sys.stdout.write(f"ended {elapsed:.2f} s after the signal\n")
     assert elapsed < 2.0
     return said
+
+
+def test_ctrl_c_does_not_end_a_process_that_still_imports() -> None:
+    process = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(0.0,))
+    start_process(process)
+    os.kill(process.pid or 0, signal.SIGINT)
+    process.join(30)
+    assert process.exitcode == 0
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

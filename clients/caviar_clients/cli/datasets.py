@@ -210,11 +210,12 @@ def verify_command(
     from rich.progress import MofNCompleteColumn, TimeRemainingColumn
     from rich.table import Column, Table
 
-    from caviar_clients.cli.shared import write_json
+    from caviar_clients.cli.shared import require_writable, write_json
     from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.verification.verify import as_rows, verify
 
     check_level(dataset)
+    require_writable(json)  # before minutes of reading
     console = Console()
     with progress_bar(console, MofNCompleteColumn(), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task("episodes", total=None)

@@ -25,6 +25,7 @@ from caviar_clients.cli.shared import (
     progress_bar,
     require_installed,
     require_known,
+    require_parent,
     require_writable,
     write_json,
 )
@@ -226,6 +227,8 @@ def trade(
     if out is not None:
         require_folder("--out", out, "tables and pictures")
     _require_extras_of_ladder(source, options, with_pictures=out is not None)
+    if json_file is not None:
+        require_parent(json_file)
     files = [file for file in (json_file, out and out / "tradeoff.md") if file is not None]
     # Files that are still empty after an error are removed: an empty table looks like a result.
     with reserved(*files):

@@ -243,10 +243,8 @@ def _plane(
     area: Area, wanted: Wanted, shapes: Sequence[SceneryShape]
 ) -> tuple[MeasurementSurface, tuple[str, ...]]:
     """A level surface above the lowest ground, and notes about ground that is above it."""
-    triangles = ground((shape.file, shape.to_world) for shape in shapes)
-    # Where the ground is a slab, its top alone; a sheet may be wound either way.
-    upward = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] > 0.0
-    triangles = triangles[upward] if upward.any() else triangles
+    pieces = ground((shape.file, shape.to_world) for shape in shapes)
+    triangles = np.concatenate([np.zeros((0, 3, 3)), *map(_upward, pieces)])
     level = triangles[..., 2]
     surface = level_surface(area, wanted.cell, wanted.height + (float(level.min()) if level.size else 0.0))
     notes = []
@@ -261,10 +259,16 @@ def _plane(
     return surface, tuple(notes)
 
 
+def _upward(piece: Float64Array) -> Float64Array:
+    """Upward triangles of a piece of ground: of a slab its top; all of a sheet that faces down."""
+    upward = np.cross(piece[:, 1] - piece[:, 0], piece[:, 2] - piece[:, 0])[:, 2] > 0.0
+    return piece[upward] if upward.any() else piece
+
+
 def _ground(name: str, shapes: Sequence[SceneryShape]) -> Float64Array:
     """Triangles [m] that the cells are over: those of all ground, or of a piece of scenery."""
     if name == "ground":
-        return ground((shape.file, shape.to_world) for shape in shapes)
+        return np.concatenate([np.zeros((0, 3, 3)), *ground((s.file, s.to_world) for s in shapes)])
     named = [shape for shape in shapes if shape.name == name]
     if named:
         return _triangles(named)

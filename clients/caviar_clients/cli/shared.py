@@ -188,14 +188,25 @@ def keys_set(
 
 
 def require_writable(*files: Path | None) -> None:
-    """Make the folders to files, and try the files, before the work whose results they get.
+    """Try files of which an option has the name, before the work whose results they get.
 
     Raises:
-        RunError: One cannot be written; the text has file, cause and remedy.
+        RunError: One cannot be written, or its folder does not exist; the text has file, cause and remedy.
     """
     for file in files:
         if file is not None:
+            require_parent(file)
             write_file(file)
+
+
+def require_parent(file: Path) -> None:
+    """Refuse a file in a folder that does not exist: of a mistyped name, folders would be made silently.
+
+    Raises:
+        RunError: There is no such folder.
+    """
+    if not file.parent.exists():
+        raise RunError(f"cannot write {file}: there is no folder {file.parent}; make it, or correct the name")
 
 
 def new_run_directory(root: Path, name: str) -> Path:

@@ -165,12 +165,25 @@ def _generate(ledger: Ledger, observer: Observer, workers: int, scheduler: str) 
             _keep(result, catalogue, outcome)
             outcome.wall_s = time.monotonic() - began
             observer.ended(result)
+            if result.rows is not None and outcome.before + outcome.episodes == 2:
+                _warn_of_equal_episodes(catalogue, observer)
     if lost := MissingEpisodes([*catalogue.episodes(), *outcome.failed], plan.episodes):
         raise RunError(
             f"{counted(len(lost), 'episode')} ended without a result, episode {lost[0]} the first; the same "
             "command goes on"
         )
     return outcome
+
+
+def _warn_of_equal_episodes(catalogue: Catalogue, observer: Observer) -> None:
+    """Warn where the first two episodes hold the same products, as where nothing draws at random."""
+    of_episode = "SELECT scene, topic, source, sha256 FROM products WHERE episode = ?"
+    first, second = catalogue.episodes()[:2]
+    if not catalogue.query(f"{of_episode} EXCEPT {of_episode}", (first, second))[1]:
+        observer.note(
+            f"warning: episodes {first} and {second} are equal, nothing in the scenario draws at random: "
+            "generate one, or vary it (traffic of SUMO, paths that the channel draws, a random agent)"
+        )
 
 
 def _tasks(ledger: Ledger, left: Sequence[int], traffic: SharedTraffic) -> Iterator[EpisodeTask]:

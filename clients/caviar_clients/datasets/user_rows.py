@@ -248,11 +248,12 @@ class Users:
         Raises:
             RecordingError: There is no such name.
             SetupError: PyTorch is not installed; the text has the command.
-            ValueError: ``names`` is empty.
+            ValueError: ``names`` is empty, or devices give an array several shapes, which no batch holds.
             TypeError: It is a text.
         """
         self.check_names(names)
         _require_torch()
+        self._require_one_shape(names)
         from caviar_clients.datasets.torch_data import UserSamples
 
         return UserSamples(self, names)
@@ -312,6 +313,24 @@ class Users:
                 recording = self._dataset.episode(self._dataset.episodes[0])
                 if topic in recording.topics and (why := _lacks(recording, topic, field)):
                     raise RecordingError(why)
+
+    def _require_one_shape(self, names: Sequence[str]) -> None:
+        """Refuse arrays whose shape the devices say, and differs: a user of each device is looked at."""
+        fixed = [name for name in names if "." in name and name not in _OF_ANY_LENGTH]
+        devices = {
+            str(name).rpartition("/")[2]: at
+            for end in ("tx", "rx")
+            for name, at in zip(*np.unique(self._table[end], return_index=True), strict=True)
+        }
+        some = self[np.array(sorted(devices.values()), dtype=np.int64)]
+        for name, rows in some._recorded(fixed).items():
+            shapes = {np.shape(row): str(rx) for row, rx in zip(rows, some["rx"], strict=True)}
+            if len(shapes) > 1:
+                (one, rx), (other, another) = list(shapes.items())[:2]
+                raise ValueError(
+                    f"{name} has the shape {one} for {rx!r} and {other} for {another!r}: take torch_batches, "
+                    "which pads, or users of one kind, as dataset.users(object_class='car')"
+                )
 
     def _shuffled(self, seed: int) -> NDArray[np.int64]:
         draw = random.Random(seed)  # noqa: S311 - no secret
@@ -401,6 +420,10 @@ def _lacks(recording: Recording, topic: str, name: str) -> str:
 
 
 _OF_HITS = ("hits", "points", "points_world", "range", "ray", "object")
+_OF_ANY_LENGTH = frozenset(f"lidar.{name}" for name in _OF_HITS) | {
+    f"channel.{name}" for name, column in TOPIC_ARRAYS["channel"].columns.items() if "P" in column.shape
+}
+"""Arrays as long as what was found: paths, hits."""
 
 
 def _recorded_like(name: str) -> list[str]:

@@ -36,7 +36,7 @@ from caviar_clients.learning.training import (
 )
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
-from caviar_protocol.host import safe_path
+from caviar_protocol.host import start_process
 
 RECORD = "experiment.json"
 """What the folder was begun with."""
@@ -295,8 +295,7 @@ def _start(training: _Training) -> tuple[Connection, Any]:
     context = multiprocessing.get_context("spawn")  # what is forked has the threads of PyTorch no more
     pipe, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_serve, args=(theirs, *training[:3]), daemon=True)
-    with safe_path():
-        process.start()
+    start_process(process)
     theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
     return pipe, process
 
@@ -325,7 +324,6 @@ def _cause(code: int) -> str:
 
 def _serve(pipe: Connection, experiment: Experiment, seed: int, folder: Path) -> None:
     """Train a seed, and tell the parent; where the parent is gone, the next report ends this process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     os.environ["PYTHONSAFEPATH"] = ""  # of scripts that an environment starts, Python searches the folder
     warnings.showwarning = lambda message, *_, **__: pipe.send(str(message))
     try:

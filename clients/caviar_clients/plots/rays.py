@@ -181,17 +181,16 @@ def footprints(meshes: Iterable[tuple[Path, Float64Array]]) -> Footprints:
     )
 
 
-def ground(meshes: Iterable[tuple[Path, Float64Array]]) -> Float64Array:
+def ground(meshes: Iterable[tuple[Path, Float64Array]]) -> list[Float64Array]:
     """Read the triangles of the PLY meshes that are ground.
 
     Args:
         meshes: File of each mesh, and its 4×4 transform into the world.
 
     Returns:
-        Corners [m], Shape ``[F, 3, 3]``.
+        Corners [m] of the triangles of each mesh, Shape ``[F, 3, 3]``.
     """
-    found, _ = _ground_and_buildings(meshes)
-    return np.concatenate([shape.corners for shape in found] or [np.zeros((0, 3, 3))])
+    return [shape.corners for shape in _ground_and_buildings(meshes)[0]]
 
 
 def with_boxes(drawn: Footprints | None, boxes: Sequence[Box]) -> Footprints:

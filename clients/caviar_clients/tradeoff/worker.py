@@ -24,7 +24,7 @@ from caviar_clients.tradeoff.errors import Key, Noise, UserChannel, user_channel
 from caviar_clients.tradeoff.ladder import SCATTERING, Setting
 from caviar_clients.tradeoff.scenes import Instant, Scenes
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
-from caviar_protocol.host import peak_mib, reset_peak, resident_mib, safe_path
+from caviar_protocol.host import peak_mib, reset_peak, resident_mib, start_process
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.scene import antennas
@@ -245,8 +245,7 @@ class Worker:
         self._process = context.Process(
             target=_serve, args=(theirs, setting, scenes, receivers, products), daemon=True
         )
-        with safe_path():
-            self._process.start()
+        start_process(self._process)
         theirs.close()  # else the end of the process would not be seen: this one would hold the pipe open
         self.loaded: Loaded = self._answer(seconds)
 
@@ -309,7 +308,6 @@ def _serve(
     products: bool,
 ) -> None:
     """Load, then answer until the parent asks for the end or has gone; a text is the reason of a failure."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     with suppress(EOFError, BrokenPipeError):
         try:
             rung = Rung(setting, scenes, receivers, products)

@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from caviar_protocol.arrays import Vector3, quantity
+from caviar_protocol.arrays import Position, quantity
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.files import Durability
 from caviar_protocol.messages import Policy, Role
@@ -154,7 +154,7 @@ class DeviceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True
     """What ``position_m`` is relative to: a point of the parent's bounding box."""
     world: str = ""
     """The world that publishes a device; needed where ``on`` leaves it open."""
-    position_m: Vector3 = (0.0, 0.0, 0.0)
+    position_m: Position = (0.0, 0.0, 0.0)
     """In the world's axes [m], or with ``on`` in the object's axes, from the mount point."""
     yaw_deg: Annotated[float, quantity("°", "counter-clockwise from +x")] = 0.0
     pitch_deg: Annotated[float, quantity("°", "positive lowers the nose")] = 0.0

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import MAX_COORDINATE_M, Float64Array, Int64Array
 from caviar_protocol.errors import AssetError
 
 # Names of PLY 1.0, and those with sizes that later tools write.
@@ -37,8 +37,8 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
         Vertices [m], Shape ``[V, 3]``, and indices of the corners of each triangle, Shape ``[F, 3]``.
 
     Raises:
-        AssetError: The file cannot be read, is no mesh, breaks off, has a vertex that is not finite, or a
-            face that refers to a vertex that is not there.
+        AssetError: The file cannot be read, is no mesh, breaks off, has a vertex that is not finite or beyond
+            `MAX_COORDINATE_M`, or a face that refers to a vertex that is not there.
 
     Example:
         >>> lines = ["ply", "format ascii 1.0", "element vertex 4"]
@@ -57,11 +57,12 @@ def read_ply(file: Path, called: str = "") -> tuple[Float64Array, Int64Array]:
     except OSError as error:
         raise AssetError(f"{called} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, IndexError) as error:
-        raise AssetError(f"{called}: not a PLY file that can be read ({error!r}); export it again") from error
-    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+        raise AssetError(f"{called}: not a PLY file that can be read ({error}); export it again") from error
+    bad = np.flatnonzero(~(abs(vertices) <= MAX_COORDINATE_M).all(1))
     if len(bad):
         where = vertices[bad[0]].tolist()
-        raise AssetError(f"{called}: vertex {bad[0]} is at {where}; give every vertex finite coordinates")
+        remedy = f"give every vertex finite coordinates of at most {MAX_COORDINATE_M:g}"
+        raise AssetError(f"{called}: vertex {bad[0]} is at {where}; {remedy}")
     return vertices, triangles
 
 
@@ -149,7 +150,11 @@ def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
     """Byte order, elements, and where the data begin."""
     # Before the lines are split: binary data after the header may hold line feeds.
-    end = data.index(b"end_header")
+    end = data.find(b"end_header")
+    if end < 0:
+        raise ValueError(
+            "it is empty" if not data else f"no line end_header; the file begins with {data[:8]!r}"
+        )
     order, elements = None, list[_Element]()
     for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
         match words:

@@ -155,7 +155,8 @@ class McapRecorder(Recorder[McapSettings]):
             folder.mkdir(parents=True, exist_ok=True)
             copied = copy_assets(assets, RunDirectory(folder).assets, sync=self._durability != "none")
         except OSError as error:
-            raise failure(Path(error.filename or folder), error) from error
+            # A copy that fails has the name of the target second.
+            raise failure(Path(error.filename2 or error.filename or folder), error) from error
         reproducible = self.settings.reproducible
         self._metadata = RecordingMetadata(
             run=self.run.run,

@@ -164,7 +164,7 @@ class Engine(ABC):
             name: Of this world in the scenario.
 
         Returns:
-            The exit status of the process: 0 after SHUTDOWN, 1 where this world failed or was refused, 143
+            The exit status of the process: 0 after SHUTDOWN, 1 where it failed, was refused or is blamed, 143
             after SIGTERM, 2 without arguments. Why is written to standard error.
         """
         from caviar_services.runner import Runner, SignalTermination

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from itertools import chain
 
+from caviar_protocol.arrays import MAX_COORDINATE_M
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.scene_validation import MAX_COORDINATE_M, UNIT_TOLERANCE
+from caviar_protocol.scene_validation import UNIT_TOLERANCE
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import AttitudeCommand, PathCommand, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.link import MotionCommand

@@ -114,8 +114,9 @@ class TrafficStates:
         """
         command = [*PYTHON, "-m", __name__]
         with subprocess.Popen(  # noqa: S603 - our own module
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,  # Ctrl-C is this process's, which ends that one
+        ) as process:  # fmt: skip
             try:
                 self._watch(process, episodes, progress)
             except BaseException:

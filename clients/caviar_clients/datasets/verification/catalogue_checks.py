@@ -16,8 +16,8 @@ from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue
 from caviar_clients.datasets.rows import EpisodeRows
 from caviar_clients.datasets.verification.checked_settings import checked_settings
 from caviar_clients.datasets.verification.findings import Finding, gaps, listed, runs
+from caviar_protocol.arrays import MAX_COORDINATE_M
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.scene_validation import MAX_COORDINATE_M
 
 TOLERANCE = 1e-12
 """Of figures of the catalogue that are computed anew, relative: they are the same arithmetic."""
