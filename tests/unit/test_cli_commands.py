@@ -119,7 +119,7 @@ def test_a_command_loads_no_other_and_the_help_nothing_heavy() -> None:
         "import sys\n"
         "from typer.testing import CliRunner\n"
         "from caviar_clients.cli.main import app\n"
-        "assert CliRunner().invoke(app, ['run', '-h']).exit_code == 0\n"
+        "assert CliRunner().invoke(app, ['new', '-h']).exit_code == 0\n"
         "print([name for name in sys.modules if name.startswith('caviar_labs')])\n"
         "assert CliRunner().invoke(app, ['-h']).exit_code == 0\n"
         "heavy = ('numpy', 'zmq', 'caviar_broker', 'caviar_services', 'caviar_labs.cli.measure')\n"
