@@ -28,7 +28,7 @@ from caviar_services.channel.stability.lab import (
     scene,
     square,
 )
-from caviar_services.mesh.shapes import box
+from caviar_space.meshes import box
 
 pytestmark = pytest.mark.channel
 

@@ -45,7 +45,7 @@ from caviar_services.channel.stability.lab import (
     write_scenery,
 )
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

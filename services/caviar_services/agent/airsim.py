@@ -33,7 +33,7 @@ from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
 from caviar_services.airsim.sensor_calls import SensorCalls
 from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
-from caviar_services.world.scenery import scenery_triangles
+from caviar_space.scenery import scenery_triangles
 
 LOOK_S = 0.1
 """[s] between looks for orders of the broker while a client holds the world."""

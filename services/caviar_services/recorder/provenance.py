@@ -30,7 +30,15 @@ from caviar_services.registry import BUILT_IN, load, registered
 ALWAYS = (DISTRIBUTION, "msgspec", "numpy")
 """Distributions that every run computes with."""
 OWN = frozenset(
-    ("caviar", "caviar_broker", "caviar_clients", "caviar_protocol", "caviar_scenarios", "caviar_services")
+    (
+        "caviar",
+        "caviar_broker",
+        "caviar_clients",
+        "caviar_protocol",
+        "caviar_scenarios",
+        "caviar_services",
+        "caviar_space",
+    )
 )
 """Packages of this distribution."""
 _BY_SETTING: Mapping[tuple[str, str], tuple[str, ...]] = {

@@ -13,10 +13,10 @@ from caviar_protocol.errors import SetupError
 from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Camera, CameraDevice, CameraImage, Scene
-from caviar_services.mesh.shapes import SHAPES, Mesh, unit_box
 from caviar_services.sensors.camera import intrinsics
 from caviar_services.sensors.shading import object_colour
 from caviar_services.world.panda3d_level import PANDA3D, geom_node, panda3d_core, srgb_of
+from caviar_space.meshes import SHAPES, Mesh, unit_box
 
 _SKY = (0.72, 0.82, 0.93, 1.0)
 
