@@ -3,6 +3,8 @@
 | group | name | value |
 | --- | --- | --- |
 | ``caviar.services`` | ``role:name`` | a subclass of `Service` |
+| ``caviar.plants`` | engine of a quadrotor in the world ``flight`` | a subclass of its `Plant` |
+| ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 
@@ -13,10 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from caviar_protocol.errors import DeclarationError
+
+# It takes longer to load than the metadata: only a process that looks for plug-ins loads it.
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
@@ -27,6 +32,8 @@ PREFIX = "caviar."
 # Once a process: looking for entry points reads the metadata of every installed distribution.
 @cache
 def _all() -> Mapping[str, tuple[EntryPoint, ...]]:
+    from importlib.metadata import entry_points
+
     found = entry_points()
     return {group: tuple(found.select(group=group)) for group in found.groups if group.startswith(PREFIX)}
 
@@ -50,7 +57,7 @@ def plugins(group: str) -> Mapping[str, EntryPoint]:
         # The same value twice is one distribution that is installed twice, in editable mode for instance.
         other = found.setdefault(point.name, point)
         if other.value != point.value:
-            both = (f"{each.value} by {_distribution(each)}" for each in (other, point))
+            both = (origin(each) for each in (other, point))
             raise DeclarationError(
                 f"{point.name} is registered twice in {group}, as {' and as '.join(both)}; uninstall one"
             )
@@ -67,7 +74,7 @@ def load_plugin(point: EntryPoint, kind: type[T]) -> T:
     Raises:
         DeclarationError: It cannot be imported, or is something else; names the distribution and the object.
     """
-    what = f"{point.name} of {point.group} is {point.value} of {_distribution(point)}, which"
+    what = f"{point.name} of {point.group} is {origin(point)}, which"
     try:
         found = point.load()
     except Exception as error:  # whatever a module that is not ours does when it is imported
@@ -77,5 +84,6 @@ def load_plugin(point: EntryPoint, kind: type[T]) -> T:
     return found
 
 
-def _distribution(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else "an unnamed distribution"
+def origin(point: EntryPoint) -> str:
+    """Object of an entry point, and the distribution that declares it, for errors."""
+    return f"{point.value} of {point.dist.name if point.dist is not None else 'an unnamed distribution'}"

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
+from caviar_clients.cli.attachments import AttachingCommand
 from caviar_clients.cli.datasets import (
     generate_command,
     look_command,
@@ -25,7 +26,7 @@ from caviar_clients.cli.keys import app as keys
 from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
 from caviar_clients.cli.paper import app as paper
 from caviar_clients.cli.shared import (
-    AirSim,
+    Attach,
     Embedded,
     Episodes,
     FiguresFile,
@@ -113,7 +114,7 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
     """The scenario of a run that is started anew; refuses what does not go together with ``--resume``."""
     if resume is not None and any(value is not None for value in (scenario, *others)):
         raise RunError(
-            "a run goes on as it began: --resume takes no scenario, frames, seed, --embedded or --airsim"
+            "a run goes on as it began: --resume takes no scenario, frames, seed, --embedded or --attach"
         )
     if resume is None and scenario is None:
         raise RunError(
@@ -122,7 +123,7 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
     return scenario or Path()
 
 
-@app.command(rich_help_panel=RUN)
+@app.command(cls=AttachingCommand, rich_help_panel=RUN)
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
@@ -140,7 +141,7 @@ def run(
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
-    airsim: AirSim = "",
+    attach: Attach = None,
     resume: Resume = None,
     force: Force = False,
 ) -> None:
@@ -149,14 +150,15 @@ def run(
 
     keys_given = keys_set(set_, record, episodes)
     source = _started_anew(
-        resume, scenario, frames, seed, embedded or None, pace, airsim or None, keys_given or None
+        resume, scenario, frames, seed, embedded or None, pace, attach or None, keys_given or None
     )
     if resume is not None:
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
         ended = run_scenario(
-            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim, keys_given
-        )
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace,
+            attach or (), keys_given,
+        )  # fmt: skip
     raise typer.Exit(ended.status)
 
 

@@ -19,6 +19,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.wire import GEO_ORIGIN, NedFrame
+from caviar_bridges.manoeuvres import Flown, FlyPath, Land, Manoeuvre
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
@@ -29,8 +31,6 @@ from caviar_protocol.topics import AttitudeCommand, BeamChoice, Scene, VelocityC
 from caviar_protocol.topics.link import MotionCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import straight_choices
-from caviar_services.airsim.manoeuvres import Flown, FlyPath, Land, Manoeuvre
-from caviar_services.airsim.wire import GEO_ORIGIN, NedFrame
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_space.engine_axes import NED, Motion
 
@@ -198,7 +198,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
         return (f"motion:{self.settings.object}",)
 
     def other_commands(self, frame: Frame, scene: Scene) -> Iterable[MotionCommand]:
-        """What the vehicle is commanded; nothing while the object is not in the scene, or while it hovers."""
+        """Commands of the vehicle; none while the object is not in the scene, or while it hovers."""
         if self._socket is None:
             raise RunError("the agent `mavlink` was not prepared; call prepare before the first frame")
         self._look(frame.t_ns, scene)
@@ -214,7 +214,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
             yield self._setpoint
 
     def _look(self, t_ns: int, scene: Scene) -> None:
-        """Take note of where the vehicle is, and whether it stands, and whether its manoeuvre is over."""
+        """Note the position of the vehicle, whether it stands, and whether its manoeuvre is over."""
         name = self.settings.object
         if name not in scene.names:
             self._flown = None
@@ -260,7 +260,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
     # --- in -------------------------------------------------------------------------------------------------
 
     def _receive(self, port: socket.socket) -> None:
-        """Take all that came since the frame before."""
+        """Take all messages that came since the frame before."""
         while True:
             try:
                 data, sender = port.recvfrom(_LARGEST_DATAGRAM)
@@ -311,7 +311,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
             self._setpoint = setpoint
 
     def _refuse(self, port: socket.socket, what: str, why: str) -> None:
-        """Count what is not obeyed, and name it once, to the peer as well."""
+        """Count a request that is not obeyed, and name it once, to the peer as well."""
         self._counts[IGNORED] += 1
         if what + why in self._named or len(self._named) >= MOST_NAMED:
             return
@@ -456,7 +456,7 @@ class MavlinkAgent(Agent[MavlinkSettings]):
         self._post(port, link.global_position_int_encode(ms, *geo, round(1000 * relative), *speeds, heading))
 
     def _send_status(self, port: socket.socket, t_ns: int, geo: Sequence[int]) -> None:
-        """What goes out each second: mode, health, landed state, the fix, and home."""
+        """Send the messages of each second: mode, health, landed state, the fix, and home."""
         d, link = self._dialect, self._link
         mode, landed = _HOLD, d.MAV_LANDED_STATE_IN_AIR
         if isinstance(self._manoeuvre, Land):

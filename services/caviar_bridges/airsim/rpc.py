@@ -42,7 +42,7 @@ _log = logging.getLogger("caviar.airsim")
 
 
 class CallError(Exception):
-    """What a call asks for cannot be done; the client raises an error with this text."""
+    """A call that cannot be done; the client raises an error with this text."""
 
 
 class Compact(NamedTuple):
@@ -195,7 +195,7 @@ class _Connection:
             self._writer.close()
 
     async def close(self, reason: str) -> None:
-        """Answer what is in progress with an error, and hang up."""
+        """Answer calls in progress with an error, and hang up."""
         for task, call in tuple(self._calls.items()):
             task.cancel()
             if call is not None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from caviar_bridges.panda3d.level import PANDA3D, panda3d_core
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector
-from caviar_services.world.panda3d_level import PANDA3D, panda3d_core
 
 TICK_NS = 10_000_000
 """Length of a step of the physics [ns]."""
@@ -25,11 +25,11 @@ _SCENERY, _VEHICLES, _UAVS = 0, 1, 2
 
 
 class BodyState(NamedTuple):
-    """Where a body is and how it moves, in the axes of the run."""
+    """Position and motion of a body, in the axes of the run."""
 
     pose: Pose
     velocity: Vector
-    """[m/s]"""
+    """Velocity [m/s]."""
     yaw_rate: float
     """[rad/s], counter-clockwise."""
 
@@ -80,19 +80,19 @@ class Body:
 
     @property
     def position(self) -> Vector:
-        """Of its centre [m]."""
+        """Position of its centre [m]."""
         x, y, z = self._path.getPos()
         return (x, y, z)
 
     @property
     def velocity(self) -> Vector:
-        """[m/s]"""
+        """Velocity [m/s]."""
         x, y, z = self._node.getLinearVelocity()
         return (x, y, z)
 
     @property
     def yaw(self) -> float:
-        """[rad], counter-clockwise from +x."""
+        """Yaw [rad], counter-clockwise from +x."""
         return math.radians(self._path.getH() + 90.0)
 
     def state(self) -> BodyState:

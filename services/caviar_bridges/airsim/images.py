@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import Map
 from caviar_protocol.arrays import Float32Array, UInt8Array
 from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.topics import Camera, CameraImage, Depth, DepthImage, Segmentation, SegmentationImage
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import Map
 
 SCENE, DEPTH_PLANAR, DEPTH_PERSPECTIVE, DEPTH_VIS, SEGMENTATION = 0, 1, 2, 3, 5
 OFFERED = {

@@ -17,6 +17,9 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 from msgspec.structs import replace
 
+from caviar_bridges.panda3d.bodies import TICK_NS, Body, Physics
+from caviar_bridges.panda3d.level import Level, empty_level, level_of_model, level_of_scenery
+from caviar_bridges.panda3d.pictures import Pictures
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import PayloadError, RunError
 from caviar_protocol.messages import Input
@@ -27,9 +30,6 @@ from caviar_protocol.topics.link import MotionCommand
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
-from caviar_services.world.panda3d_bodies import TICK_NS, Body, Physics
-from caviar_services.world.panda3d_level import Level, empty_level, level_of_model, level_of_scenery
-from caviar_services.world.panda3d_pictures import Pictures
 from caviar_services.world.trajectory import Length, NamedObject, unique_name
 from caviar_space.meshes import SHAPES
 from caviar_space.scenery import scenery_file

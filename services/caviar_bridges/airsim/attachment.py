@@ -1,4 +1,4 @@
-"""A scenario with the agent ``airsim`` in place of those that fly its objects: ``caviar run --airsim``."""
+"""Attachment of the agent ``airsim``, in place of those that fly a scenario's objects: ``--airsim``."""
 
 from __future__ import annotations
 
@@ -16,29 +16,27 @@ BUDGET_MS = 3_600_000.0
 """[ms] for which a script may hold the world before that counts as a miss."""
 
 
-def with_airsim(scenario: Scenario, address: str) -> Scenario:
-    """Have scripts written for AirSim fly the objects that agents fly.
+def attach(scenario: Scenario, address: str) -> Scenario:
+    """HOST:PORT, as 127.0.0.1:41451: scripts for AirSim connect there and fly.
 
     The agent takes the place of the first one that owns the motion of an object, and the users of all that
     do; these are left out. Where there is none it is one more service.
 
     Args:
         scenario: The scenario.
-        address: ``HOST:PORT`` at which AirSim's RPC is served; empty: the scenario is returned as it is.
+        address: ``HOST:PORT`` at which AirSim's RPC is served.
 
     Raises:
         ScenarioError: No object is flown by commands.
 
     Example:
         >>> from caviar_protocol.scenario import load_scenario
-        >>> pair = with_airsim(load_scenario("uav-pair"), "127.0.0.1:41451")
+        >>> pair = attach(load_scenario("uav-pair"), "127.0.0.1:41451")
         >>> list(pair.services)
         ['world', 'channel', 'link', 'pilot', 'beams', 'recorder']
         >>> pair.services["pilot"].use, pair.services["pilot"].settings["vehicles"]
         ('airsim', {'uav': 'uav'})
     """
-    if not address:
-        return scenario
     served = {n: spec for n, spec in scenario.services.items() if (spec.role, spec.use) == ("agent", NAME)}
     if served:
         changed = {n: replace(s, settings={**s.settings, "listen": address}) for n, s in served.items()}

@@ -59,7 +59,7 @@ def panda3d_core() -> ModuleType:
 
 
 class Level(NamedTuple):
-    """What stands still in the engine."""
+    """Geometry that stands still in the engine."""
 
     node: Any
     """``NodePath`` of the geometry."""

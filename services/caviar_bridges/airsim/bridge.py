@@ -10,21 +10,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from caviar_bridges.airsim.images import Products
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import NedFrame
+from caviar_bridges.manoeuvres import Command, Flown, Hover, Manoeuvre
 from caviar_protocol.space.coordinates import Pose, Vector, euler_from_quaternion
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Lidar, Scene, WaypointCommand
-from caviar_services.airsim.images import Products
-from caviar_services.airsim.manoeuvres import Command, Flown, Hover, Manoeuvre
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import NedFrame
 
 OVER = "the run is over"
-ANEW = "a new episode has begun"
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What one frame shows."""
+    """Scene and products of one frame."""
 
     frame: int
     t_ns: int
@@ -144,7 +143,7 @@ class Vehicle:
         return self._done
 
     def put(self, position: Vector, yaw: float) -> asyncio.Future[None]:
-        """Be at a position [m] with a yaw [rad], at rest, in the frame after the next command.
+        """Put the vehicle at a position [m] with a yaw [rad], at rest, in the frame after the next command.
 
         Returns:
             Done once a frame shows it there.
@@ -154,13 +153,13 @@ class Vehicle:
         return self._placed
 
     def reset(self) -> None:
-        """Be as before the first call."""
+        """Take back all that calls have changed."""
         self.begin(Hover(self.object))
         self.api_enabled, self.armed, self.landed = False, False, True
         self._place = None
 
     def see(self, snapshot: Snapshot) -> None:
-        """Take note of where it is in a frame."""
+        """Note the position of the vehicle in a frame."""
         before, scene = self.flown, snapshot.scene
         if self._place is None and self._placed is not None:
             if not self._placed.done():
@@ -187,7 +186,7 @@ class Vehicle:
             self._finish(self._manoeuvre.result)
 
     def command(self) -> Command | None:
-        """What it is commanded in the newest frame; None while it is not in the scene."""
+        """Command for the newest frame; None while the vehicle is not in the scene."""
         if self.flown is None:
             return None
         if self._place is not None:
@@ -202,7 +201,7 @@ class Vehicle:
 
 
 class Bridge:
-    """What calls and frames share.
+    """State that calls and frames share.
 
     Args:
         vehicles: Object of each vehicle, by the name that clients use; the first one is meant where a call
@@ -253,7 +252,7 @@ class Bridge:
         return sorted(commands, key=lambda command: command.object), ending
 
     def begin_episode(self) -> None:
-        """Forget what belongs to the episode before."""
+        """Forget the state of the episode before."""
         if self._snapshot is None:  # before the first one: a script may have taken over a vehicle already
             return
         self._snapshot, self.ending = None, False

@@ -1,4 +1,4 @@
-"""What AirSim's motion calls ask of a vehicle: in every frame a command, until the manoeuvre is done.
+"""Manoeuvres of a vehicle, as AirSim's motion calls ask for them: a command a frame, until one is done.
 
 A manoeuvre sees where the vehicle is in a frame, and answers with a command of the protocol, which holds
 until the next frame. All is in ENU; time is simulated. A manoeuvre that is done goes on commanding: the
@@ -43,12 +43,12 @@ class Flown(NamedTuple):
 
 
 def deadline(now_ns: int, timeout_s: float) -> float:
-    """When a time is up that begins now [ns]; of AirSim's 3·10³⁸ s, never."""
+    """End of a time that begins now [ns]; of AirSim's 3·10³⁸ s, never."""
     return now_ns + timeout_s * 1e9 if timeout_s < 1e9 else math.inf
 
 
 class Heading(NamedTuple):
-    """Where a vehicle heads while it moves; of neither, where it moves to."""
+    """Heading of a vehicle while it moves; with neither field, that of its motion."""
 
     yaw: float | None = None
     """Counter-clockwise from east [rad]."""
@@ -94,18 +94,18 @@ class Manoeuvre(ABC):
 
     @abstractmethod
     def begin(self, now: Flown) -> None:
-        """Note where and when it begins."""
+        """Note place and time of the beginning."""
 
     @abstractmethod
     def judge(self, now: Flown) -> bool | None:
-        """Whether it succeeded or failed; None: neither yet."""
+        """Success or failure; None: neither yet."""
 
     @abstractmethod
     def command(self, now: Flown) -> Command:
-        """What the vehicle does until the next frame."""
+        """Command until the next frame."""
 
     def rest(self, now: Flown) -> Command:
-        """What it does once the manoeuvre is done: brake, and stay."""
+        """Command once the manoeuvre is done: brake, and stay."""
         return VelocityCommand(object=self.name, velocity=(0.0, 0.0, 0.0))
 
 

@@ -10,23 +10,10 @@ from typing import Annotated, Any
 
 import msgspec
 
-from caviar_protocol.arrays import quantity
-from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
-from caviar_services.airsim.bridge import Bridge, Vehicle
-from caviar_services.airsim.calls import Call
-from caviar_services.airsim.manoeuvres import (
-    ALONG,
-    Flown,
-    FlyPath,
-    FlyVelocity,
-    Heading,
-    Hover,
-    Land,
-    Manoeuvre,
-    Turn,
-)
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import (
+from caviar_bridges.airsim.bridge import Bridge, Vehicle
+from caviar_bridges.airsim.calls import Call
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import (
     LEVEL,
     flag,
     ned_yaw,
@@ -37,13 +24,26 @@ from caviar_services.airsim.wire import (
     vector,
     vector_map,
 )
+from caviar_bridges.manoeuvres import (
+    ALONG,
+    Flown,
+    FlyPath,
+    FlyVelocity,
+    Heading,
+    Hover,
+    Land,
+    Manoeuvre,
+    Turn,
+)
+from caviar_protocol.arrays import quantity
+from caviar_protocol.space.coordinates import Vector, euler_from_quaternion
 
 MOST_POINTS = 10_000
 """Of a path."""
 FASTEST = 1000.0
 """[m/s]"""
 FORWARD_ONLY = 1
-"""Of AirSim's ``DrivetrainType``: the vehicle heads along its way."""
+"""Heading of AirSim's ``DrivetrainType``: the vehicle heads along its way."""
 LEAST_MARGIN = math.radians(0.1)
 SAME_YAW = math.radians(1.0)
 
@@ -106,7 +106,7 @@ class MotionCalls:
             vehicle.begin(Hover(vehicle.object))
 
     async def is_enabled(self, vehicle_name: object = "") -> bool:
-        """Whether it is taken over."""
+        """Whether a vehicle is taken over."""
         return self._vehicle(vehicle_name).api_enabled
 
     async def arm(self, arm: object, vehicle_name: object = "") -> bool:
@@ -264,7 +264,7 @@ class MotionCalls:
         yaw_mode: object = None,
         vehicle_name: object = "",
     ) -> bool:
-        """The same, with a height."""
+        """Keep a velocity forward and to the right, and a height."""
         north, east = await self._from_body(vx, vy, vehicle_name)
         return await self.move_by_velocity_z(north, east, z, duration, drivetrain, yaw_mode, vehicle_name)
 
@@ -290,7 +290,7 @@ class MotionCalls:
     async def set_vehicle_pose(
         self, pose: object, ignore_collision: object = True, vehicle_name: object = ""
     ) -> None:
-        """Be at a pose, at rest; parts that are not-a-number, and an orientation of zeros, stay as they are.
+        """Put a vehicle at a pose, at rest; parts that are not-a-number, and an orientation of zeros, stay.
 
         A world that is paused has the vehicle there in its next frame, and the call returns before that.
         """
@@ -358,7 +358,7 @@ class MotionCalls:
         return vehicle, flown
 
     def _heading(self, flown: Flown, drivetrain: object, yaw_mode: object) -> Heading:
-        """Of AirSim's ``DrivetrainType`` and ``YawMode``: along the way, to a yaw, or turning with a rate."""
+        """Heading of AirSim's ``DrivetrainType`` and ``YawMode``: along the way, to a yaw, or with a rate."""
         if drivetrain == FORWARD_ONLY:
             return ALONG
         mode = yaw_mode if isinstance(yaw_mode, dict) else {}
@@ -407,7 +407,7 @@ class MotionCalls:
         return (await self._bridge.ned()).velocity_to_enu((x, y, z))
 
     def _note(self, key: str, words: str) -> None:
-        """Say once what a client asks for in vain."""
+        """Log once a request that has no effect."""
         if key not in self._noted:
             self._noted.add(key)
             _log.warning("%s; this is said once", words)

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from caviar_bridges.airsim.rpc import CallError
 from caviar_protocol.arrays import Float32Array
 from caviar_protocol.space.coordinates import Pose, Vector, unrotated
-from caviar_services.airsim.rpc import CallError
 from caviar_space.engine_axes import NED, Motion
 
 EARTH_RADIUS_M = 6_378_137.0

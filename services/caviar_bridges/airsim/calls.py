@@ -13,11 +13,9 @@ import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Any
 
-from caviar_protocol.space.coordinates import Vector
-from caviar_protocol.space.scene import object_pose
-from caviar_services.airsim.bridge import Bridge, Snapshot, Vehicle, boxes_overlap
-from caviar_services.airsim.rpc import CallError, Params
-from caviar_services.airsim.wire import (
+from caviar_bridges.airsim.bridge import Bridge, Snapshot, Vehicle, boxes_overlap
+from caviar_bridges.airsim.rpc import CallError, Params
+from caviar_bridges.airsim.wire import (
     NOWHERE,
     Map,
     NedFrame,
@@ -26,6 +24,8 @@ from caviar_services.airsim.wire import (
     text,
     vector_map,
 )
+from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.space.scene import object_pose
 
 VERSION = 1
 """Of the interface, as the client 1.8.1 has it."""

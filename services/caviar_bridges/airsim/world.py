@@ -12,14 +12,14 @@ from typing import Annotated, Any, ClassVar
 
 import msgspec
 
+from caviar_bridges.airsim.rpc import HOST, PORT, CallError, RpcClient, address_of
+from caviar_bridges.airsim.wire import NOWHERE, NedFrame, vector, vector_map
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError, suggestion
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, Vector
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
-from caviar_services.airsim.rpc import HOST, PORT, CallError, RpcClient, address_of
-from caviar_services.airsim.wire import NOWHERE, NedFrame, vector, vector_map
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_services.world.trajectory import NamedObject, unique_name
@@ -109,7 +109,7 @@ class AirSimWorld(World[AirSimWorldSettings]):
         return (*self._vehicles, *self._objects)
 
     def mesh_classes(self) -> tuple[str, ...]:
-        """None: all are boxes."""
+        """No classes: all objects are boxes."""
         return ()
 
     def prepare(self, preparation: Preparation) -> Prepared:

@@ -17,6 +17,12 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.bridge import OVER, Bridge, Snapshot
+from caviar_bridges.airsim.calls import Offer, StateCalls
+from caviar_bridges.airsim.motion_calls import Habits, MotionCalls
+from caviar_bridges.airsim.rpc import HOST, PORT, RpcServer, address_of
+from caviar_bridges.airsim.sensor_calls import SensorCalls
+from caviar_bridges.airsim.wire import GEO_ORIGIN
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
@@ -26,12 +32,6 @@ from caviar_protocol.topics import BeamChoice, Camera, Depth, Lidar, Scene, Segm
 from caviar_protocol.topics.link import Command
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import straight_choices
-from caviar_services.airsim.bridge import OVER, Bridge, Snapshot
-from caviar_services.airsim.calls import Offer, StateCalls
-from caviar_services.airsim.motion_calls import Habits, MotionCalls
-from caviar_services.airsim.rpc import HOST, PORT, RpcServer, address_of
-from caviar_services.airsim.sensor_calls import SensorCalls
-from caviar_services.airsim.wire import GEO_ORIGIN
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_space.scenery import scenery_triangles
 
@@ -211,7 +211,7 @@ class AirSimAgent(Agent[AirSimSettings]):
         return await self._bridge.decide(snapshot)
 
     def close(self) -> None:
-        """Answer what is under way with an error, and hang up."""
+        """Answer calls under way with an error, and hang up."""
         loop, self._loop = self._loop, None
         if loop is not None:
             try:
@@ -229,11 +229,11 @@ class _LoopThread:
         self._thread.start()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
-        """Have it run in the loop."""
+        """Run a coroutine in the loop."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def run(self, work: Coroutine[Any, Any, T], timeout_s: float) -> T:
-        """Have it run in the loop, and wait for its result."""
+        """Run a coroutine in the loop, and wait for its result."""
         return self.submit(work).result(timeout_s)
 
     def close(self) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from caviar_bridges.panda3d.level import PANDA3D, geom_node, panda3d_core, srgb_of
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import SetupError
 from caviar_protocol.space.coordinates import Pose
@@ -15,7 +16,6 @@ from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Camera, CameraDevice, CameraImage, Scene
 from caviar_services.sensors.camera import intrinsics
 from caviar_services.sensors.shading import object_colour
-from caviar_services.world.panda3d_level import PANDA3D, geom_node, panda3d_core, srgb_of
 from caviar_space.meshes import SHAPES, Mesh, unit_box
 
 _SKY = (0.72, 0.82, 0.93, 1.0)
@@ -179,7 +179,7 @@ class Pictures:
 
 
 def _optics(device: CameraDevice) -> CameraDevice:
-    """What of a camera its buffer depends on."""
+    """Properties of a camera on which its buffer depends."""
     return CameraDevice(
         name=device.name, width=device.width, height=device.height, field_of_view=device.field_of_view
     )

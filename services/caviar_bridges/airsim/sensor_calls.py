@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from caviar_bridges.airsim.bridge import Bridge, Snapshot, Vehicle
+from caviar_bridges.airsim.calls import Call, kinematics_of
+from caviar_bridges.airsim.images import image_response
+from caviar_bridges.airsim.rpc import CallError, Compact
+from caviar_bridges.airsim.wire import Map, NedFrame, sensor_points, table, text, vector_map
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Pose, Vector, unrotated
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import CameraDevice, LidarDevice, LidarScan
-from caviar_services.airsim.bridge import Bridge, Snapshot, Vehicle
-from caviar_services.airsim.calls import Call, kinematics_of
-from caviar_services.airsim.images import image_response
-from caviar_services.airsim.rpc import CallError, Compact
-from caviar_services.airsim.wire import Map, NedFrame, sensor_points, table, text, vector_map
 
 MOST_IMAGES = 64
 """Pictures of a call."""
@@ -60,7 +60,7 @@ def atmosphere(altitude: float) -> tuple[float, float, float]:
 
 
 class Motion(NamedTuple):
-    """What the sensors of a vehicle measure."""
+    """Motion of a vehicle, as its sensors measure it."""
 
     t_ns: int
     kinematics: Map

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
@@ -31,6 +32,9 @@ class MujocoPlant(Plant):
     Raises:
         SetupError: MuJoCo is not installed.
     """
+
+    extra: ClassVar[str] = "mujoco"
+    packages: ClassVar[tuple[str, ...]] = ("mujoco",)
 
     def __init__(self, airframe: Airframe, gravity: float = GRAVITY) -> None:
         super().__init__(airframe, gravity)
@@ -77,7 +81,7 @@ class MujocoPlant(Plant):
         return moved, end, h / 6.0 * (w0[4] + 4.0 * w1[4] + w2[4])
 
     def _force(self, velocity: Vector, q: UnitQuaternion, thrust: float, air: Vector) -> Vector:
-        """Of rotors and air, in body axes [N]."""
+        """Force of rotors and air, in body axes [N]."""
         x, y, z = (a - b for a, b in zip(velocity, air, strict=True))
         speed = math.sqrt(x * x + y * y + z * z)
         frame = self.airframe
