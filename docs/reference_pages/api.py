@@ -21,6 +21,7 @@ from . import markdown
 PACKAGES = (
     "caviar",
     "caviar_protocol",
+    "caviar_space",
     "caviar_broker",
     "caviar_services",
     "caviar_bridges",

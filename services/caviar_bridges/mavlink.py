@@ -26,13 +26,13 @@ from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, Vector, euler_from_quaternion, rotated, unrotated
-from caviar_protocol.space.engine_axes import NED, Motion
 from caviar_protocol.space.scene import Pair, object_pose
 from caviar_protocol.topics import AttitudeCommand, BeamChoice, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.link import MotionCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import straight_choices
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_space.engine_axes import NED, Motion
 
 SETPOINTS = "mavlink-setpoints"
 """Count of the set-points that came in a frame."""

@@ -32,7 +32,7 @@ from caviar_services.channel.propagation.patterns import Patterns, element_ampli
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

@@ -28,7 +28,7 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.paths import Antenna
-from caviar_services.mesh.shapes import box
+from caviar_space.meshes import box
 
 pytestmark = pytest.mark.channel
 

@@ -45,7 +45,7 @@ from caviar_services.channel.sionna.materials import (
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

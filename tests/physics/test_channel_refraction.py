@@ -20,7 +20,7 @@ from caviar_labs.stability.lab import (
     write_scenery,
 )
 from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

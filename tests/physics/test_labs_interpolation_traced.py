@@ -12,7 +12,7 @@ import pytest
 from caviar_labs.interpolation import Interpolation, Keyframe
 from caviar_labs.stability.lab import Thing, antenna, measure, scene, sionna
 from caviar_protocol.topics import AntennaArray, Channel, Scene
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 FRAME_S = 0.1
 FRAMES = 11

@@ -40,7 +40,8 @@ from caviar_protocol.topics import (
 )
 from caviar_services.sensors.camera import CameraSettings
 from caviar_services.sensors.lidar import LidarSettings
-from caviar_services.world.scenery import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

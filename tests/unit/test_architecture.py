@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 
 PACKAGES = (
     "caviar_protocol",
+    "caviar_space",
     "caviar_broker",
     "caviar_services",
     "caviar_bridges",

@@ -21,8 +21,8 @@ from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.mesh.shapes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.meshes import box
 
 HOUSE = box((-5.0, 5.0), (10.0, 20.0), (0.0, 8.0))
 CARRIERS = (Carrier(name="a", frequency_hz=3e9), Carrier(name="b", frequency_hz=28e9))

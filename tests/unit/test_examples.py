@@ -23,6 +23,7 @@ from caviar_protocol.scenario import find_scenario, parse_scenario
 
 PACKAGES = (
     "caviar_protocol",
+    "caviar_space",
     "caviar_broker",
     "caviar_services",
     "caviar_bridges",

@@ -22,8 +22,8 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, euler_from_quaternion, rotated, rotation_matrix
 from caviar_protocol.topics import Action, AttitudeCommand, Camera, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.link import MotionCommand
-from caviar_services.mesh.scenery import read_scenery, world_mesh
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
+from caviar_space.mitsuba_xml import read_scenery, world_mesh
 
 pytestmark = pytest.mark.slow
 

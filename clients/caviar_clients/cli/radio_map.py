@@ -35,8 +35,8 @@ from caviar_services.channel.radio_map.mapping import (
     rays_at_once,
     transmitters_of,
 )
-from caviar_services.mesh.scenery import find_scenery, read_scenery
 from caviar_services.service import Preparation
+from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 FORMAT = "caviar-radio-map-1"
 

@@ -23,7 +23,8 @@ from caviar_protocol.space.coordinates import Vector
 from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.registry import find_modules_in, load, registered, registered_names
 from caviar_services.service import Service
-from caviar_services.world.scenery import Obstacles, scenery_triangles
+from caviar_space.obstacles import Obstacles
+from caviar_space.scenery import scenery_triangles
 
 TOPICS_OF: Mapping[str, tuple[str, ...]] = {
     "world": ("scene",),

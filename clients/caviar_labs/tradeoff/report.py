@@ -23,8 +23,8 @@ from caviar_labs.tradeoff.ladder import TRUTH, Block, Setting
 from caviar_labs.tradeoff.worker import is_known, seen
 from caviar_protocol.arrays import quantity
 from caviar_protocol.space.scene import antennas
-from caviar_services.mesh.scenery import find_scenery
 from caviar_services.registry import load
+from caviar_space.mitsuba_xml import find_scenery
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):

@@ -33,7 +33,7 @@ from caviar_protocol.topics.link import Command
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import straight_choices
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
-from caviar_services.world.scenery import scenery_triangles
+from caviar_space.scenery import scenery_triangles
 
 LOOK_S = 0.1
 """[s] between looks for orders of the broker while a client holds the world."""

@@ -15,7 +15,7 @@ import numpy as np
 from caviar_bridges.airsim.rpc import CallError
 from caviar_protocol.arrays import Float32Array
 from caviar_protocol.space.coordinates import Pose, Vector, unrotated
-from caviar_protocol.space.engine_axes import NED, Motion
+from caviar_space.engine_axes import NED, Motion
 
 EARTH_RADIUS_M = 6_378_137.0
 """[m] of the sphere on which geographic positions lie: the equator of WGS 84."""

@@ -19,11 +19,11 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError, sugges
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, Vector
-from caviar_protocol.space.engine_axes import NED, Motion
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_services.world.trajectory import NamedObject, unique_name
+from caviar_space.engine_axes import NED, Motion
 
 FOREVER_S = 3e38
 """[s] of AirSim's calls without a time limit."""

@@ -20,10 +20,10 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError, suggestion
 from caviar_protocol.host import install_command
 from caviar_protocol.space.coordinates import Vector
-from caviar_protocol.space.engine_axes import EngineAxes
-from caviar_services.mesh.scenery import ITU_MATERIALS, RadioMaterial, read_scenery, scenery_files, world_mesh
-from caviar_services.mesh.shapes import Mesh
 from caviar_services.sensors.shading import shape_colour
+from caviar_space.engine_axes import EngineAxes
+from caviar_space.meshes import Mesh
+from caviar_space.mitsuba_xml import ITU_MATERIALS, RadioMaterial, read_scenery, scenery_files, world_mesh
 
 PANDA3D = EngineAxes(
     "panda3d",

@@ -14,9 +14,9 @@ from caviar_protocol.errors import SetupError
 from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Camera, CameraDevice, CameraImage, Scene
-from caviar_services.mesh.shapes import SHAPES, Mesh, unit_box
 from caviar_services.sensors.camera import intrinsics
 from caviar_services.sensors.shading import object_colour
+from caviar_space.meshes import SHAPES, Mesh, unit_box
 
 _SKY = (0.72, 0.82, 0.93, 1.0)
 

@@ -28,11 +28,11 @@ from caviar_protocol.space.coordinates import Pose, Vector, multiply, quaternion
 from caviar_protocol.topics import Action, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.link import MotionCommand
 from caviar_services.checkpoint import restored, saved
-from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
-from caviar_services.world.scenery import scenery_file
 from caviar_services.world.trajectory import Length, NamedObject, unique_name
+from caviar_space.meshes import SHAPES
+from caviar_space.scenery import scenery_file
 
 # [s] of its way at which a vehicle on a straight path goes on to the point after the next.
 _LEAST_S = 0.05

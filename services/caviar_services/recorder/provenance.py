@@ -33,7 +33,17 @@ ALWAYS = (DISTRIBUTION, "msgspec", "numpy")
 """Distributions that every run computes with."""
 OWN = frozenset(
     f"caviar{name}"
-    for name in ("", "_bridges", "_broker", "_clients", "_protocol", "_scenarios", "_services")
+    for name in (
+        "",
+        "_bridges",
+        "_broker",
+        "_clients",
+        "_labs",
+        "_protocol",
+        "_scenarios",
+        "_services",
+        "_space",
+    )
 )
 """Packages of this distribution."""
 _BY_SETTING: Mapping[tuple[str, str], tuple[str, ...]] = {

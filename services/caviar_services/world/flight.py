@@ -40,7 +40,6 @@ from caviar_services.world.quadrotor.fleet import Fleet
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
 from caviar_services.world.quadrotor.state import Battery, QuadrotorState
 from caviar_services.world.quadrotor.wind import Wind
-from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 from caviar_services.world.trajectory import (
     MovingObject,
     NamedObject,
@@ -48,6 +47,8 @@ from caviar_services.world.trajectory import (
     TrajectoryWorld,
     unique_name,
 )
+from caviar_space.obstacles import Obstacles
+from caviar_space.scenery import scenery_assets, scenery_triangles
 
 _log = logging.getLogger("caviar.service")
 

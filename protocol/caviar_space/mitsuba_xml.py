@@ -24,7 +24,7 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.geometry import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.space.ply import read_ply
-from caviar_services.mesh.shapes import Mesh, ply
+from caviar_space.meshes import Mesh, ply
 
 
 class RadioBsdf(NamedTuple):
@@ -86,8 +86,22 @@ def world_mesh(shape: SceneryShape) -> Mesh:
     Raises:
         AssetError: The file is no mesh, or a vertex is not finite; names the shape.
     """
-    vertices, faces = read_ply(shape.file, f"{shape.place}: mesh {shape.file.name}")
-    return Mesh(vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3], faces.astype(np.int32))
+    return transformed_mesh(shape.file, shape.to_world, f"{shape.place}: mesh {shape.file.name}")
+
+
+def transformed_mesh(file: Path, to_world: Float64Array, called: str = "") -> Mesh:
+    """Read a PLY mesh in world coordinates.
+
+    Args:
+        file: The mesh.
+        to_world: Homogeneous transform of its vertices [m], Shape ``[4, 4]``.
+        called: What errors call it; by default the file.
+
+    Raises:
+        AssetError: The file is no mesh, or a vertex is not finite.
+    """
+    vertices, faces = read_ply(file, called)
+    return Mesh(vertices @ to_world[:3, :3].T + to_world[:3, 3], faces.astype(np.int32))
 
 
 class RadioMaterial(NamedTuple):
@@ -119,7 +133,7 @@ def scenery_files(
             that is not there.
 
     Example:
-        >>> from caviar_services.mesh.shapes import unit_box
+        >>> from caviar_space.meshes import unit_box
         >>> list(scenery_files("town", {"house": (unit_box(), "wall")}, {"wall": RadioMaterial("brick")}))
         ['scenery/town.xml', 'scenery/meshes/house.ply']
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from caviar_protocol.errors import PayloadError
-from caviar_services.mesh.shapes import assign_bodies
+from caviar_space.meshes import assign_bodies
 
 
 def test_bodies_are_given_by_name_whatever_the_order_of_objects() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers, shared_planes
-from caviar_services.mesh.shapes import Mesh, box, unit_box
+from caviar_space.meshes import Mesh, box, unit_box
+from caviar_space.planes import PlaneTable, plane_numbers, shared_planes
 
 Array = NDArray[np.float64]
 

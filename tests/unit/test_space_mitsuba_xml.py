@@ -10,8 +10,8 @@ import pytest
 
 from caviar_protocol.errors import AssetError
 from caviar_services.channel.sionna.scene_loading import file_pieces
-from caviar_services.mesh.scenery import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.mitsuba_xml import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
+from caviar_space.scenery import scenery_assets
 
 SHAPE = '<shape type="ply" id="mesh-{0}"><string name="filename" value="meshes/{0}.ply"/>{1}</shape>'
 

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.propagation.geometry import cross, ranges
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
+from caviar_space.vectors import cross, ranges
 
 # Room for rounding beyond the tolerances, so that no pair within them falls into separate cells.
 _SLACK = 1.001
@@ -199,7 +199,7 @@ def plane_numbers(mesh: Mesh) -> Int32Array:
         mesh: Any.
 
     Example:
-        >>> from caviar_services.mesh.shapes import unit_box
+        >>> from caviar_space.meshes import unit_box
         >>> plane_numbers(unit_box()).tolist()
         [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
     """
@@ -433,7 +433,7 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
         numbers: Plane of each triangle, Shape ``[F]``.
 
     Example:
-        >>> from caviar_services.mesh.shapes import unit_box
+        >>> from caviar_space.meshes import unit_box
         >>> two_sided_planes(unit_box(), plane_numbers(unit_box())).any()
         np.False_
     """

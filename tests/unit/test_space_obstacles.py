@@ -10,7 +10,6 @@ import pytest
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.mesh.shapes import box
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.flight_dynamics import (
@@ -20,7 +19,9 @@ from caviar_services.world.flight_dynamics import (
     Limits,
     Motion,
 )
-from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
+from caviar_space.meshes import box
+from caviar_space.obstacles import Obstacles
+from caviar_space.scenery import scenery_assets, scenery_triangles
 
 pytestmark = pytest.mark.slow
 

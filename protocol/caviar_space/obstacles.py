@@ -1,153 +1,18 @@
-"""What a world brings as files, and its scenery as obstacles of flight.
+"""Scenery as obstacles of flight: where a ball may go between its triangles.
 
-Files: a Mitsuba XML with what it names, the meshes of moving objects, and element patterns of antennas.
-
-Obstacles: where a ball may go between the triangles of the scenery. Triangles lie in the cells of a
-horizontal grid. Those around the ball are kept until it has gone some way, so that a step looks at few of
-them, and in free flight at none.
+Triangles lie in the cells of a horizontal grid. Those around the ball are kept until it has gone some way, so
+that a step looks at few of them, and in free flight at none.
 """
 
 from __future__ import annotations
 
-import difflib
-import importlib.util
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.errors import AssetError, ScenarioError, SetupError
-from caviar_protocol.host import install_command
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.scenario.schema import pattern_asset
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.mesh.scenery import read_scenery, world_mesh
-from caviar_services.mesh.shapes import SHAPES, ply
-from caviar_services.pattern_files import read_pattern
-
-_BUNDLED = "sionna:"
-
-
-def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
-    """Find the files that a world's ``scenery`` setting stands for.
-
-    Args:
-        scenery: ``sionna:NAME``, the absolute path of a Mitsuba XML, or empty: no scenery.
-
-    Returns:
-        File by asset name: the XML and every file that it names.
-
-    Raises:
-        AssetError: The XML, or a file that it names, is missing or cannot travel, or the XML is wrong
-            (`read_scenery`).
-        SetupError: A scene of sionna-rt is asked for, and sionna-rt is not installed.
-
-    Example:
-        >>> scenery_assets("")
-        {}
-    """
-    if not scenery:
-        return {}
-    xml = scenery_file(scenery)
-    files = read_scenery(xml).files  # errors name the user's file, not a copy at its consumers
-    for name, place in files.items():
-        if not (xml.parent / name).is_file():
-            raise AssetError(
-                f"{place} names {name!r}, and there is no file {xml.parent / name}; put it there"
-            )
-    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in sorted(files)}}
-
-
-def scenery_file(scenery: str) -> Path:
-    """Find the XML that a world's ``scenery`` setting names.
-
-    Args:
-        scenery: ``sionna:NAME``, or the absolute path of a Mitsuba XML.
-
-    Raises:
-        AssetError: There is no such file, or no such scene of sionna-rt.
-        SetupError: A scene of sionna-rt is asked for, and sionna-rt is not installed.
-    """
-    if scenery.startswith(_BUNDLED):
-        return _bundled(scenery.removeprefix(_BUNDLED))
-    xml = Path(scenery)
-    if not xml.is_absolute():
-        raise AssetError(f'{scenery!r} is no scenery; write "sionna:NAME" or "file:PATH.xml"')
-    if xml.is_dir():
-        inside = sorted(file.name for file in xml.glob("*.xml"))
-        hint = f"; there is {', '.join(inside[:5])}" if inside else ""
-        raise AssetError(f"{xml} is a folder; name the XML file of the scenery{hint}")
-    if not xml.is_file():
-        raise AssetError(f"scenery {xml} is not there; correct the path")
-    return xml
-
-
-def object_assets(classes: Iterable[str]) -> dict[str, Path | bytes]:
-    """Make the unit meshes of object classes.
-
-    Args:
-        classes: Keys of `mesh.shapes.SHAPES`.
-
-    Returns:
-        PLY bytes by asset name.
-
-    Example:
-        >>> list(object_assets(["car", "car", "bus"]))
-        ['objects/bus.ply', 'objects/car.ply']
-    """
-    return {f"objects/{name}.ply": ply(SHAPES[name]()) for name in sorted(set(classes))}
-
-
-def pattern_assets(devices: Iterable[DeviceSpec]) -> dict[str, Path | bytes]:
-    """Find the files of the element patterns that devices name.
-
-    Args:
-        devices: Devices of the scenario.
-
-    Returns:
-        File by asset name.
-
-    Raises:
-        ScenarioError: A file is wrong (`read_pattern`); names the device's key.
-    """
-    found: dict[str, Path | bytes] = {}
-    for device in devices:
-        if device.array is not None and device.array.pattern_file:
-            file = Path(device.array.pattern_file)
-            try:
-                read_pattern(file)  # so that an error names the user's file, not a copy of it
-            except AssetError as error:
-                key = Place("devices").at(device.name).at("array").at("pattern_file").key
-                raise ScenarioError(str(error), key=key) from error
-            found[pattern_asset(device.array.pattern_file)] = file
-    return found
-
-
-def _bundled(name: str) -> Path:
-    # The package is located, never imported: its import loads Mitsuba and Dr.Jit, for the sake of a file.
-    spec = importlib.util.find_spec("sionna")
-    folders = (
-        [Path(place) / "rt" / "scenes" for place in (spec.submodule_search_locations or ())] if spec else []
-    )
-    folder = next((place for place in folders if place.is_dir()), None)
-    if folder is None:
-        raise SetupError(
-            f'scenery "{_BUNDLED}{name}" comes with sionna-rt, which the extras `world` and `channel` bring, '
-            f"and which is not installed; run: {install_command('world')}"
-        )
-    xml = folder / name / f"{name}.xml"
-    if "/" in name or not xml.is_file():
-        known = sorted(
-            entry.parent.name for entry in folder.glob("*/*.xml") if entry.stem == entry.parent.name
-        )
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise AssetError(f"sionna-rt has no scene {name!r}; {hint}known: {', '.join(known)}")
-    return xml
-
 
 # Side of a grid cell [m].
 _CELL = 10.0
@@ -379,28 +244,3 @@ def _dot(a: Float64Array, b: Float64Array) -> Float64Array:
     # Written out: the same order of operations on every processor.
     found: Float64Array = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
     return found
-
-
-def scenery_triangles(assets: Mapping[str, Path | bytes]) -> Float64Array:
-    """Read all triangles of a world's scenery.
-
-    Args:
-        assets: What `scenery_assets` gives.
-
-    Returns:
-        Corners in world coordinates [m], Shape ``[T, 3, 3]``.
-
-    Raises:
-        AssetError: A mesh cannot be read or is not finite; names it.
-
-    Example:
-        >>> scenery_triangles(scenery_assets("")).shape
-        (0, 3, 3)
-    """
-    descriptions = [
-        content
-        for name, content in sorted(assets.items())
-        if PurePosixPath(name).match("scenery/*.xml") and isinstance(content, Path)
-    ]
-    meshes = [world_mesh(shape) for xml in descriptions for shape in read_scenery(xml).shapes]
-    return np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])
