@@ -37,7 +37,7 @@ def small_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def compared(
-    source: Path, folder: Path, frames: int = 3, seconds: float = 20.0, **options: Any
+    source: Path, folder: Path, frames: int = 3, seconds: float = 240.0, **options: Any
 ) -> tuple[dict[str, Any], str]:
     """What the JSON says, and the screen."""
     screen = StringIO()
@@ -174,7 +174,7 @@ def test_a_comparison_that_fails_leaves_no_empty_files(
 
     monkeypatch.setattr("caviar_clients.session.scenes.scenes_of", fails)
     monkeypatch.setattr(measure, "has_extra", lambda _: True)
-    json_file, kept = tmp_path / "new" / "t.json", tmp_path / "trade" / "kept"
+    json_file, kept = tmp_path / "t.json", tmp_path / "trade" / "kept"
     kept.parent.mkdir()
     kept.touch()
     with pytest.raises(RunError, match="the worlds fail"):
