@@ -53,7 +53,7 @@ from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.airsim import with_airsim
+from caviar_protocol.scenario.attachments import attached
 from caviar_protocol.scenario.rules import with_overrides
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, .
     scenario = with_overrides(
         load_scenario(arguments.scenario, arguments.set), arguments.frames, arguments.seed, arguments.pace
     )
-    scenario = with_airsim(scenario, arguments.airsim)
+    scenario = attached(scenario, arguments.attach)
     directory = _made(arguments.directory)
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
     versions = versions_of(scenario)
@@ -303,7 +303,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--seed", type=int, default=None, help="instead of the scenario's")
     found.add_argument("--pace", default=None, help="instead of the scenario's: free, realtime or a factor")
     found.add_argument("--set", action="append", default=[], help="KEY=VALUE, instead of the scenario's")
-    found.add_argument("--airsim", default="", help="HOST:PORT: scripts for AirSim fly the objects")
+    found.add_argument("--attach", action="append", default=[], help="NAME=VALUE of an attachment")
     found.add_argument(
         "--restarted", action="store_true", help="started again whenever its status is not 0: 0 after SIGTERM"
     )

@@ -29,8 +29,8 @@ from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import ReplaySpec, Scenario
 from caviar_protocol.scenario.conversion import Source
 
-PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services")
-"""Code that takes part in every run."""
+PACKAGES = ("caviar_protocol", "caviar_space", "caviar_broker", "caviar_services", "caviar_bridges")
+"""Code that takes part in a run."""
 LIBRARIES = ("numpy", "msgspec", "pyzmq", "mcap")
 TRACING = ("sionna-rt", "mitsuba", "drjit")
 TRAFFIC = ("libsumo", "eclipse-sumo")

@@ -12,10 +12,10 @@ import sys
 import numpy as np
 
 from caviar_protocol.topics import WaypointCommand
-from caviar_services.mesh.scenery import RadioMaterial
-from caviar_services.mesh.shapes import box, joined
 from caviar_services.world.base import ObjectState
 from caviar_services.world.engine import Engine, SceneryMesh
+from caviar_space.meshes import box, joined
+from caviar_space.mitsuba_xml import RadioMaterial
 
 POINTS = [[20, 10, 15], [-20, 10, 25], [-20, -10, 15], [20, -10, 25]]  # of the UAV's flight [m]
 UAV_M_S, CAR_M_S, CIRCLE_M = 6.0, 10.0, 15.0

@@ -18,7 +18,16 @@ from caviar_protocol.spec import rows
 
 from . import markdown
 
-PACKAGES = ("caviar", "caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients")
+PACKAGES = (
+    "caviar",
+    "caviar_protocol",
+    "caviar_space",
+    "caviar_broker",
+    "caviar_services",
+    "caviar_bridges",
+    "caviar_clients",
+    "caviar_labs",
+)
 """Import packages; those that are not installed are left out."""
 
 _HEAD = """\

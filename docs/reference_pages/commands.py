@@ -39,13 +39,13 @@ def _command(command: Any, parent: Any, path: str, level: int) -> Iterator[str]:
     usage = " ".join([path, *command.collect_usage_pieces(context)])
     yield from ("#" * level + f" {path}", "", spec.markdown(inspect.cleandoc(command.help or "")), "")
     yield from ("```text", usage, "```", "")
+    shown = [p for p in command.get_params(context) if p.name != "help" and not getattr(p, "hidden", False)]
     for kind in ("argument", "option"):
-        shown = [p for p in command.params if not getattr(p, "hidden", False)]
         found = [_row(parameter) for parameter in shown if parameter.param_type_name == kind]
         if found:
             yield from markdown.table((kind, "default", "meaning"), found)
-    for name in getattr(command, "commands", {}):
-        yield from _command(command.commands[name], context, f"{path} {name}", level + 1)
+    for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
+        yield from _command(command.get_command(context, name), context, f"{path} {name}", level + 1)
 
 
 def _row(parameter: Any) -> tuple[str, str, str]:

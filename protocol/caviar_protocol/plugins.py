@@ -3,8 +3,11 @@
 | group | name | value |
 | --- | --- | --- |
 | ``caviar.services`` | ``role:name`` | a subclass of `Service` |
+| ``caviar.plants`` | engine of a quadrotor in the world ``flight`` | a subclass of its `Plant` |
+| ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
 | ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |
+| ``caviar.commands`` | what is typed after ``caviar`` | a function for Typer, or a ``typer.Typer`` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 
 What is built in stands in a table of its own and goes first; a distribution adds names, and changes none.
@@ -14,10 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from caviar_protocol.errors import DeclarationError
+
+# It takes longer to load than the metadata: only a process that looks for plug-ins loads it.
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 
@@ -28,8 +34,19 @@ PREFIX = "caviar."
 # Once a process: looking for entry points reads the metadata of every installed distribution.
 @cache
 def _all() -> Mapping[str, tuple[EntryPoint, ...]]:
+    from importlib.metadata import entry_points
+
     found = entry_points()
     return {group: tuple(found.select(group=group)) for group in found.groups if group.startswith(PREFIX)}
+
+
+def claims(group: str) -> tuple[EntryPoint, ...]:
+    """The entry points of a group, also several of one name.
+
+    Args:
+        group: Its name.
+    """
+    return _all().get(group, ())
 
 
 @cache
@@ -47,11 +64,11 @@ def plugins(group: str) -> Mapping[str, EntryPoint]:
         {}
     """
     found: dict[str, EntryPoint] = {}
-    for point in _all().get(group, ()):
+    for point in claims(group):
         # The same value twice is one distribution that is installed twice, in editable mode for instance.
         other = found.setdefault(point.name, point)
         if other.value != point.value:
-            both = (f"{each.value} by {_distribution(each)}" for each in (other, point))
+            both = (origin(each) for each in (other, point))
             raise DeclarationError(
                 f"{point.name} is registered twice in {group}, as {' and as '.join(both)}; uninstall one"
             )
@@ -68,7 +85,7 @@ def load_plugin(point: EntryPoint, kind: type[T]) -> T:
     Raises:
         DeclarationError: It cannot be imported, or is something else; names the distribution and the object.
     """
-    what = f"{point.name} of {point.group} is {point.value} of {_distribution(point)}, which"
+    what = f"{point.name} of {point.group} is {origin(point)}, which"
     try:
         found = point.load()
     except Exception as error:  # whatever a module that is not ours does when it is imported
@@ -78,5 +95,6 @@ def load_plugin(point: EntryPoint, kind: type[T]) -> T:
     return found
 
 
-def _distribution(point: EntryPoint) -> str:
-    return point.dist.name if point.dist is not None else "an unnamed distribution"
+def origin(point: EntryPoint) -> str:
+    """Object of an entry point, and the distribution that declares it, for errors."""
+    return f"{point.value} of {point.dist.name if point.dist is not None else 'an unnamed distribution'}"

@@ -286,6 +286,16 @@ def _wrong_device(device: Device, objects: set[str]) -> str:
         return f"{what} parent {device.parent!r} is no object of the scene"
     if device.parent and not device.name.startswith(f"{device.parent}/"):
         return f"{what} on {device.parent!r}, its name has to be {device.parent}/NAME"
+    return _wrong_device_number(device)
+
+
+def wrong_device_number(scene: Scene) -> str:
+    """The first device with a pose or another number that cannot be."""
+    return next((found for device in scene.devices if (found := _wrong_device_number(device))), "")
+
+
+def _wrong_device_number(device: Device) -> str:
+    what = f"device {device.name!r}:"
     for field in device.__struct_fields__:
         value = getattr(device, field)
         numbers = value if isinstance(value, tuple) else (value,)

@@ -1,9 +1,10 @@
 """Implementations by role and name.
 
 Strings, loaded late: importing this module imports no implementation, and an implementation
-imports its heavy libraries only when it prepares. Other distributions add theirs through the
-entry-point group ``caviar.services`` (name ``role:name``, value ``module:Class``). What is not
-registered at all can be named by its place, ``module:Class``, as long as Python finds the module.
+imports its heavy libraries only when it prepares. Other distributions, and `caviar_bridges` of this
+one, add theirs through the entry-point group ``caviar.services`` (name ``role:name``, value
+``module:Class``). What is not registered at all can be named by its place, ``module:Class``, as long as
+Python finds the module.
 
 `scenario_schema` makes a JSON Schema of scenario files, for editors that complete and check TOML, from
 `caviar_protocol.scenario.schema.Scenario` and the ``Settings`` of every registered implementation. It has the
@@ -20,23 +21,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
 
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import Input, Role
-from caviar_protocol.plugins import plugins
+from caviar_protocol.plugins import origin, plugins
 from caviar_protocol.scenario.schema import REMOTE, Run, Scenario
 from caviar_services.service import NoSettings, Service
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
     "world:sumo-actuated": "caviar_services.world.sumo_actuated:ActuatedSumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
-    "world:airsim": "caviar_services.world.airsim:AirSimWorld",
-    "world:panda3d": "caviar_services.world.panda3d:Panda3dWorld",
     "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
     "channel:free-space": "caviar_services.channel.statistical.free_space:FreeSpaceChannel",
     "channel:geometric": "caviar_services.channel.statistical.geometric:GeometricChannel",
@@ -48,7 +50,6 @@ BUILT_IN: dict[str, str] = {
     "agent:los-beam": "caviar_services.agent.baselines:LosBeamAgent",
     "agent:random": "caviar_services.agent.baselines:RandomAgent",
     "agent:oracle": "caviar_services.agent.baselines:OracleAgent",
-    "agent:airsim": "caviar_services.agent.airsim:AirSimAgent",
     "agent:waypoints": "caviar_services.agent.baselines:WaypointsAgent",
     "agent:exhaustive-sweep": "caviar_services.agent.sweeps:ExhaustiveSweepAgent",
     "agent:hierarchical-sweep": "caviar_services.agent.sweeps:HierarchicalSweepAgent",
@@ -57,7 +58,6 @@ BUILT_IN: dict[str, str] = {
     "agent:out-of-band": "caviar_services.agent.out_of_band:OutOfBandAgent",
     "agent:ucb": "caviar_services.agent.bandits:UcbAgent",
     "agent:thompson": "caviar_services.agent.bandits:ThompsonAgent",
-    "agent:mavlink": "caviar_services.agent.mavlink:MavlinkAgent",
     "agent:learner": "caviar_services.agent.learner:LearnerAgent",
     "agent:policy": "caviar_services.agent.policy:PolicyAgent",
     "recorder:mcap": "caviar_services.recorder.mcap:McapRecorder",
@@ -67,7 +67,6 @@ BUILT_IN: dict[str, str] = {
 ENTRY_POINT_GROUP = "caviar.services"
 
 
-# Once a process: looking for entry points reads the metadata of every installed distribution.
 @cache
 def registered() -> dict[str, str]:
     """Everything registered, built in and by entry points.
@@ -82,13 +81,14 @@ def registered() -> dict[str, str]:
         >>> registered()["agent:random"]
         'caviar_services.agent.baselines:RandomAgent'
     """
-    added = {name: point.value for name, point in plugins(ENTRY_POINT_GROUP).items()}
-    for name, value in added.items():
-        if BUILT_IN.get(name, value) != value:
+    added = plugins(ENTRY_POINT_GROUP)
+    for name, point in added.items():
+        if BUILT_IN.get(name, point.value) != point.value:
             raise DeclarationError(
-                f"{name} is registered twice, as {BUILT_IN[name]} and as {value}; uninstall or rename one"
+                f"{name} is registered twice, as {BUILT_IN[name]} and as {origin(point)}; "
+                "uninstall or rename one of them"
             )
-    return BUILT_IN | added
+    return BUILT_IN | {name: point.value for name, point in added.items()}
 
 
 def with_inputs(cls: type[Service[Any]], inputs: Sequence[Input]) -> type[Service[Any]]:
@@ -125,7 +125,10 @@ def load(role: str, name: str) -> type[Service[Any]]:
         >>> load("agent", "random").__name__
         'RandomAgent'
     """
-    target = name if ":" in name else _registered_target(role, name)
+    target = where = name if ":" in name else BUILT_IN.get(f"{role}:{name}", "")
+    if not target:  # a process of a service that is built in reads no metadata
+        point = _added(role, name)
+        target, where = point.value, origin(point)
     module_name, _, class_name = target.partition(":")
     try:
         module = import_module(module_name)
@@ -142,31 +145,33 @@ def load(role: str, name: str) -> type[Service[Any]]:
                 "; modules are looked for beside the scenario, in the current folder, among what is "
                 "installed and in PYTHONPATH"
             )
-        raise DeclarationError(f"{role} {name!r} cannot be loaded from {target}: {text}") from error
+        raise DeclarationError(f"{role} {name!r} cannot be loaded from {where}: {text}") from error
     if cls is None:
         classes = [key for key, value in vars(module).items() if _is_of_role(value, role)]
         found = suggestion(class_name, classes) if classes else f"it has no class of role {role!r}"
         place = getattr(module, "__file__", None) or module_name
-        raise DeclarationError(f"{role} {name!r}: {place} has no attribute {class_name!r}; {found}")
+        raise DeclarationError(
+            f"{role} {name!r} is {where}: {place} has no attribute {class_name!r}; {found}"
+        )
     if not (isinstance(cls, type) and issubclass(cls, Service)):
-        raise DeclarationError(f"{role} {name!r} is {target}, which is not a Service")
+        raise DeclarationError(f"{role} {name!r} is {where}, which is not a Service")
     declared = getattr(cls, "role", None)
     if declared != role:
-        raise DeclarationError(f"{role} {name!r} is {target}, whose role is {declared!r}")
+        raise DeclarationError(f"{role} {name!r} is {where}, whose role is {declared!r}")
     if inspect.isabstract(cls):
         missing = ", ".join(sorted(cls.__abstractmethods__))
-        raise DeclarationError(f"{role} {name!r} is {target}, which does not define: {missing}")
+        raise DeclarationError(f"{role} {name!r} is {where}, which does not define: {missing}")
     # Abstract methods are found above; a class attribute that is not set would fail where it is first read.
     missing = ", ".join(name for name in cls.attributes_to_set if not hasattr(cls, name))
     if missing:
-        raise DeclarationError(f"{role} {name!r} is {target}, which does not set: {missing}")
+        raise DeclarationError(f"{role} {name!r} is {where}, which does not set: {missing}")
     if cls.checkpoints:
         missing = " and ".join(
             method for method in ("checkpoint", "restore") if getattr(cls, method) is getattr(Service, method)
         )
         if missing:
             raise DeclarationError(
-                f"{role} {name!r} is {target}, which sets checkpoints = True and does not define {missing}; "
+                f"{role} {name!r} is {where}, which sets checkpoints = True and does not define {missing}; "
                 "define checkpoint() and restore(), or leave out checkpoints if nothing outlives a frame"
             )
     # What is saved by nobody would be found out with the first service that is killed.
@@ -174,7 +179,7 @@ def load(role: str, name: str) -> type[Service[Any]]:
     unsaid = not any("checkpoints" in vars(base) for base in own)
     if unsaid and any({"checkpoint", "restore"} & {*vars(base)} for base in own):
         raise DeclarationError(
-            f"{role} {name!r} is {target}, which defines checkpoint() or restore() and does not say whether "
+            f"{role} {name!r} is {where}, which defines checkpoint() or restore() and does not say whether "
             "they are used; write checkpoints = True in the class"
         )
     for base in cls.__mro__[1:]:
@@ -182,7 +187,7 @@ def load(role: str, name: str) -> type[Service[Any]]:
         inherited = vars(base).get("Settings", NoSettings)
         if inherited is not NoSettings and not issubclass(cls.Settings, inherited):
             raise DeclarationError(
-                f"{role} {name!r} is {target}, whose Settings is {cls.Settings.__name__}: it has to be a "
+                f"{role} {name!r} is {where}, whose Settings is {cls.Settings.__name__}: it has to be a "
                 f"subclass of {inherited.__name__}, that of {base.__name__}"
             )
     return cls
@@ -218,13 +223,13 @@ def find_modules_in(folder: Path) -> None:
         sys.path.append(text)
 
 
-def _registered_target(role: str, name: str) -> str:
-    known = registered()
-    roles = sorted({key.split(":", 1)[0] for key in known})
+def _added(role: str, name: str) -> EntryPoint:
+    """The entry point of an implementation that is not built in."""
+    roles = sorted({key.split(":", 1)[0] for key in registered()})
     if role not in roles:
         raise DeclarationError(f"no service has the role {role!r}; one of {', '.join(roles)}")
-    target = known.get(f"{role}:{name}")
-    if target is None:
+    point = plugins(ENTRY_POINT_GROUP).get(f"{role}:{name}")
+    if point is None:
         names = registered_names(role)
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
@@ -233,7 +238,7 @@ def _registered_target(role: str, name: str) -> str:
             module, _, cls = name.rpartition(".")
             text += f"; a class of your own is named {module or name}:{cls if module else 'CLASS'}"
         raise DeclarationError(text)
-    return target
+    return point
 
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -36,7 +36,7 @@ from typing import Any
 
 import zmq
 
-from caviar_broker.bench import WARM_UP, deliveries, measure
+from caviar_labs.broker_bench import WARM_UP, deliveries, measure
 
 HEADER = bytes(60)
 """Stands for what the broker tells with each product."""

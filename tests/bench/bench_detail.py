@@ -33,7 +33,7 @@ from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 STATION = (8.5, 21.0, 27.0)
 """Position of the transmitter [m]."""

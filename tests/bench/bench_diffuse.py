@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.tradeoff.errors import Key, UserChannel, differences, error_fields
-from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.scenes import Scenes, scenes_of
-from caviar_clients.tradeoff.worker import Rung
+from caviar_clients.session.scenes import Scenes, scenes_of
+from caviar_labs.tradeoff.errors import Key, UserChannel, differences, error_fields
+from caviar_labs.tradeoff.ladder import Setting
+from caviar_labs.tradeoff.worker import Rung
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"
 WITHOUT, ONE, OTHER, RAYS = "without", "seed 1", "seed 2", "other rays"

@@ -46,7 +46,8 @@ from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.scenery import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets
+from caviar_space.scenery import scenery_assets
 
 FREQUENCY_HZ = 28e9
 

@@ -18,8 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from caviar_protocol.spec import table
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Model,
     Thing,
     antenna,
@@ -29,6 +28,7 @@ from caviar_services.channel.stability.lab import (
     sionna,
     total,
 )
+from caviar_protocol.spec import table
 
 FREQUENCIES = (28e9, 60e9)
 SIZE = (0.3, 0.5, 1.72)

@@ -23,7 +23,8 @@ from caviar_protocol.topics import LidarDevice, Scene
 from caviar_services.sensors.base import active_variant
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings, ray_directions
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.scenery import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets
+from caviar_space.scenery import scenery_assets
 
 
 def traffic(frame: int, count: int) -> Scene:

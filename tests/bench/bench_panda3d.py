@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from caviar_bridges.panda3d.world import Panda3dSettings, Panda3dWorld
 from caviar_protocol.scenario import DeviceSpec, load_scenario
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.panda3d import Panda3dSettings, Panda3dWorld
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 SIZES = ((320, 240), (640, 480), (1280, 720))

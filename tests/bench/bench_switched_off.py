@@ -27,7 +27,7 @@ from caviar_services.channel.sionna.materials import UsedSurfaces
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 METAL = {
     name: {"relative_permittivity": 1.0, "conductivity_s_per_m": 1e7}

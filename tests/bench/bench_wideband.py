@@ -28,7 +28,7 @@ import numpy as np
 from bench_channel import canyon
 from bench_ladder import world
 
-from caviar_clients.tradeoff.errors import nmse
+from caviar_labs.tradeoff.errors import nmse
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.conform import street
+from caviar_labs.conform import street
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.multipath import TAPS_BEFORE
 

@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from caviar_clients.conform.client import End, Started
+from caviar_labs.conform.client import End, Started
 
 TICK_S = 0.005
 """[s] between two looks of the nursery at what has ended."""
@@ -143,7 +143,7 @@ def preload() -> None:
     import msgpack  # type: ignore[import-untyped]  # noqa: F401
     import zmq  # noqa: F401
 
-    import caviar_clients.conform.street
+    import caviar_labs.conform.street
     import caviar_services.runner  # noqa: F401
     from caviar_services.registry import load
 
@@ -152,7 +152,7 @@ def preload() -> None:
         load(role, use)  # type: ignore[arg-type]
     load("recorder", "mcap")
     # A channel of the broken client takes its answers from there, and would import it in each life.
-    caviar_clients.conform.street.product("scene", "traffic", 0)
+    caviar_labs.conform.street.product("scene", "traffic", 0)
 
 
 def live(order: dict[str, Any]) -> None:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import msgpack
 import pytest
 
-from caviar_clients.conform import street
-from caviar_clients.conform.canonical import (
+from caviar_labs.conform import street
+from caviar_labs.conform.canonical import (
     check_products,
     first_difference,
     not_canonical,
@@ -16,7 +16,7 @@ from caviar_clients.conform.canonical import (
     product_digest,
     unpack,
 )
-from caviar_clients.conform.client import Failed, Received
+from caviar_labs.conform.client import Failed, Received
 
 HEADER, BODY = street.product("scene", "traffic", 3)
 POSITION = pack([0.0, -10.0, 9.0])

@@ -22,10 +22,10 @@ import zmq
 from client_nursery import Forked, Nursery
 
 from caviar_clients.cli.main import app
-from caviar_clients.conform import Verdict, cases, conform, street
-from caviar_clients.conform.case import as_markdown, repeated
-from caviar_clients.conform.client import End, Rules, Started, Wire, unpack
-from caviar_clients.conform.session import Seen, Session
+from caviar_labs.conform import Verdict, cases, conform, street
+from caviar_labs.conform.case import as_markdown, repeated
+from caviar_labs.conform.client import End, Rules, Started, Wire, unpack
+from caviar_labs.conform.session import Seen, Session
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.topics import Scene
@@ -79,7 +79,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Clients in Python are forks of one process, and scenery of the kit goes to a folder of the tests."""
     Forked.nursery = Nursery()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("caviar_clients.conform.Started", Forked)
+        patch.setattr("caviar_labs.conform.Started", Forked)
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
     Forked.nursery.close()
@@ -562,6 +562,6 @@ def test_the_command_prints_a_table_writes_files_and_tells_by_its_status(tmp_pat
 def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    monkeypatch.setattr("caviar_clients.conform.conform", lambda *_, **__: pytest.fail("a case was played"))
+    monkeypatch.setattr("caviar_labs.conform.conform", lambda *_, **__: pytest.fail("a case was played"))
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
         app(["conform", "--listen", ANY, option, str(tmp_path)], standalone_mode=False)

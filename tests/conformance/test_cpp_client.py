@@ -22,11 +22,11 @@ from cpp_programs import CPP, PROBE, STRICT, WORLD, compiled, program_folder
 from scenarios_support import ROOT, environment, eventually, recorded_below, running
 
 from caviar_broker.control.socket import ask
-from caviar_clients.conform import conform
-from caviar_clients.conform.canonical import Answer
-from caviar_clients.conform.client import Received, Rules, Started, Wire
-from caviar_clients.conform.session import Seen, Session
-from caviar_clients.conform.street import Inputs
+from caviar_labs.conform import conform
+from caviar_labs.conform.canonical import Answer
+from caviar_labs.conform.client import Received, Rules, Started, Wire
+from caviar_labs.conform.session import Seen, Session
+from caviar_labs.conform.street import Inputs
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import RunError
 from caviar_protocol.geometry import is_mesh_name

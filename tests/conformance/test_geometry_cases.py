@@ -10,15 +10,15 @@ from typing import Any, ClassVar
 
 import pytest
 
-from caviar_clients.conform import Rules, conform
+from caviar_labs.conform import Rules, conform
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.topics import Depth
 from caviar_services.frame import Frame, StepResult
-from caviar_services.mesh.shapes import box, ply, unit_box
 from caviar_services.runner import Runner
 from caviar_services.service import NoSettings, Service
 from caviar_services.world.base import ObjectState
 from caviar_services.world.engine import Engine, EngineWorld
+from caviar_space.meshes import box, ply, unit_box
 
 pytestmark = pytest.mark.slow
 

@@ -24,8 +24,8 @@ from test_websocket_agent import WITHIN_S, WebRun
 
 from caviar_broker.control.socket import ask
 from caviar_broker.http.process import gateway_in_front
-from caviar_clients.conform import Verdict, cases, conform
-from caviar_clients.conform.client import Rules
+from caviar_labs.conform import Verdict, cases, conform
+from caviar_labs.conform.client import Rules
 from caviar_protocol.recording import Recording
 
 CLIENT = ROOT / "clients" / "js"

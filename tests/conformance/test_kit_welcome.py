@@ -10,10 +10,10 @@ import pytest
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import briefings, plan_run, with_ownership
-from caviar_clients.conform import session as kit
-from caviar_clients.conform.client import Rules, pack, unpack
-from caviar_clients.conform.session import Seen, Session
-from caviar_clients.conform.street import SCENARIO, scenario_of
+from caviar_labs.conform import session as kit
+from caviar_labs.conform.client import Rules, pack, unpack
+from caviar_labs.conform.session import Seen, Session
+from caviar_labs.conform.street import SCENARIO, scenario_of
 from caviar_protocol import messages as m
 from caviar_protocol.codec import encode_message
 from caviar_protocol.scenario import parse_scenario

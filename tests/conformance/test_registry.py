@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.scenario.rules import world_of
 from caviar_services.recorder.mcap import McapRecorder
-from caviar_services.registry import BUILT_IN, load
+from caviar_services.registry import load, registered
 from caviar_services.testing import CONFORMANCE, ServiceConformance, samples
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
@@ -129,7 +129,7 @@ def _tests_of(key: str) -> type[ServiceConformance]:
     return tests
 
 
-for _key in BUILT_IN:
+for _key in registered():
     _tests = _tests_of(_key)
     globals()[_tests.__name__] = _tests
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from caviar_labs.stability.lab import Thing, scene
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Pose, UnitQuaternion, Vector, rotation_matrix
 from caviar_protocol.topics import Lidar, LidarDevice, Scene
 from caviar_protocol.topics.scene import Device
-from caviar_services.channel.stability.lab import Thing, scene
 from caviar_services.sensors.lidar import LidarSensors, LidarSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 

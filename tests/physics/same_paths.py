@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from caviar_labs.stability.lab import Array, Thing, antenna, measure, scene, sionna
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.topics import AntennaArray, Channel
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.lab import Array, Thing, antenna, measure, scene, sionna
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 POSITIONS = int(os.environ.get("CAVIAR_SAME_PATHS", "20"))
 """Receivers that are drawn in each scene."""

@@ -18,8 +18,8 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import Pose, compose, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import CameraDevice
-from caviar_services.mesh.shapes import box, ply
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
+from caviar_space.meshes import box, ply
 
 pytestmark = pytest.mark.channel
 

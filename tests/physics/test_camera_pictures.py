@@ -14,8 +14,8 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import CameraDevice, Scene
-from caviar_services.mesh.shapes import box, ply
 from caviar_services.sensors.camera import CameraSensors, CameraSettings
+from caviar_space.meshes import box, ply
 
 pytestmark = pytest.mark.channel
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_services.channel.stability.formulas import C
-from caviar_services.channel.stability.lab import Plate, antenna, measure, scene, sionna, write_scenery
+from caviar_labs.stability.formulas import C
+from caviar_labs.stability.lab import Plate, antenna, measure, scene, sionna, write_scenery
 
 pytestmark = pytest.mark.channel
 

@@ -10,13 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.multipath import subcarrier_offsets
-from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
-from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.propagation.patterns import Patterns, element_amplitude, radiated_field
-from caviar_services.channel.stability.formulas import C, turn, vertical
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C, turn, vertical
+from caviar_labs.stability.lab import (
     CONDUCTOR,
     Array,
     Lab,
@@ -29,10 +24,15 @@ from caviar_services.channel.stability.lab import (
     sionna,
     square,
 )
+from caviar_protocol.multipath import subcarrier_offsets
+from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix
+from caviar_protocol.topics import AntennaArray, Carrier, Channel, Panel
+from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.propagation.patterns import Patterns, element_amplitude, radiated_field
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.pattern_files import read_pattern
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.topics import Channel
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.formulas import C, mirrored
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C, mirrored
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -22,6 +20,8 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.topics import Channel
+from caviar_services.channel.base import ChannelModel
 
 F = 28e9
 TX, RX = np.array([-7.0, -9.0, 2.0]), np.array([6.0, -7.0, 1.5])

@@ -8,14 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation import utd as module
-from caviar_services.channel.propagation.fresnel import Media
-from caviar_services.channel.propagation.utd import edge_fields, wedges_of
-from caviar_services.channel.sionna import path_table
-from caviar_services.channel.stability.formulas import EPSILON_0, C, turn, unit
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import EPSILON_0, C, turn, unit
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -25,6 +19,12 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import Interaction
+from caviar_services.channel.propagation import utd as module
+from caviar_services.channel.propagation.fresnel import Media
+from caviar_services.channel.propagation.utd import edge_fields, wedges_of
+from caviar_services.channel.sionna import path_table
 
 pytestmark = pytest.mark.channel
 

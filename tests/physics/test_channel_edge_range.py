@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.errors import CaviarError
-from caviar_protocol.topics import Channel, Interaction
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Plate,
     Thing,
     antenna,
@@ -22,6 +19,9 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.errors import CaviarError
+from caviar_protocol.topics import Channel, Interaction
+from caviar_services.channel.base import ChannelModel
 
 pytestmark = pytest.mark.channel
 

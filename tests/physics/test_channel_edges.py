@@ -8,11 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import Channel, Interaction
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.formulas import C
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -23,7 +20,10 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
-from caviar_services.channel.stability.waves import around
+from caviar_labs.stability.waves import around
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import Channel, Interaction
+from caviar_services.channel.base import ChannelModel
 
 pytestmark = pytest.mark.channel
 

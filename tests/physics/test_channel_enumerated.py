@@ -11,16 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.digest import payload_digest
-from caviar_protocol.scenario import DeviceSpec
-from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.enumeration import scenery_chains
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.formulas import C, itu_permittivity, mirrored, spherical_wave
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C, itu_permittivity, mirrored, spherical_wave
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -30,6 +22,14 @@ from caviar_services.channel.stability.lab import (
     scene,
     write_scenery,
 )
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.enumeration import scenery_chains
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 STATION = (-3.0, -8.3, 5.0)

@@ -11,12 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.arrays import Float64Array
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
-from caviar_services.channel.paths import Antenna
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Lab,
     Material,
     Plate,
@@ -28,7 +23,12 @@ from caviar_services.channel.stability.lab import (
     scene,
     square,
 )
-from caviar_services.mesh.shapes import box
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.errors import AssetError, ScenarioError
+from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
+from caviar_services.channel.paths import Antenna
+from caviar_space.meshes import box
 
 pytestmark = pytest.mark.channel
 

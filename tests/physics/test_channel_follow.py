@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from same_paths import model
 
+from caviar_labs.stability.lab import Thing, antenna, channel_of, frame_of, scene
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.topics import AntennaArray, Channel, Scene
 from caviar_services.channel.base import ChannelModel
 from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.lab import Thing, antenna, channel_of, frame_of, scene
 
 CANYON = "simple_street_canyon_with_cars"
 SAMPLES = 40_000

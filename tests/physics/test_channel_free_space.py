@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from caviar_labs.stability.formulas import C, spherical_wave, turn, vertical
+from caviar_labs.stability.lab import Thing, antenna, free_space, measure, scene
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.stability.formulas import C, spherical_wave, turn, vertical
-from caviar_services.channel.stability.lab import Thing, antenna, free_space, measure, scene
 
 
 @pytest.mark.parametrize("seed", range(4))

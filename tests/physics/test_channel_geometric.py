@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from caviar_labs.stability.formulas import spherical_wave
+from caviar_labs.stability.lab import Thing, antenna, free_space, geometric, measure, scene
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Channel, Scene
-from caviar_services.channel.stability.formulas import spherical_wave
-from caviar_services.channel.stability.lab import Thing, antenna, free_space, geometric, measure, scene
 
 C = 299_792_458.0
 BS = (3.0, -2.0, 11.0)

@@ -9,9 +9,9 @@ import pytest
 from same_paths import model
 from test_channel_follow import stepped
 
+from caviar_labs.stability.lab import Thing, antenna, scene
 from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
 from caviar_services.channel.sionna.ray_launcher import RAYS_AT_ONCE, rays_within
-from caviar_services.channel.stability.lab import Thing, antenna, scene
 
 pytestmark = pytest.mark.channel
 

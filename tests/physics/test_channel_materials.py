@@ -9,19 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.topics import Channel, Scene
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.materials import (
-    ItuMaterial,
-    MaterialPolicy,
-    MaterialSettings,
-    itu_material,
-)
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.formulas import (
+from caviar_labs.stability.formulas import (
     itu_permittivity,
     mirrored,
     reflected,
@@ -29,7 +17,7 @@ from caviar_services.channel.stability.formulas import (
     unit,
     vertical,
 )
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Array,
     Lab,
     Material,
@@ -44,8 +32,20 @@ from caviar_services.channel.stability.lab import (
     square,
     write_scenery,
 )
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.errors import AssetError, ScenarioError
+from caviar_protocol.topics import Channel, Scene
+from caviar_services.channel.base import ChannelModel
+from caviar_services.channel.sionna.materials import (
+    ItuMaterial,
+    MaterialPolicy,
+    MaterialSettings,
+    itu_material,
+)
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

@@ -10,11 +10,7 @@ import pytest
 from msgspec.structs import replace
 from same_paths import digest
 
-from caviar_protocol.errors import ScenarioError
-from caviar_protocol.topics import Channel
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Plate,
     antenna,
     carriers,
@@ -23,6 +19,10 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.errors import ScenarioError
+from caviar_protocol.topics import Channel
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

@@ -10,10 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
-from caviar_services.channel.stability.formulas import (
+from caviar_labs.stability.formulas import (
     EPSILON_0,
     itu_permittivity,
     mirrored,
@@ -22,7 +19,7 @@ from caviar_services.channel.stability.formulas import (
     unit,
     vertical,
 )
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -32,6 +29,9 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.errors import AssetError, ScenarioError
+from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
 

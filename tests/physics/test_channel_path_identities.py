@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from same_paths import SCENES, model
 
-from caviar_protocol.multipath import changes
-from caviar_protocol.topics import Channel, Scene
-from caviar_services.channel.stability.formulas import C
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C
+from caviar_labs.stability.lab import (
     Plate,
     Thing,
     antenna,
@@ -21,6 +19,8 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.multipath import changes
+from caviar_protocol.topics import Channel, Scene
 
 pytestmark = pytest.mark.channel
 

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import Channel
-from caviar_services.channel.stability.formulas import C, mirrored, turn, unit
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C, mirrored, turn, unit
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -25,6 +23,8 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import Channel
 
 pytestmark = pytest.mark.channel
 

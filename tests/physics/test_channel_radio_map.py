@@ -9,6 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caviar_labs.stability.formulas import C, turn
+from caviar_labs.stability.lab import (
+    Array,
+    Plate,
+    Thing,
+    antenna,
+    measure,
+    scene,
+    sionna,
+    write_scenery,
+)
 from caviar_protocol.errors import RunError
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, Scene
@@ -24,17 +35,6 @@ from caviar_services.channel.radio_map.mapping import (
     transmitters_of,
 )
 from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.stability.formulas import C, turn
-from caviar_services.channel.stability.lab import (
-    Array,
-    Plate,
-    Thing,
-    antenna,
-    measure,
-    scene,
-    sionna,
-    write_scenery,
-)
 
 pytestmark = pytest.mark.channel
 

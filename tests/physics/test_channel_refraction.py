@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from same_paths import SCENES, things
 
-from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -20,7 +19,8 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
-from caviar_services.world.scenery import scenery_assets
+from caviar_protocol.topics import Channel, Interaction, Scene
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

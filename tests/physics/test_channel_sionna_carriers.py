@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, Scene
-from caviar_services.channel.stability.formulas import (
+from caviar_labs.stability.formulas import (
     itu_permittivity,
     mirrored,
     reflected,
@@ -18,7 +16,9 @@ from caviar_services.channel.stability.formulas import (
     unit,
     vertical,
 )
-from caviar_services.channel.stability.lab import Plate, Thing, antenna, measure, scene, sionna, write_scenery
+from caviar_labs.stability.lab import Plate, Thing, antenna, measure, scene, sionna, write_scenery
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import AntennaArray, Scene
 
 pytestmark = pytest.mark.channel
 

@@ -8,10 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.formulas import (
+from caviar_labs.stability.formulas import (
     C,
     horizontal,
     itu_permittivity,
@@ -22,7 +19,7 @@ from caviar_services.channel.stability.formulas import (
     unit,
     vertical,
 )
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     antenna,
@@ -33,6 +30,9 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import AntennaArray
+from caviar_services.channel.base import ChannelModel
 
 pytestmark = pytest.mark.channel
 

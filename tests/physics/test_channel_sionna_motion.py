@@ -11,13 +11,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from caviar_protocol.codec import encode_payload
-from caviar_protocol.digest import payload_digest
-from caviar_protocol.space.coordinates import multiply, quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.stability.formulas import C, mirrored
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import C, mirrored
+from caviar_labs.stability.lab import (
     Plate,
     Thing,
     antenna,
@@ -27,6 +22,11 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.codec import encode_payload
+from caviar_protocol.digest import payload_digest
+from caviar_protocol.space.coordinates import multiply, quaternion_from_euler
+from caviar_protocol.topics import AntennaArray, Channel, Interaction, Scene
+from caviar_services.channel.base import ChannelModel
 
 pytestmark = pytest.mark.channel
 
@@ -266,7 +266,7 @@ PROCESS = """
 import sys
 sys.path[:0] = [{here!r}]
 from pathlib import Path
-from caviar_services.channel.stability.lab import measure, sionna, write_scenery
+from caviar_labs.stability.lab import measure, sionna, write_scenery
 from test_channel_sionna_motion import F, GROUND, WALL, digest, traffic
 assets = write_scenery(Path({folder!r}), [GROUND, WALL])
 model = sionna(F, assets, bodies=6, **{settings!r})

@@ -9,11 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.topics import AntennaArray, Carrier, Channel
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.formulas import (
+from caviar_labs.stability.formulas import (
     C,
     itu_permittivity,
     mirrored,
@@ -23,7 +19,7 @@ from caviar_services.channel.stability.formulas import (
     unit,
     vertical,
 )
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.lab import (
     Array,
     Plate,
     Thing,
@@ -33,6 +29,10 @@ from caviar_services.channel.stability.lab import (
     sionna,
     write_scenery,
 )
+from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.topics import AntennaArray, Carrier, Channel
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
 
 pytestmark = pytest.mark.channel

@@ -9,17 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.topics import Channel, Interaction
-from caviar_services.channel.sionna import model as sionna_model
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions
-from caviar_services.channel.sionna.settings import (
-    SionnaSettings,
-    SurfaceMaterial,
-    UsedSurfaces,
-    contributing,
-)
-from caviar_services.channel.stability.formulas import turn
-from caviar_services.channel.stability.lab import (
+from caviar_labs.stability.formulas import turn
+from caviar_labs.stability.lab import (
     Plate,
     Thing,
     antenna,
@@ -28,6 +19,15 @@ from caviar_services.channel.stability.lab import (
     scene,
     sionna,
     write_scenery,
+)
+from caviar_protocol.topics import Channel, Interaction
+from caviar_services.channel.sionna import model as sionna_model
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.settings import (
+    SionnaSettings,
+    SurfaceMaterial,
+    UsedSurfaces,
+    contributing,
 )
 from caviar_services.service import Preparation, RunInfo
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import Plate, antenna, measure, scene, sionna, write_scenery
 from caviar_protocol.topics import AntennaArray, Channel
 from caviar_services.channel.arrays import spherical
-from caviar_services.channel.stability.lab import Plate, antenna, measure, scene, sionna, write_scenery
 
 pytestmark = pytest.mark.channel
 

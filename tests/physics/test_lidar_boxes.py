@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from lidar_world import Body, expected, observed, prepared, scene_of
 
+from caviar_labs.stability.lab import Plate, write_scenery
 from caviar_protocol.space.coordinates import Pose, compose, multiply, quaternion_from_euler, rotation_matrix
 from caviar_protocol.topics import LidarDevice
-from caviar_services.channel.stability.lab import Plate, write_scenery
-from caviar_services.mesh.shapes import box, ply
 from caviar_services.sensors.lidar import GridSettings, LidarSensors, LidarSettings
+from caviar_space.meshes import box, ply
 
 pytestmark = pytest.mark.channel
 

@@ -19,9 +19,9 @@ from caviar_protocol.errors import AssetError, PayloadError
 from caviar_protocol.host import trim_memory
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaDevice, Lidar, LidarDevice
-from caviar_services.mesh.shapes import box, car, ply
 from caviar_services.sensors.lidar import GridSettings, LidarSensors, LidarSettings
 from caviar_services.session import TRIM_EVERY
+from caviar_space.meshes import box, car, ply
 
 pytestmark = pytest.mark.channel
 

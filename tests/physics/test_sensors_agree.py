@@ -24,6 +24,7 @@ from camera_world import products, projected
 from lidar_world import observed
 from lidar_world import prepared as lidars
 
+from caviar_labs.stability.lab import measure, sionna
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
@@ -37,10 +38,10 @@ from caviar_protocol.topics import (
     LidarScan,
     Scene,
 )
-from caviar_services.channel.stability.lab import measure, sionna
 from caviar_services.sensors.camera import CameraSettings
 from caviar_services.sensors.lidar import LidarSettings
-from caviar_services.world.scenery import object_assets, scenery_assets
+from caviar_services.world.assets import object_assets
+from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
 

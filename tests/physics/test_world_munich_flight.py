@@ -12,10 +12,10 @@ import pytest
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
 from caviar_services.drjit_setup import activate_llvm
-from caviar_services.mesh.scenery import read_scenery, world_mesh
 from caviar_services.sensors.base import active_variant
-from caviar_services.world.scenery import scenery_assets
 from caviar_services.world.trajectory import Track, read_waypoints
+from caviar_space.mitsuba_xml import read_scenery, world_mesh
+from caviar_space.scenery import scenery_assets
 
 pytestmark = [
     pytest.mark.channel,

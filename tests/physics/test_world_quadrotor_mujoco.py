@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from quadrotor_flights import AIRFRAME, STEP, WIND, Flight, figure_of_eight, hover, step
 
+from caviar_bridges.mujoco import MujocoPlant
 from caviar_protocol.errors import SetupError
 from caviar_services.world.quadrotor.airframe import Airframe, Body
-from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
 
 pytestmark = pytest.mark.slow
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.geometry import mesh_name
-from caviar_services.mesh.shapes import Mesh, fitted, loft, ply, unit_box
 from caviar_services.service import Frame, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
+from caviar_space.meshes import Mesh, fitted, loft, ply, unit_box
 
 LEVEL, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 MATERIALS = ("metal", "concrete", "wood", "glass", "")

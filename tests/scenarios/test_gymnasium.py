@@ -23,7 +23,7 @@ from caviar_clients.session.connected import ConnectedSession
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
-from caviar_services.mesh.shapes import box, joined, ply
+from caviar_space.meshes import box, joined, ply
 
 PARTS = ("aoa", "aod", "position", "velocity", "last_abs_y")
 FRAMES, EPISODES, BEAMS = 60, 3, 64

@@ -29,6 +29,9 @@ burst = "harbour:BURST"
 
 [project.entry-points."caviar.observations"]
 height = "harbour:Height"
+
+[project.entry-points."caviar.commands"]
+ships = "harbour:ships"
 """
 
 MODULE = '''
@@ -79,6 +82,11 @@ class Height(Part):
     def read(self, moment):
         pair = moment.users[0][1]
         return np.array([device_pose(moment.scene, pair.rx).position[2]], np.float32)
+
+
+def ships(count: int = 1) -> None:
+    """Count ships."""
+    print(f"ships: {count}")
 '''
 
 SCENARIO = """
@@ -192,6 +200,12 @@ def test_its_world_and_traffic_model_run(site: Path, tmp_path: Path) -> None:
 
 def test_its_part_of_the_observation_is_observed(site: Path) -> None:
     assert python(site, OBSERVE, site.parent / "harbour.toml") == pytest.approx([9.0])
+
+
+def test_its_command_is_one_of_caviar(site: Path) -> None:
+    assert caviar("ships", "--count", "3", PYTHONPATH=str(site)).output == "ships: 3\n"
+    assert "Count ships" in caviar("-h", PYTHONPATH=str(site)).output
+    assert caviar("ships").status == 2
 
 
 def test_it_is_named_where_it_is_not_installed(site: Path, tmp_path: Path) -> None:

@@ -11,12 +11,13 @@ import pytest
 from rich.console import Console
 from scenarios_support import SCENARIOS, caviar, run, scenario_file
 
-from caviar_clients.cli import measure, shared
-from caviar_clients.cli.measure import trade
-from caviar_clients.tradeoff import ladder
-from caviar_clients.tradeoff.ladder import Setting
-from caviar_clients.tradeoff.report import Options
-from caviar_clients.tradeoff.scenes import scenes_of
+from caviar_clients.cli import shared
+from caviar_clients.session.scenes import scenes_of
+from caviar_labs.cli import measure
+from caviar_labs.cli.measure import trade
+from caviar_labs.tradeoff import ladder
+from caviar_labs.tradeoff.ladder import Setting
+from caviar_labs.tradeoff.report import Options
 from caviar_protocol.errors import RunError, SetupError
 
 KEYS = ("time_ms_median", "factor", "nmse_db", "beam_top1", "beam_top5", "capacity_error_bps_hz")
@@ -36,7 +37,7 @@ def small_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def compared(
-    source: Path, folder: Path, frames: int = 3, seconds: float = 20.0, **options: Any
+    source: Path, folder: Path, frames: int = 3, seconds: float = 240.0, **options: Any
 ) -> tuple[dict[str, Any], str]:
     """What the JSON says, and the screen."""
     screen = StringIO()
@@ -171,9 +172,9 @@ def test_a_comparison_that_fails_leaves_no_empty_files(
     def fails(*_: object) -> None:
         raise RunError("the worlds fail")
 
-    monkeypatch.setattr("caviar_clients.tradeoff.scenes.scenes_of", fails)
+    monkeypatch.setattr("caviar_clients.session.scenes.scenes_of", fails)
     monkeypatch.setattr(measure, "has_extra", lambda _: True)
-    json_file, kept = tmp_path / "new" / "t.json", tmp_path / "trade" / "kept"
+    json_file, kept = tmp_path / "t.json", tmp_path / "trade" / "kept"
     kept.parent.mkdir()
     kept.touch()
     with pytest.raises(RunError, match="the worlds fail"):

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from caviar_bridges.airsim.bridge import Bridge, Snapshot
+from caviar_bridges.airsim.calls import Offer, StateCalls
+from caviar_bridges.airsim.motion_calls import Habits, MotionCalls
+from caviar_bridges.airsim.sensor_calls import SensorCalls
+from caviar_bridges.manoeuvres import Flown
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.topics import CameraDevice, LidarDevice, Scene, VelocityCommand, WaypointCommand
-from caviar_services.airsim.bridge import Bridge, Snapshot
-from caviar_services.airsim.calls import Offer, StateCalls
-from caviar_services.airsim.manoeuvres import Flown
-from caviar_services.airsim.motion_calls import Habits, MotionCalls
-from caviar_services.airsim.sensor_calls import SensorCalls
 from caviar_services.world.flight_commands import motion_of
 from caviar_services.world.flight_dynamics import Flyer, Limits, Motion
 

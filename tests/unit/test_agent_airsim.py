@@ -15,13 +15,13 @@ from airsim_harness import PERIOD_NS, Body, scene
 from link_builders import given
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.agent import AirSimAgent, AirSimSettings
+from caviar_bridges.airsim.attachment import attach
+from caviar_bridges.airsim.rpc import RpcClient
 from caviar_clients.session.checks import checked_scenario
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.airsim import with_airsim
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
-from caviar_services.agent.airsim import AirSimAgent, AirSimSettings
-from caviar_services.airsim.rpc import RpcClient
 from caviar_services.connection import RunOver
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 
@@ -206,7 +206,7 @@ def test_settings_that_cannot_be_are_refused_with_their_key(
 
 def test_scripts_take_the_place_of_the_agent_that_flies() -> None:
     """And of its users; the agent of the beams stays."""
-    found = with_airsim(load_scenario("uav-pair"), ":5")
+    found = attach(load_scenario("uav-pair"), ":5")
     pilot = found.services["pilot"]
     assert (pilot.use, pilot.users) == ("airsim", ("motion:uav",))
     assert pilot.settings == {"vehicles": {"uav": "uav"}, "listen": ":5"}
@@ -216,18 +216,17 @@ def test_scripts_take_the_place_of_the_agent_that_flies() -> None:
 def test_scripts_are_one_more_agent_where_none_flies() -> None:
     scenario = load_scenario("uav-pair")
     services = {name: spec for name, spec in scenario.services.items() if name != "pilot"}
-    found = with_airsim(replace(scenario, services=services), ":5")
+    found = attach(replace(scenario, services=services), ":5")
     assert list(found.services)[-1] == "airsim"
     assert found.services["airsim"].users == ("motion:uav",)
 
 
 def test_an_agent_of_scripts_gets_another_address() -> None:
     shipped = load_scenario("airsim")
-    found = with_airsim(shipped, ":5")
+    found = attach(shipped, ":5")
     assert found.services["pilot"].settings == shipped.services["pilot"].settings | {"listen": ":5"}
-    assert with_airsim(shipped, "") is shipped
 
 
 def test_a_scenario_in_which_nothing_flies_is_refused() -> None:
     with pytest.raises(ScenarioError, match="no object of the scenario is flown by commands"):
-        with_airsim(load_scenario("smoke"), ":5")
+        attach(load_scenario("smoke"), ":5")

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from caviar_bridges.mavlink import MavlinkAgent, MavlinkSettings
 from caviar_protocol.errors import ScenarioError, SetupError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import quaternion_from_euler, rotated
 from caviar_protocol.topics import Action, AttitudeCommand, Scene, VelocityCommand, WaypointCommand
-from caviar_services.agent.mavlink import MavlinkAgent, MavlinkSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 

@@ -12,11 +12,11 @@ import pytest
 from airsim_harness import PERIOD_NS, START, Body, Flight
 from msgspec.structs import replace
 
+from caviar_bridges.airsim.calls import WITHOUT_EFFECT
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.sensor_calls import NAVIGATION, atmosphere
+from caviar_bridges.airsim.wire import NedFrame
 from caviar_protocol.topics import Lidar, LidarScan, VelocityCommand, WaypointCommand
-from caviar_services.airsim.calls import WITHOUT_EFFECT
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.sensor_calls import NAVIGATION, atmosphere
-from caviar_services.airsim.wire import NedFrame
 
 
 def do(work: Awaitable[Any]) -> Any:

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caviar_bridges.airsim.images import colour_of, image_response, png
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import NedFrame
 from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.topics import (
     Camera,
@@ -20,9 +23,6 @@ from caviar_protocol.topics import (
     Segmentation,
     SegmentationImage,
 )
-from caviar_services.airsim.images import colour_of, image_response, png
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import NedFrame
 
 OPTICS = Intrinsics(fx=2.0, fy=4.0, cx=2.0, cy=1.5)
 WHERE: dict[str, Any] = {

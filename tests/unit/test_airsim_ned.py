@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from caviar_bridges.airsim.rpc import CallError
+from caviar_bridges.airsim.wire import NedFrame, flag, ned_yaw, number, sensor_points, text, vector
 from caviar_protocol.space.coordinates import Pose, Vector, quaternion_from_euler, rotated, rotation_matrix
-from caviar_services.airsim.rpc import CallError
-from caviar_services.airsim.wire import NedFrame, flag, ned_yaw, number, sensor_points, text, vector
 
 NED = NedFrame((10.0, -20.0, 1.5), (47.641468, -122.140165, 122.0))
 parts = st.floats(-1e4, 1e4)

@@ -10,9 +10,9 @@ from typing import Any
 import msgpack
 import pytest
 
+from caviar_bridges.airsim import rpc
+from caviar_bridges.airsim.rpc import CallError, Compact, Params, RpcClient, RpcServer, address_of, response
 from caviar_protocol.errors import RunError, SetupError
-from caviar_services.airsim import rpc
-from caviar_services.airsim.rpc import CallError, Compact, Params, RpcClient, RpcServer, address_of, response
 
 
 async def echo(method: str, params: Params) -> object:

@@ -14,7 +14,16 @@ from packaging.requirements import Requirement
 
 pytestmark = pytest.mark.slow
 
-PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
+PACKAGES = (
+    "caviar_protocol",
+    "caviar_space",
+    "caviar_broker",
+    "caviar_services",
+    "caviar_bridges",
+    "caviar_clients",
+    "caviar_labs",
+    "caviar",
+)
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
     "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb",

@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import antenna, carriers, free_space, geometric, measure, scene
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
 from caviar_services.channel.propagation.atmosphere import Atmosphere, amplitude_factor, specific_attenuation
-from caviar_services.channel.stability.lab import antenna, carriers, free_space, geometric, measure, scene
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.service import Preparation, RunInfo

@@ -8,7 +8,7 @@ import pytest
 from caviar_protocol.topics import AntennaArray
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.clearance import CLEARANCE, Surfaces, spread_anew, with_near_pairs
-from caviar_services.mesh.shapes import box
+from caviar_space.meshes import box
 
 BOX = box((0.0, 2.0), (0.0, 3.0), (0.0, 1.0))
 TRIANGLES = BOX.vertices[BOX.faces]

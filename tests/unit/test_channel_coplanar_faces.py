@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
-from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers
-from caviar_services.mesh.shapes import Mesh, box
+from caviar_space.meshes import Mesh, box
+from caviar_space.planes import PlaneTable, plane_numbers
 
 FACES = 6
 

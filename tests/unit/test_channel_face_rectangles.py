@@ -6,9 +6,9 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_services.channel.enumeration.scene_faces import RIM, FaceRectangles, narrowest_sides
-from caviar_services.channel.propagation.geometry import ranges
-from caviar_services.channel.sionna.planes import plane_numbers, two_sided_planes
-from caviar_services.mesh.shapes import Mesh, unit_box
+from caviar_space.meshes import Mesh, unit_box
+from caviar_space.planes import plane_numbers, two_sided_planes
+from caviar_space.vectors import ranges
 
 L_SHAPE = np.array(
     [[0, 0], [4, 0], [4, 1], [0, 0], [4, 1], [0, 1], [0, 1], [1, 1], [1, 3], [0, 1], [1, 3], [0, 3]]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import channel_of, frame_of, scene
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier
-from caviar_services.channel.stability.lab import channel_of, frame_of, scene
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import channel_of, frame_of
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Panel, Scene
 from caviar_services.channel.propagation.clearance import Boxes
-from caviar_services.channel.stability.lab import channel_of, frame_of
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load

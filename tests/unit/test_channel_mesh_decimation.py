@@ -9,7 +9,7 @@ import pytest
 
 from caviar_protocol.arrays import Float64Array
 from caviar_services.channel.mesh_detail import decimated, welded
-from caviar_services.mesh.shapes import Mesh, box, unit_box
+from caviar_space.meshes import Mesh, box, unit_box
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.mesh_detail import DetailSettings, detailed, piece_numbers
-from caviar_services.mesh.shapes import Mesh, box
+from caviar_space.meshes import Mesh, box
 
 
 def joined(*meshes: Mesh) -> Mesh:

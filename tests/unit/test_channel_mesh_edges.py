@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
-from caviar_services.channel.sionna.planes import plane_numbers
-from caviar_services.mesh.shapes import Mesh, box, unit_box
+from caviar_space.meshes import Mesh, box, unit_box
+from caviar_space.planes import plane_numbers
 
 Array = np.ndarray[tuple[int, ...], np.dtype[Any]]
 FAR = np.array([1e3, -2e3, 50.0])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import frame_of
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.space.coordinates import Vector
@@ -19,10 +20,9 @@ from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.lab import frame_of
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
-from caviar_services.mesh.shapes import box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.meshes import box
 
 HOUSE = box((-5.0, 5.0), (10.0, 20.0), (0.0, 8.0))
 CARRIERS = (Carrier(name="a", frequency_hz=3e9), Carrier(name="b", frequency_hz=28e9))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from caviar_services.channel.sionna import planes
-from caviar_services.channel.sionna.planes import plane_numbers, plane_numbers_of
-from caviar_services.mesh.shapes import Mesh, unit_box
+from caviar_space import planes
+from caviar_space.meshes import Mesh, unit_box
+from caviar_space.planes import plane_numbers, plane_numbers_of
 
 Array = NDArray[np.float64]
 

@@ -9,16 +9,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from caviar_labs.stability.lab import frame_of
 from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.channel.stability.lab import frame_of
-from caviar_services.mesh.shapes import ply, unit_box
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
+from caviar_space.meshes import ply, unit_box
 
 pytestmark = pytest.mark.slow
 

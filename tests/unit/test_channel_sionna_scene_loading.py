@@ -12,7 +12,7 @@ import pytest
 from caviar_protocol.errors import AssetError
 from caviar_services.channel.sionna.scene_loading import Shape, counting_centre, file_pieces
 from caviar_services.drjit_setup import choose_variant
-from caviar_services.mesh.shapes import Mesh, box, ply
+from caviar_space.meshes import Mesh, box, ply
 
 
 def shape(**pieces: Mesh) -> Shape:

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.planes import PlaneTable, plane_numbers_of, shared_planes
 from caviar_services.channel.sionna.scene_loading import Shape
 from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
-from caviar_services.mesh.shapes import Mesh, box, joined
+from caviar_space.meshes import Mesh, box, joined
+from caviar_space.planes import PlaneTable, plane_numbers_of, shared_planes
 
 HOUSE, SECOND = box((0.0, 8.0), (0.0, 9.0), (0.0, 6.0)), box((8.0, 20.0), (0.0, 9.0), (0.0, 7.0))
 

@@ -10,8 +10,8 @@ import pytest
 
 from caviar_broker.http.process import HttpProcess
 from caviar_clients.cli import main as command
-from caviar_clients.conform import conform
-from caviar_clients.conform.client import Rules
+from caviar_labs.conform import conform
+from caviar_labs.conform.client import Rules
 from caviar_protocol.errors import SetupError
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from caviar_clients.cli import plain_progress
-from caviar_clients.cli.paper import _time_left
 from caviar_clients.cli.shared import progress_bar
+from caviar_labs.cli.paper import _time_left
 
 
 def test_lines_are_printed_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

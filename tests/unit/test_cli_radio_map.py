@@ -23,12 +23,12 @@ from caviar_clients.cli.radio_map import ARRAYS, draw_radio_map, options_of
 from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, noise_of, surface_of
 from caviar_clients.plots.map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.session.plausibility import in_hertz
-from caviar_clients.tradeoff.scenes import scene_at
+from caviar_clients.session.scenes import scene_at
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
 from caviar_services.channel.radio_map.mapping import transmitters_of
-from caviar_services.mesh.shapes import Mesh, box, ply
+from caviar_space.meshes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow
 

@@ -20,7 +20,7 @@ from caviar_protocol.messages import Role
 from caviar_protocol.scenario import ServiceSpec, load_scenario
 from caviar_protocol.scenario.rules import refuse_remote
 from caviar_protocol.topics import topics_of
-from caviar_services.registry import BUILT_IN, load
+from caviar_services.registry import load, registered
 
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 REMOTE = SCENARIOS / "remote.toml"
@@ -84,7 +84,7 @@ def test_a_topic_that_a_remote_service_may_produce_may_be_recorded(tmp_path: Pat
 
 
 def test_remote_services_may_produce_all_that_those_of_their_role_do() -> None:
-    for key in BUILT_IN:
+    for key in registered():
         role, _, name = key.partition(":")
         # The engine draws its own pictures; a remote world has none that a scenario could count on.
         own = {"camera"} if key == "world:panda3d" else set()

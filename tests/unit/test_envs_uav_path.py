@@ -20,7 +20,7 @@ from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.space.beams import beam_towards
 from caviar_protocol.topics import Action, BeamChoice
-from caviar_services.mesh.shapes import Mesh, box, ply
+from caviar_space.meshes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow
 

@@ -21,7 +21,16 @@ from recording_builders import record_run
 
 from caviar_protocol.scenario import find_scenario, parse_scenario
 
-PACKAGES = ("caviar_protocol", "caviar_broker", "caviar_services", "caviar_clients", "caviar")
+PACKAGES = (
+    "caviar_protocol",
+    "caviar_space",
+    "caviar_broker",
+    "caviar_services",
+    "caviar_bridges",
+    "caviar_clients",
+    "caviar_labs",
+    "caviar",
+)
 ROOT = Path(__file__).parents[2]
 RUN = "runs/smoke-20261122-101500"
 ELSEWHERE = {

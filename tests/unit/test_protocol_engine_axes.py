@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.space.coordinates import Pose, compose, quaternion_from_euler, rotated
-from caviar_protocol.space.engine_axes import ENGINES, GODOT, NED, UNITY, UNREAL, EngineAxes, Motion
+from caviar_space.engine_axes import ENGINES, GODOT, NED, UNITY, UNREAL, EngineAxes, Motion
 
 VECTORS: dict[str, Any] = json.loads((Path(__file__).parents[2] / "clients" / "axes.json").read_text())
 

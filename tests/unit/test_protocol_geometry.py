@@ -20,7 +20,7 @@ from caviar_protocol.geometry import (
     wrong_name,
 )
 from caviar_protocol.messages import Asset
-from caviar_services.mesh.shapes import Mesh, fitted, ply, unit_box
+from caviar_space.meshes import Mesh, fitted, ply, unit_box
 
 BOX = unit_box()
 

@@ -18,7 +18,7 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import rotated, rotation_matrix
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Interaction
-from caviar_services.mesh.scenery import find_scenery, read_scenery
+from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 SPEC = (Path(__file__).parents[2] / "protocol" / "SPEC.md").read_text("utf-8")
 

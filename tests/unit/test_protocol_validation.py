@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from caviar_clients.conform.street import product
+from caviar_labs.conform.street import product
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ProductError

@@ -17,7 +17,7 @@ from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario, parse_scenario
 from caviar_services.recorder import provenance
 from caviar_services.recorder.provenance import code_digests, installed_versions, used_versions
-from caviar_services.registry import BUILT_IN, load
+from caviar_services.registry import load, registered
 
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 BASE = {"caviar-sim", "lz4", "mcap", "msgspec", "numpy", "python", "zstandard"}
@@ -67,7 +67,7 @@ def test_the_packages_of_the_services_count_and_no_others(
 def test_every_package_that_a_service_names_is_required_by_an_extra_or_the_base() -> None:
     required = {line.partition(" ")[0] for line in metadata.requires("caviar-sim") or ()}
     names = {provenance.re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in required}
-    for key in BUILT_IN:
+    for key in registered():
         packages = set(load(*key.split(":")).packages)
         assert packages - {"zstandard"} <= names, key  # which mcap brings
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.mesh.shapes import SHAPES, box, contains
 from caviar_services.sensors.lidar import ray_directions
+from caviar_space.meshes import SHAPES, box, contains
 
 
 @pytest.mark.parametrize("seed", range(3))

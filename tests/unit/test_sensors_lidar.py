@@ -54,7 +54,7 @@ def test_a_pool_for_an_unknown_mesh_is_refused() -> None:
 
 @pytest.mark.channel
 def test_an_object_mesh_that_is_not_a_unit_mesh_is_refused(tmp_path: Path) -> None:
-    from caviar_services.mesh.shapes import box, ply
+    from caviar_space.meshes import box, ply
 
     file = tmp_path / "car.ply"
     file.write_bytes(ply(box((-2.2, 2.2), (-0.9, 0.9), (0.0, 1.5))))

@@ -10,9 +10,9 @@ import pytest
 
 from caviar_protocol.geometry import mesh_name
 from caviar_protocol.topics import Depth, Scene
-from caviar_services.mesh.shapes import box, joined, ply
 from caviar_services.sensors.base import Sensors, SensorSettings, TracedScene
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.meshes import box, joined, ply
 
 pytestmark = [pytest.mark.slow, pytest.mark.channel]
 pytest.importorskip("mitsuba")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_services.mesh.scenery import SceneryShape
 from caviar_services.sensors.shading import (
     CLASSES,
     MATERIALS,
@@ -17,6 +16,7 @@ from caviar_services.sensors.shading import (
     object_colour,
     shape_colour,
 )
+from caviar_space.mitsuba_xml import SceneryShape
 
 
 def shape(

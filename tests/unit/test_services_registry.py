@@ -57,7 +57,7 @@ def test_other_distributions_add_theirs(monkeypatch: pytest.MonkeyPatch) -> None
 def test_two_of_one_name_are_refused_naming_both(monkeypatch: pytest.MonkeyPatch) -> None:
     register(monkeypatch, ("channel:free-space", "other:Channel"))
     with pytest.raises(DeclarationError, match=r"registered twice.*FreeSpaceChannel.*other:Channel"):
-        load("channel", "free-space")
+        registered()
 
 
 def test_an_unknown_name_comes_with_the_nearest_and_all_known() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from runner_harness import IDS, Broker, ends, played_broker, service
 
-from caviar_clients.conform.street import product
+from caviar_labs.conform.street import product
 from caviar_protocol import messages as m
 from caviar_protocol.digest import payload_digest
 

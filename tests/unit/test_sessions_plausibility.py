@@ -16,7 +16,7 @@ from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import shipped_scenarios
-from caviar_services.mesh.shapes import Mesh, ply
+from caviar_space.meshes import Mesh, ply
 
 pytestmark = pytest.mark.slow
 

@@ -15,13 +15,13 @@ import pytest
 from airsim_harness import PERIOD_NS, START, Body, Flight
 from link_builders import choices
 
+from caviar_bridges.airsim.rpc import RpcServer
+from caviar_bridges.airsim.world import AirSimObject, AirSimWorld, AirSimWorldSettings
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Scene, VelocityCommand, WaypointCommand
-from caviar_services.airsim.rpc import RpcServer
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.testing import WorldConformance
-from caviar_services.world.airsim import AirSimObject, AirSimWorld, AirSimWorldSettings
 
 CAR: Vector = (40.0, 90.0, 0.75)
 

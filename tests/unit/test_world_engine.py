@@ -14,11 +14,11 @@ from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Action, VelocityCommand
-from caviar_services.mesh.scenery import RadioMaterial
-from caviar_services.mesh.shapes import unit_box
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, WorldSettings
 from caviar_services.world.engine import Engine, EngineWorld, OfferedMesh, SceneryMesh
+from caviar_space.meshes import unit_box
+from caviar_space.mitsuba_xml import RadioMaterial
 
 LEVEL, STILL, SIZE = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (4.0, 2.0, 1.5)
 BOX = unit_box()

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("panda3d", reason="needs Panda3D, the extra panda3d")
 
+from caviar_bridges.panda3d.level import PANDA3D, panda3d_core
+from caviar_bridges.panda3d.world import DrivenObject, EngineFlownObject, Panda3dSettings, Panda3dWorld
 from caviar_protocol.errors import AssetError, PayloadError, ScenarioError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
@@ -20,10 +22,8 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Pose, euler_from_quaternion, rotated, rotation_matrix
 from caviar_protocol.topics import Action, AttitudeCommand, Camera, Scene, VelocityCommand, WaypointCommand
 from caviar_protocol.topics.link import MotionCommand
-from caviar_services.mesh.scenery import read_scenery, world_mesh
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
-from caviar_services.world.panda3d import DrivenObject, EngineFlownObject, Panda3dSettings, Panda3dWorld
-from caviar_services.world.panda3d_level import PANDA3D, panda3d_core
+from caviar_space.mitsuba_xml import read_scenery, world_mesh
 
 pytestmark = pytest.mark.slow
 

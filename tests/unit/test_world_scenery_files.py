@@ -15,9 +15,10 @@ from caviar_protocol.errors import AssetError, ScenarioError, SetupError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.schema import fixed_device
 from caviar_protocol.topics import AntennaArray, AntennaDevice
-from caviar_services.mesh.shapes import SHAPES, Mesh, placed, ply
+from caviar_services.world.assets import object_assets, pattern_assets
 from caviar_services.world.base import WorldSettings
-from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets
+from caviar_space.meshes import SHAPES, Mesh, placed, ply
+from caviar_space.scenery import scenery_assets
 
 with_sionna = pytest.mark.skipif(importlib.util.find_spec("sionna") is None, reason="needs sionna-rt")
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from caviar_clients.datasets.episode import EpisodeResult
     from caviar_clients.datasets.estimate import Estimate
 
+app = typer.Typer()
 DatasetLocation = Annotated[
     str, typer.Argument(help="folder or address of a dataset", metavar="DATASET", show_default=False)
 ]
@@ -42,6 +43,7 @@ SHOWN_FAILURES = 10
 SHOWN_FINDINGS = 40
 
 
+@app.command("generate")
 def generate_command(
     scenario: Annotated[
         Path,
@@ -143,6 +145,7 @@ def generate_command(
         )
 
 
+@app.command("tables")
 def tables_command(
     dataset: DatasetLocation,
     form: Annotated[
@@ -173,6 +176,7 @@ def tables_command(
         print_line(console, file)
 
 
+@app.command("look")
 def look_command(
     dataset: DatasetLocation,
     out: Annotated[
@@ -202,6 +206,7 @@ def look_command(
     print_line(console, file)
 
 
+@app.command("verify")
 def verify_command(
     dataset: DatasetLocation,
     json: FiguresFile = None,

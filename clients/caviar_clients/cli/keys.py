@@ -18,7 +18,7 @@ from caviar_protocol.files import PrivateFolder
 from caviar_protocol.messages import Role
 from caviar_protocol.topics import PAYLOADS
 
-app = typer.Typer(no_args_is_help=True, help="Keys: who may take part in a run, and as what.")
+app = typer.Typer()
 
 Directory = Annotated[Path, typer.Option(help="keys directory")]
 DEFAULT = Path("keys")

@@ -63,7 +63,7 @@ class Launcher:
         http: ``HOST:PORT`` at which the broker has HTTP served; empty: nowhere.
         resume: Whether the run in the directory is resumed, whatever path, frames, seed and pace are.
         force: Whether it is, though code, libraries or files have changed.
-        airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        attachments: ``NAME=VALUE`` each, what is attached to the scenario.
         settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
     """
 
@@ -78,7 +78,7 @@ class Launcher:
     resume: bool = False
     force: bool = False
     pace: str | None = None
-    airsim: str = ""
+    attachments: Sequence[str] = ()
     settings: Sequence[str] = ()
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
@@ -209,8 +209,7 @@ class Launcher:
             arguments += ["--seed", str(self.seed)]
         if self.pace is not None:
             arguments += ["--pace", self.pace]
-        if self.airsim:
-            arguments += ["--airsim", self.airsim]
+        arguments += [f"--attach={text}" for text in self.attachments]
         arguments += [f"--set={text}" for text in self.settings]
         return arguments
 

@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from caviar_clients.learning.experiment import Experiment
     from caviar_clients.learning.training import Progress, SeedResult
 
+app = typer.Typer()
 ALGORITHMS = ("dqn", "ppo", "a2c")
 
 
+@app.command("train")
 def train_command(
     experiment: Annotated[Path, typer.Argument(help="TOML file of the experiment", show_default=False)],
     out: Annotated[Path, typer.Option(help="folder in which the experiment's own is made")] = Path(
@@ -141,6 +143,7 @@ def _results_table(experiment: Experiment, folder: Path, results: list[SeedResul
     return table
 
 
+@app.command("export")
 def export_command(
     model: Annotated[Path, typer.Argument(help="zip file that Stable-Baselines3 saved", show_default=False)],
     policy: Annotated[Path, typer.Argument(help="ONNX file to write", show_default=False)],
@@ -214,6 +217,7 @@ def _spaces(space: Any) -> str:
     return ", ".join(f"{name} {box.shape}" for name, box in space.spaces.items())
 
 
+@app.command("evaluate")
 def evaluate_command(
     policy: Annotated[Path, typer.Argument(help="ONNX file with a card", show_default=False)],
     on: Annotated[str, typer.Option("--on", help="scenario, by name or file")],
@@ -342,6 +346,7 @@ def _settings_of(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return {agent: typed(changes, load("agent", agent).Settings) for agent, changes in found.items()}
 
 
+@app.command("swap")
 def swap_command(
     policy: Annotated[Path, typer.Argument(help="ONNX file of the policy", show_default=False)],
     run: Annotated[

@@ -5,30 +5,21 @@ from __future__ import annotations
 import signal
 import sys
 import warnings
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from caviar_clients.cli.datasets import (
-    generate_command,
-    look_command,
-    tables_command,
-    verify_command,
-)
-from caviar_clients.cli.keys import app as keys
-from caviar_clients.cli.learning import evaluate_command, export_command, swap_command, train_command
-from caviar_clients.cli.paper import app as paper
+from caviar_clients.cli.attachments import AttachingCommand
+from caviar_clients.cli.commands import LOOK, OPERATE, RUN, Commands
 from caviar_clients.cli.shared import (
-    AirSim,
+    Attach,
     Embedded,
     Episodes,
-    FiguresFile,
     Force,
     Frames,
     Http,
@@ -49,20 +40,6 @@ from caviar_clients.cli.shared import (
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.host import DISTRIBUTION
 
-PANELS = RUN, LOOK, DATASETS, POLICIES, MEASURE, OPERATE = (
-    "Run", "Look at a run", "Datasets", "Policies", "Measure", "Operate"
-)  # fmt: skip
-"""Panels of commands in the help, in their order."""
-
-
-class _Commands(TyperGroup):
-    """Group of all commands, listed by their panels."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        shown = [(name, command) for name, command in self.commands.items() if not command.hidden]
-        shown.sort(key=lambda item: PANELS.index(getattr(item[1], "rich_help_panel", "")))
-        return [name for name, _ in shown]
-
 
 class _PlotGroup(TyperGroup):
     """Group of ``caviar plot``, whose command `run` is meant where none is named: ``caviar plot RUN``."""
@@ -76,7 +53,7 @@ class _PlotGroup(TyperGroup):
 
 # Commands import what they need when they run: `caviar --help` and completion in a shell load none of it.
 app = typer.Typer(
-    cls=_Commands,
+    cls=Commands,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,  # a bug shows the traceback of Python, which reports can quote
@@ -84,10 +61,6 @@ app = typer.Typer(
 pictures = typer.Typer(
     cls=_PlotGroup, help="Draw a run, map its coverage, or make a video: plot RUN, map, video."
 )
-dataset = typer.Typer(no_args_is_help=True, help="Datasets: generate, look, verify, tables.")
-policy = typer.Typer(no_args_is_help=True, help="Trained policies: train, evaluate, export, swap.")
-measure = typer.Typer(no_args_is_help=True, help="Time and error: budget, bench, tradeoff, stability.")
-bench = typer.Typer(no_args_is_help=True, help="Measure what the parts of a run cost on this machine.")
 _console = Console()
 # Warnings, errors and progress: what a command prints on standard output can be piped.
 _errors = Console(stderr=True)
@@ -113,7 +86,7 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
     """The scenario of a run that is started anew; refuses what does not go together with ``--resume``."""
     if resume is not None and any(value is not None for value in (scenario, *others)):
         raise RunError(
-            "a run goes on as it began: --resume takes no scenario, frames, seed, --embedded or --airsim"
+            "a run goes on as it began: --resume takes no scenario, frames, seed, --embedded or --attach"
         )
     if resume is None and scenario is None:
         raise RunError(
@@ -122,7 +95,7 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
     return scenario or Path()
 
 
-@app.command(rich_help_panel=RUN)
+@app.command(cls=AttachingCommand, rich_help_panel=RUN)
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
@@ -140,7 +113,7 @@ def run(
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
-    airsim: AirSim = "",
+    attach: Attach = None,
     resume: Resume = None,
     force: Force = False,
 ) -> None:
@@ -149,14 +122,15 @@ def run(
 
     keys_given = keys_set(set_, record, episodes)
     source = _started_anew(
-        resume, scenario, frames, seed, embedded or None, pace, airsim or None, keys_given or None
+        resume, scenario, frames, seed, embedded or None, pace, attach or None, keys_given or None
     )
     if resume is not None:
         ended = resume_run(resume, _console, json, bind, keys, http, force=force)
     else:
         ended = run_scenario(
-            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace, airsim, keys_given
-        )
+            source, out, _console, frames, seed, json, bind, embedded, keys, http, pace,
+            attach or (), keys_given,
+        )  # fmt: skip
     raise typer.Exit(ended.status)
 
 
@@ -276,85 +250,6 @@ def doctor(
     found = checks.doctor()
     checks.render(found, _console)
     raise typer.Exit(checks.exit_status(found))
-
-
-@measure.command()
-def stability(
-    group: Annotated[list[str] | None, typer.Option(help="only this group of cases; may be repeated")] = None,
-    json: Annotated[Path | None, typer.Option(help="write the results to this file")] = None,
-    markdown: Annotated[Path | None, typer.Option(help="write the table of the docs to this file")] = None,
-    traced: Annotated[bool, typer.Option(help="also the cases that need the ray tracer")] = True,
-) -> None:
-    """Ask the channel models at their extremes, and compare with formulas; status 1 where one is wrong."""
-    from caviar_clients.cli.measure import stability as ask
-
-    raise typer.Exit(ask(_console, group or (), json, markdown, traced))
-
-
-@bench.command("broker")
-def bench_broker(
-    services: Annotated[int, typer.Option(min=2, max=256, help="services, each a process")] = 8,
-    payload: Annotated[int, typer.Option(min=1, max=1 << 28, help="bytes of a product")] = 100,
-    frames: Annotated[int, typer.Option(min=10, max=10_000_000, help="frames that are measured")] = 2000,
-    topology: Annotated[
-        Literal["hub", "all"], typer.Option(help="hub: one with all others; all: everyone with everyone")
-    ] = "hub",
-    curve: Annotated[bool, typer.Option("--curve", help="with keys, encrypted")] = False,
-    json: Annotated[Path | None, typer.Option(help="write the figures to this file")] = None,
-) -> None:
-    """A frame's way through the broker, with clients that do nothing but exchange products."""
-    from caviar_clients.cli.measure import measure_broker
-
-    measure_broker(_console, topology, services, payload, frames, curve, json)
-
-
-@app.command(rich_help_panel=OPERATE)
-def conform(
-    listen: Annotated[
-        str,
-        typer.Option(
-            help="address to listen on; port 0: any; default: any port of 127.0.0.1 where {endpoint} in "
-            "--command passes it on, else tcp://127.0.0.1:5590"
-        ),
-    ] = "",
-    role: Annotated[
-        str, typer.Option(help="role that the client has to declare: agent, world, …; by default any")
-    ] = "",
-    name: Annotated[str, typer.Option(help="name that it has to declare; by default any")] = "",
-    case: Annotated[list[str] | None, typer.Option(help="only this case; may be repeated")] = None,
-    command: Annotated[
-        str,
-        typer.Option(help="starts the client for each life, with {endpoint} and {name} filled in"),
-    ] = "",
-    ws: Annotated[
-        bool,
-        typer.Option("--ws", help="clients speak WebSocket: {endpoint} is ws://HOST:PORT/ws of --listen"),
-    ] = False,
-    timeout: Annotated[float, typer.Option(min=0.1, help="seconds in which the client has to answer")] = 5.0,
-    settings: Annotated[Path | None, typer.Option(help="TOML or JSON file: its settings in WELCOME")] = None,
-    json: Annotated[Path | None, typer.Option(help="write the verdicts to this file")] = None,
-    markdown: Annotated[Path | None, typer.Option(help="write them as a Markdown table")] = None,
-    list_cases: Annotated[bool, typer.Option("--list", help="only list the cases")] = False,
-) -> None:
-    """Judge a client in any language against the protocol, clause by clause; status 1 where one fails."""
-    from caviar_clients.cli import measure as kit
-    from caviar_clients.conform.client import Rules
-
-    if list_cases:
-        kit.list_cases(_console)
-        return
-    rules = Rules(timeout_s=timeout, name=name, role=role, settings=kit.settings_of(settings))
-    status = kit.conform_client(
-        _console,
-        listen,
-        rules,
-        command=command,
-        names=case or (),
-        websocket=ws,
-        json_file=json,
-        markdown_file=markdown,
-    )
-    raise typer.Exit(status)
 
 
 @app.command(rich_help_panel=LOOK)
@@ -485,75 +380,7 @@ def replay(
     raise typer.Exit(status)
 
 
-@measure.command()
-def budget(
-    run: RunDirectory,
-    json: FiguresFile = None,
-) -> None:
-    """Tell from a recorded run the frame rate that each policy sustains, and which service bounds it."""
-    from caviar_clients.cli.measure import budget_run
-
-    budget_run(run, _console, json)
-
-
-@measure.command()
-def tradeoff(
-    source: ScenarioOrRun,
-    json: FiguresFile = None,
-    out: Annotated[Path | None, typer.Option(help="directory for tables and pictures")] = None,
-    frames: Annotated[int, typer.Option(min=1, max=10_000, help="scenes, spread over the episode")] = 12,
-    receivers: Annotated[
-        int | None, typer.Option(min=1, help="receivers of a scene at most; by default all")
-    ] = None,
-    reference: Annotated[
-        str | None, typer.Option(help="setting that errors are against; by default the finest")
-    ] = None,
-    baseline: Annotated[str | None, typer.Option(help="setting that factors of time are against")] = None,
-    seeds: Annotated[int, typer.Option(min=2, max=20, help="seeds of the convergence")] = 2,
-    minutes: Annotated[float, typer.Option(min=0.1, help="time for measuring")] = 12.0,
-    part: Annotated[
-        list[str] | None,
-        typer.Option(help="ladder, keyframes, spacing, arrays or convergence; by default all"),
-    ] = None,
-    error_db: Annotated[
-        list[float] | None, typer.Option(help="name the fastest setting with this NMSE of H [dB], as -20")
-    ] = None,
-    time_ms: Annotated[
-        list[float] | None, typer.Option(help="name the most accurate setting with this time of a scene [ms]")
-    ] = None,
-) -> None:
-    """Compare channel settings: time and error of each over the same scenes."""
-    from caviar_clients.cli.measure import trade, tradeoff_options
-
-    options = tradeoff_options(reference, baseline, receivers, seeds, minutes, part, error_db, time_ms)
-    trade(source, frames, options, json, out, _console)
-
-
 app.add_typer(pictures, name="plot", rich_help_panel=LOOK)
-app.add_typer(dataset, name="dataset", rich_help_panel=DATASETS)
-app.add_typer(policy, name="policy", rich_help_panel=POLICIES)
-app.add_typer(measure, name="measure", rich_help_panel=MEASURE)
-app.add_typer(paper, name="paper", rich_help_panel=MEASURE)
-app.add_typer(keys, name="keys", rich_help_panel=OPERATE)
-measure.add_typer(bench, name="bench")
-dataset.command("generate")(generate_command)
-dataset.command("look")(look_command)
-dataset.command("verify")(verify_command)
-dataset.command("tables")(tables_command)
-policy.command("train")(train_command)
-policy.command("evaluate")(evaluate_command)
-policy.command("export")(export_command)
-policy.command("swap")(swap_command)
-# The names that commands had before they were in groups go on, and no help shows them.
-FORMER: dict[str, Callable[..., None]] = {
-    "generate": generate_command, "look": look_command, "verify": verify_command, "tables": tables_command,
-    "train": train_command, "evaluate": evaluate_command, "export-policy": export_command,
-    "swap": swap_command, "budget": budget, "tradeoff": tradeoff, "stability": stability,
-    "map": radio_map, "video": video, "why": status,
-}  # fmt: skip
-for _name, _command in FORMER.items():
-    app.command(_name, hidden=True)(_command)
-app.add_typer(bench, name="bench", hidden=True)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -32,7 +32,7 @@ from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.antenna_arrays import dft_codebook, steering_vector
 from caviar_services.channel.propagation.patterns import element_amplitude
-from caviar_services.mesh.scenery import find_scenery, read_scenery
+from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 
 def plot_run(

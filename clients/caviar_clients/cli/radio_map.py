@@ -21,7 +21,7 @@ from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.plausibility import implausible_values, in_hertz
-from caviar_clients.tradeoff.scenes import is_recording, scene_at
+from caviar_clients.session.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import DISTRIBUTION
 from caviar_protocol.topics import Scene
@@ -35,8 +35,8 @@ from caviar_services.channel.radio_map.mapping import (
     rays_at_once,
     transmitters_of,
 )
-from caviar_services.mesh.scenery import find_scenery, read_scenery
 from caviar_services.service import Preparation
+from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 FORMAT = "caviar-radio-map-1"
 

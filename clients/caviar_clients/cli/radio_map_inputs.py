@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from caviar_clients.cli.shared import require_known
-from caviar_clients.plots.rays import ground
 from caviar_clients.session.plausibility import in_hertz
-from caviar_clients.tradeoff.scenes import Scenes
+from caviar_clients.session.scenes import Scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.schema import PATTERNS
-from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
@@ -37,9 +35,10 @@ from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.link_budget import noise_power
-from caviar_services.mesh.scenery import SceneryShape, read_scenery
 from caviar_services.registry import load
 from caviar_services.service import RunInfo
+from caviar_space.ground import ground
+from caviar_space.mitsuba_xml import SceneryShape, read_scenery, world_mesh
 
 _MOST_CELLS = 20_000_000
 # [m] around devices and objects where there is no scenery.
@@ -285,11 +284,8 @@ def _ground(name: str, shapes: Sequence[SceneryShape]) -> Float64Array:
 
 def _triangles(shapes: Sequence[SceneryShape]) -> Float64Array:
     """Triangles [m] of pieces of scenery, Shape ``[F, 3, 3]``."""
-    found = [np.zeros((0, 3, 3))]
-    for shape in shapes:
-        vertices, faces = read_ply(shape.file)
-        found.append((vertices @ shape.to_world[:3, :3].T + shape.to_world[:3, 3])[faces])
-    return np.concatenate(found)
+    meshes = [world_mesh(shape) for shape in shapes]
+    return np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])
 
 
 def _area(channel: SionnaChannel, scene: Scene) -> Area:

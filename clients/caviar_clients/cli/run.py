@@ -202,7 +202,7 @@ def run_scenario(
     keys: Path | None = None,
     http: str = "",
     pace: str | None = None,
-    airsim: str = "",
+    attachments: Sequence[str] = (),
     settings: Sequence[str] = (),
 ) -> RunOutcome:
     """Run a scenario to its end, with progress and summary on the screen.
@@ -217,7 +217,7 @@ def run_scenario(
         embedded: Whether all services run in this process.
         keys: Keys directory; None: a run without keys.
         http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
-        airsim: ``HOST:PORT`` at which scripts for AirSim fly the objects; empty: the scenario's agents do.
+        attachments: ``NAME=VALUE`` each, what is attached to the scenario.
         settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
 
     Raises:
@@ -225,7 +225,7 @@ def run_scenario(
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace, airsim, settings)
+    scenario = checked_scenario(path, frames, seed, pace, attachments, settings)
     if bind:
         check_bind(bind, keys=keys is not None)
     require_extras(scenario)
@@ -260,7 +260,7 @@ def run_scenario(
             keys,
             http,
             pace=pace,
-            airsim=airsim,
+            attachments=attachments,
             settings=settings,
         )
     return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)

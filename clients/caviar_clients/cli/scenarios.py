@@ -13,8 +13,10 @@ from rich.text import Text
 from caviar_clients.cli.shared import description, print_line, require_installed
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
+from caviar_protocol.plugins import plugins
 from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
 from caviar_services.registry import load
+from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
 TEMPLATE = "new/scenario.toml"
 """The scenario that `caviar new` writes, in the package of scenarios."""
@@ -41,8 +43,8 @@ def _extras(spec: ServiceSpec) -> set[str]:
         found.add("channel" if has_extra("channel") and not has_extra("world") else "world")
     if spec.settings.get("rate_model") == "nr":  # of the link `cell`
         found.add("system")
-    if any(flown.get("engine") == "mujoco" for flown in spec.settings.get("flown", ())):
-        found.add("mujoco")
+    engines = {flown.get("engine") for flown in spec.settings.get("flown", ())}  # of quadrotors
+    found.update(plant_named(engine).extra for engine in engines & plugins(PLANTS).keys())
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")
     for rung in (*ladder, *([reference] if reference else [])):  # models that an adaptive channel has
         found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)

@@ -120,8 +120,8 @@ Keys = Annotated[
     Path | None, typer.Option(help="keys directory: only authorized keys take part (caviar keys)")
 ]
 Http = Annotated[str, typer.Option(help="HOST:PORT: serve status, orders and WebSocket there")]
-AirSim = Annotated[
-    str, typer.Option(help="HOST:PORT, as 127.0.0.1:41451: scripts for AirSim connect there and fly")
+Attach = Annotated[
+    list[str] | None, typer.Option(metavar="NAME=VALUE", help="attach a service; may be repeated")
 ]
 Resume = Annotated[Path | None, typer.Option(help="resume the run in this directory, whose broker died")]
 Force = Annotated[

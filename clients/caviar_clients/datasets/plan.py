@@ -19,7 +19,7 @@ from caviar_protocol.scenario.rules import with_overrides
 from caviar_services.drjit_setup import choose_variant
 from caviar_services.recorder.provenance import code_digests, used_versions
 from caviar_services.registry import load
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,16 @@ from caviar_clients.session.plausibility import refuse_carriers
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import PROTOCOL_VERSION, Hello
 from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, load_scenario
-from caviar_protocol.scenario.airsim import with_airsim
+from caviar_protocol.scenario.attachments import attached
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import topics_of
 from caviar_services.channel.propagation.clearance import Surfaces
-from caviar_services.registry import find_modules_in, load, registered_names
+from caviar_services.registry import find_modules_in, load, registered, registered_names
 from caviar_services.service import Service
-from caviar_services.world.scenery import Obstacles, scenery_triangles
+from caviar_space.obstacles import Obstacles
+from caviar_space.scenery import scenery_triangles
 
 
 def checked_scenario(
@@ -32,7 +33,7 @@ def checked_scenario(
     frames: int | None = None,
     seed: int | None = None,
     pace: str | None = None,
-    airsim: str = "",
+    attachments: Sequence[str] = (),
     settings: Sequence[str] = (),
 ) -> Scenario:
     """Load a scenario and check it against the implementations that it uses.
@@ -40,7 +41,7 @@ def checked_scenario(
     Args:
         path: The scenario's file, or the name of one that ships.
         frames, seed, pace: What replaces the scenario's; None: nothing.
-        airsim: ``HOST:PORT`` at which scripts written for AirSim fly its objects; empty: its agents do.
+        attachments: ``NAME=VALUE`` each, as of `attached`.
         settings: ``KEY=VALUE`` each, in place of what the file says.
 
     Raises:
@@ -52,7 +53,7 @@ def checked_scenario(
         3
     """
     scenario = with_overrides(load_scenario(Path(path), settings), frames, seed, pace)
-    return check_implementations(with_airsim(scenario, airsim))
+    return check_implementations(attached(scenario, attachments))
 
 
 def module_folders(scenario: Scenario) -> tuple[Path, ...]:
@@ -123,6 +124,7 @@ def check_implementations(scenario: Scenario) -> Scenario:
         ScenarioError: As of `checked_scenario`.
     """
     refuse_carriers(scenario)
+    registered()  # refuses two of one name: the process of a service that is built in looks for no other
     # Before classes are loaded; the processes of services get the same folders on their command lines.
     for folder in module_folders(scenario):
         find_modules_in(folder)

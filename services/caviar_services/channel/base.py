@@ -23,7 +23,7 @@ from caviar_protocol.host import keep_large_buffers
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.multipath import changes
 from caviar_protocol.scenario.schema import PATTERNS
-from caviar_protocol.scene_validation import numbers_are_right, wrong_device, wrong_number
+from caviar_protocol.scene_validation import numbers_are_right, wrong_device_number, wrong_number
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelOptions, Scene
@@ -268,7 +268,7 @@ class ChannelModel(Service[S]):
         scene = frame.scene()
         wrong = "" if numbers_are_right(scene) else wrong_number(scene)
         if not wrong and scene.devices is not self._devices:
-            wrong, self._devices = wrong_device(scene), scene.devices
+            wrong, self._devices = wrong_device_number(scene), scene.devices
         if wrong:
             raise PayloadError(wrong)
         transmitters, receivers = antennas(scene, "tx"), antennas(scene, "rx")

@@ -24,7 +24,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.space.coordinates import Vector, dot
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
 
 # Unit normal and offset: a point p is n·p + d off.
 _Plane: TypeAlias = tuple[float, float, float, float]
@@ -67,7 +67,7 @@ def decimated(mesh: Mesh, tolerance_m: float) -> Mesh:
         A mesh of fewer triangles, a subset of the vertices, welded.
 
     Example:
-        >>> from caviar_services.mesh.shapes import unit_box
+        >>> from caviar_space.meshes import unit_box
         >>> len(decimated(unit_box(), 0.1).faces)
         12
     """

@@ -25,8 +25,9 @@ from caviar_protocol.space.beams import subarrays
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
-from caviar_services.channel.propagation.geometry import Rows, cross
+from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.propagation.patterns import ElementPattern, Field, Patterns, radiated_field
+from caviar_space.vectors import cross
 
 
 @dataclass(frozen=True, eq=False)

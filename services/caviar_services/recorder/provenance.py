@@ -24,17 +24,29 @@ from pathlib import Path
 from typing import Any
 
 from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.plugins import plugins
 from caviar_protocol.scenario.schema import REMOTE
 from caviar_services.registry import BUILT_IN, load, registered
+from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
 ALWAYS = (DISTRIBUTION, "msgspec", "numpy")
 """Distributions that every run computes with."""
 OWN = frozenset(
-    ("caviar", "caviar_broker", "caviar_clients", "caviar_protocol", "caviar_scenarios", "caviar_services")
+    f"caviar{name}"
+    for name in (
+        "",
+        "_bridges",
+        "_broker",
+        "_clients",
+        "_labs",
+        "_protocol",
+        "_scenarios",
+        "_services",
+        "_space",
+    )
 )
 """Packages of this distribution."""
 _BY_SETTING: Mapping[tuple[str, str], tuple[str, ...]] = {
-    ("engine", "mujoco"): ("mujoco",),
     ("rate_model", "nr"): ("sionna", "torch"),
 }
 _BUNDLED = "sionna:"
@@ -78,6 +90,8 @@ def used_versions(scenario: Mapping[str, Any]) -> dict[str, str]:
             names.update(_BY_SETTING.get((key, value), ()))
             if key == "scenery" and value.startswith(_BUNDLED):
                 names.add("sionna-rt")
+            if key == "engine" and value in plugins(PLANTS):
+                names.update(plant_named(value).packages)
     return _versions([*names, *_imported_distributions(_own_modules(scenario))])
 
 
@@ -145,8 +159,10 @@ def _versions(names: Iterable[str]) -> dict[str, str]:
 
 def _own_modules(scenario: Mapping[str, Any]) -> list[str]:
     """Modules of classes that are none of this distribution, in order."""
-    found = set()
-    for role, use, _ in _services(scenario):
+    found = set[str]()
+    for role, use, settings in _services(scenario):
+        engines = {value for key, value in _texts(settings) if key == "engine"}
+        found.update(plugins(PLANTS)[name].module for name in engines if name in plugins(PLANTS))
         if f"{role}:{use}" not in BUILT_IN:
             target = use if ":" in use else registered().get(f"{role}:{use}", "")
             found.add(target.partition(":")[0])

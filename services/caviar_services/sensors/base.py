@@ -37,9 +37,9 @@ from caviar_services.drjit_setup import (
     cuda_devices,
     limit_threads,
 )
-from caviar_services.mesh.scenery import SceneryShape, find_scenery, read_scenery, world_mesh
-from caviar_services.mesh.shapes import Mesh, assign_bodies, contains, joined, placed, unit_box
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
+from caviar_space.meshes import Mesh, assign_bodies, contains, joined, placed, unit_box
+from caviar_space.mitsuba_xml import SceneryShape, find_scenery, read_scenery, world_mesh
 
 NO_HIT = -1
 """Owner of a ray that hits nothing."""
@@ -302,7 +302,7 @@ def load_unit_mesh(file: Path) -> Mesh:
 
     Example:
         >>> import tempfile
-        >>> from caviar_services.mesh.shapes import ply
+        >>> from caviar_space.meshes import ply
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     file = Path(folder, "box.ply")
         ...     _ = file.write_bytes(ply(unit_box()))

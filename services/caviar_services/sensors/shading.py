@@ -23,8 +23,8 @@ from caviar_protocol.arrays import Float32Array, Float64Array, Int64Array, UInt8
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.topics import CameraDevice, Intrinsics
 from caviar_services.drjit_setup import aligned_columns
-from caviar_services.mesh.scenery import SceneryShape
 from caviar_services.sensors.base import TracedScene
+from caviar_space.mitsuba_xml import SceneryShape
 
 SUN = (1.0, 0.93, 0.80)
 """Irradiance of a surface that faces the sun, over π; linear sRGB, as all colours here."""

@@ -42,8 +42,8 @@ from caviar_services.agent.base import AgentSettings
 from caviar_services.agent.baselines import RandomAgent
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
-from caviar_services.mesh.shapes import SHAPES, Mesh, box, ply
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.meshes import SHAPES, Mesh, box, ply
 
 SAMPLING_PERIOD_NS = 100_000_000
 CARRIERS = (

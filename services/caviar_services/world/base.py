@@ -31,8 +31,9 @@ from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
 from caviar_services.returned import series_of
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.world.assets import object_assets, pattern_assets
 from caviar_services.world.run_time_meshes import RunTimeMeshes
-from caviar_services.world.scenery import object_assets, pattern_assets, scenery_assets, scenery_file
+from caviar_space.scenery import scenery_assets, scenery_file
 
 
 class ObjectState(NamedTuple):
@@ -269,7 +270,7 @@ class World(Service[W]):
         `RunTimeMeshes.LINGER_FRAMES` longer. Adding one that is there changes nothing.
 
         Args:
-            content: A PLY file of a unit mesh, as `mesh.shapes.ply` makes it of what `mesh.shapes.fitted`
+            content: A PLY file of a unit mesh, as `caviar_space.meshes.ply` makes it of what `fitted`
                 returns.
 
         Returns:

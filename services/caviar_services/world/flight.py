@@ -17,7 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
-from caviar_protocol.errors import PayloadError, RunError, ScenarioError
+from caviar_protocol.errors import DeclarationError, PayloadError, RunError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler, rotated
@@ -33,14 +33,13 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepR
 from caviar_services.world.base import ObjectState, turning
 from caviar_services.world.flight_commands import motion_of, order_of, place_outside
 from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits
-from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, Plant
+from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, plant_named
 from caviar_services.world.quadrotor.contacts import OnCollision
 from caviar_services.world.quadrotor.control import Controller
 from caviar_services.world.quadrotor.fleet import Fleet
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
 from caviar_services.world.quadrotor.state import Battery, QuadrotorState
 from caviar_services.world.quadrotor.wind import Wind
-from caviar_services.world.scenery import Obstacles, scenery_assets, scenery_triangles
 from caviar_services.world.trajectory import (
     MovingObject,
     NamedObject,
@@ -48,6 +47,8 @@ from caviar_services.world.trajectory import (
     TrajectoryWorld,
     unique_name,
 )
+from caviar_space.obstacles import Obstacles
+from caviar_space.scenery import scenery_assets, scenery_triangles
 
 _log = logging.getLogger("caviar.service")
 
@@ -83,9 +84,9 @@ class FlownObject(NamedObject, frozen=True, kw_only=True, forbid_unknown_fields=
     """Of a quadrotor; unset: the defaults."""
     battery: Battery | None = None
     """Of a quadrotor; unset: the defaults."""
-    engine: Literal["caviar", "mujoco"] | None = None
-    """What integrates the rigid body of a quadrotor: ``caviar``, or ``mujoco``, which the extra of that name
-    brings; unset: ``caviar``."""
+    engine: str | None = None
+    """What integrates the rigid body of a quadrotor: ``caviar``, ``mujoco``, which the extra of that name
+    brings, or another plug-in of the group ``caviar.plants``; unset: ``caviar``."""
     on_collision: OnCollision | None = None
     """What a quadrotor does that touches scenery, an object of this world, or the ground at more than 2 m/s.
     ``stop``: it comes to rest there, and flies on where the way is free. ``bounce``: it rebounds. ``land``:
@@ -173,6 +174,10 @@ class FlightWorld(TrajectoryWorld):
             given = [key for key in _QUADROTOR_KEYS if getattr(thing, key) is not None]
             if thing.dynamics == "point" and given:
                 raise where.at(given[0]).error('is for quadrotors; write dynamics = "quadrotor" beside it')
+            try:
+                plant_named(thing.engine or "caviar")
+            except DeclarationError as error:
+                raise where.at("engine").error(str(error)) from error
         if settings.wind != Wind() and all(thing.dynamics == "point" for thing in settings.flown):
             raise place.at("wind").error('moves quadrotors alone; write dynamics = "quadrotor" in [[flown]]')
 
@@ -420,17 +425,8 @@ def _quadrotor(thing: FlownObject, wind: Wind, key: str) -> Quadrotor:
         thing.on_collision or "stop",
         0.5 if thing.restitution is None else thing.restitution,
         thing.dimensions_m[2],
-        _plant(thing.engine, airframe),
+        plant_named(thing.engine or "caviar")(airframe),
     )
-
-
-def _plant(engine: str | None, airframe: Airframe) -> Plant:
-    if engine != "mujoco":
-        return Plant(airframe)
-    # Only here: a world without such a quadrotor needs no MuJoCo.
-    from caviar_services.world.quadrotor.mujoco_plant import MujocoPlant
-
-    return MujocoPlant(airframe)
 
 
 def _limits(thing: FlownObject, key: str) -> Limits:

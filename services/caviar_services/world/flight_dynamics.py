@@ -19,7 +19,7 @@ import msgspec
 
 from caviar_protocol.space.coordinates import Vector, dot
 from caviar_services.world.base import course_rate
-from caviar_services.world.scenery import Obstacles
+from caviar_space.obstacles import Obstacles
 
 SUB_STEP_NS = 10_000_000
 """[ns]"""

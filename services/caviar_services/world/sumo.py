@@ -18,7 +18,6 @@ from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import BESIDE_ROAD_PREFIX, SIMULATOR_SAYS_PREFIX
 from caviar_services.checkpoint import restored, saved
-from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
 from caviar_services.world.people import People
@@ -35,6 +34,7 @@ from caviar_services.world.sumo_inputs import Inputs, checked_inputs
 from caviar_services.world.sumo_process import Simulation, load_libsumo
 from caviar_services.world.sumo_states import TrafficStates
 from caviar_services.world.sumo_steps import check_spacing, step_length_ms
+from caviar_space.meshes import SHAPES
 
 _NS_PER_MS = 1_000_000
 # A vehicle that turns by more in a step has not turned: SUMO has put it elsewhere.

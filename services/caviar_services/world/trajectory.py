@@ -17,9 +17,9 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.fields import PRINTABLE
 from caviar_protocol.scenario.conversion import Place, csv_rows
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
-from caviar_services.mesh.shapes import SHAPES
 from caviar_services.service import Preparation, Prepared, RunInfo
 from caviar_services.world.base import ObjectState, World, WorldSettings, course_rate, reverses, turning
+from caviar_space.meshes import SHAPES
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 YAW_COLUMN = "yaw_deg"

@@ -46,7 +46,7 @@ from caviar_clients.datasets.verification.catalogue_checks import refuse_impossi
 from caviar_clients.files import reserved, write_file
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_protocol.errors import AssetError
-from caviar_services.mesh.scenery import find_scenery, read_scenery
+from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 CLASSES = 12
 """Classes of objects with a bar of their own at most."""

@@ -47,7 +47,7 @@ from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.clearance import Boxes, Surfaces
 from caviar_services.channel.propagation.patterns import Patterns
 from caviar_services.pattern_files import read_pattern
-from caviar_services.world.scenery import scenery_triangles
+from caviar_space.scenery import scenery_triangles
 
 __all__ = ["Finding", "PhysicsChecks"]
 

@@ -11,7 +11,7 @@ from caviar_protocol.errors import AssetError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import FrameEntry, Recording
 from caviar_protocol.topics import AntennaDevice, Scene
-from caviar_services.world.scenery import scenery_assets
+from caviar_space.scenery import scenery_assets
 
 _BUNDLED = "sionna:"
 

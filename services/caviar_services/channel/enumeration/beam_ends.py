@@ -32,7 +32,7 @@ from caviar_services.channel.enumeration.image_beams import (
     reflected_beams,
     scenery_beams,
 )
-from caviar_services.channel.propagation.geometry import ranges
+from caviar_space.vectors import ranges
 
 # Beams of one group that lanes test together: groups are filled up to a multiple of it, so that a lane finds
 # its beam by a division and not by a search.

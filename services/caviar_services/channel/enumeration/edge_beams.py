@@ -42,9 +42,9 @@ from caviar_services.channel.enumeration.image_beams import (
     scenery_beams,
 )
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
-from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512

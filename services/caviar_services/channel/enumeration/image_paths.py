@@ -22,8 +22,8 @@ from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
 from caviar_services.channel.sionna.materials import DRAWN
-from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.planes import PlaneTable
 
 OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first face, whose points float32 rounds."""

@@ -14,11 +14,11 @@ from functools import lru_cache
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.propagation.geometry import cross, ranges
 from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.planes import two_sided_planes
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
+from caviar_space.planes import two_sided_planes
+from caviar_space.vectors import cross, ranges
 
 RIM = 1e-4
 """[m]; a point this far outside of a triangle counts as inside, so that none falls between two triangles."""

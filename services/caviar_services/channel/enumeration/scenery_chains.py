@@ -39,13 +39,13 @@ from caviar_services.channel.enumeration.scene_faces import (
     seen_planes,
     visible_pairs,
 )
-from caviar_services.channel.propagation.geometry import ranges
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.candidates import chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import positions
+from caviar_space.vectors import ranges
 
 MOST_CHAINS = 20_000
 """Largest number of sequences that are enumerated."""

@@ -28,9 +28,10 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Carrier, Scene
 from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.geometry import path_corners, ranges
+from caviar_services.channel.propagation.geometry import path_corners
 from caviar_services.channel.sionna.materials import ObjectMaterials
-from caviar_services.mesh.shapes import Mesh, placed, unit_box
+from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_space.vectors import ranges
 
 # Boxes in a box of the next level, and triangles in one of the first.
 _BRANCHES = 8
@@ -171,7 +172,7 @@ def lengths_inside(
         Lengths [m], Shape ``[Q, K]``.
 
     Example:
-        >>> from caviar_services.mesh.shapes import box
+        >>> from caviar_space.meshes import box
         >>> crown = MeshVolumes.of([(outward(box((0, 2), (0, 2), (0, 2))), 0)])
         >>> start, end = np.array([[-1.0, 1.0, 1.5]]), np.array([[1.5, 1.0, 1.5]])
         >>> lengths_inside([crown], start, end, kinds=1).tolist()

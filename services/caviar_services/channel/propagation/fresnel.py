@@ -9,7 +9,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_services.channel.propagation.geometry import cross, unit
+from caviar_space.vectors import cross, unit
 
 # Permittivity of vacuum [F/m] (CODATA 2018).
 EPSILON_0 = 8.8541878128e-12

@@ -24,7 +24,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.geometry import cross
+from caviar_space.vectors import cross
 
 # [m]; a point that moves less is the same.
 _NEAR = 0.05

@@ -28,7 +28,7 @@ from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.scene_loading import Shape, mi_mesh
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
 
 
 @dataclass(frozen=True, eq=False)

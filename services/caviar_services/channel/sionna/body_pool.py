@@ -12,7 +12,7 @@ from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna.materials import ObjectMaterials, body_kind
 from caviar_services.channel.sionna.scene_loading import unit_mesh
 from caviar_services.channel.sionna.triangle_numbering import Body
-from caviar_services.mesh.shapes import Mesh, assign_bodies
+from caviar_space.meshes import Mesh, assign_bodies
 
 
 def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:

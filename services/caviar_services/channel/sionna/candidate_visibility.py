@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna.planes import PlaneTable
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
+from caviar_space.planes import PlaneTable
 
 # [m] that a point may lie outside the box of its plane: more than float32 and the planes' tolerance do.
 _SLACK = 0.1

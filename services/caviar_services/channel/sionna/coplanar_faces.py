@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.propagation.geometry import cross, ranges
-from caviar_services.channel.sionna.planes import PlaneTable
+from caviar_space.planes import PlaneTable
+from caviar_space.vectors import cross, ranges
 
 COPLANAR = 1e-5
 """[m]; faces are in one plane to this, and `COPLANAR_RELATIVE` of their coordinates: about what float32 tells

@@ -22,7 +22,7 @@ from caviar_services.channel.propagation.utd import Wedges, wedges_of
 from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
 
 # [m]; corners of scenery that are nearer to each other are one.
 _SAME_PLACE = 1e-3

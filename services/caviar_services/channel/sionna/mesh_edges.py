@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.propagation.geometry import Rows, ranges
+from caviar_services.channel.propagation.geometry import Rows
+from caviar_space.vectors import ranges
 
 # [rad]; faces that deviate less from one plane are one, as in `planes`.
 _FLAT_ANGLE = 2e-4
@@ -104,8 +105,8 @@ def mesh_edges(
         free: Whether free edges are wanted too.
 
     Example:
-        >>> from caviar_services.channel.sionna.planes import plane_numbers
-        >>> from caviar_services.mesh.shapes import unit_box
+        >>> from caviar_space.planes import plane_numbers
+        >>> from caviar_space.meshes import unit_box
         >>> mesh = unit_box()
         >>> faces, planes = mesh.faces.astype(int), plane_numbers(mesh).astype(int)
         >>> edges = mesh_edges(mesh.vertices, faces, planes, 1e-6, free=False)

@@ -66,8 +66,8 @@ from caviar_services.channel.sionna.scene_loading import (
 )
 from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
 from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
-from caviar_services.mesh.scenery import find_scenery
-from caviar_services.mesh.shapes import Mesh, placed, unit_box
+from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
 _Tuning = tuple[float, list[tuple[Any, Constants]]]

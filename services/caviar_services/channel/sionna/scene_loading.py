@@ -33,8 +33,8 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.drjit_setup import aligned_columns
-from caviar_services.mesh.scenery import SceneryShape, asset_name, read_scenery, world_mesh
-from caviar_services.mesh.shapes import Mesh, unit_box
+from caviar_space.meshes import Mesh, unit_box
+from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
 
 
 @dataclass(frozen=True, eq=False)

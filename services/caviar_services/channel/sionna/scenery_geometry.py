@@ -12,10 +12,10 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.messages import WARNING
-from caviar_services.channel.propagation.geometry import cross
-from caviar_services.channel.sionna.planes import is_closed
 from caviar_services.channel.sionna.scene_loading import Shape
-from caviar_services.mesh.shapes import Mesh
+from caviar_space.meshes import Mesh
+from caviar_space.planes import is_closed
+from caviar_space.vectors import cross
 
 # [m]; what overlaps, or stands out, by less does not.
 _NEAR = 1e-3

@@ -35,7 +35,7 @@ from caviar_services.channel.sionna.materials import (
     UsedSurfaces,
 )
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
-from caviar_services.mesh.scenery import ITU_MATERIALS
+from caviar_space.mitsuba_xml import ITU_MATERIALS
 
 # Half of the smallest float32 above 0.
 _VANISHED = 2.0**-150

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
-from caviar_services.channel.sionna.planes import (
+from caviar_services.channel.sionna.scene_loading import Shape
+from caviar_space.meshes import Mesh
+from caviar_space.planes import (
     PlaneTable,
     plane_numbers,
     plane_numbers_of,
     shared_planes,
     two_sided_planes,
 )
-from caviar_services.channel.sionna.scene_loading import Shape
-from caviar_services.mesh.shapes import Mesh
 
 Body = tuple[str, int]
 """Asset and slot of a body in the pool."""

@@ -27,12 +27,6 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
 
     A pair closer than one wavelength of a carrier, so also a device and itself, is outside the
     far field that the formula holds in: it has no path and counts as ``too_close``.
-
-    Example:
-        >>> from caviar_services.channel.stability.lab import free_space, link
-        >>> channel = link(free_space(28e9), (0, 0, 10), (60, 80, 10))  # 100 m
-        >>> round(float(-20 * np.log10(abs(channel.a[0, 0]))), 2)  # path loss [dB]
-        101.39
     """
 
     Settings: ClassVar[type[ChannelSettings]] = FreeSpaceSettings

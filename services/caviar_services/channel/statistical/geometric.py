@@ -96,12 +96,6 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     Paths have no interaction points: none are known. Under ``path-loss`` a pair closer than one
     wavelength, under ``unit`` one at the same point, has no path and counts as ``too_close``.
-
-    Example:
-        >>> from caviar_services.channel.stability.lab import geometric, link
-        >>> channel = link(geometric(28e9, components=3, k_factor_db=10.0), (0, 0, 10), (30, 40, 1.5))
-        >>> len(channel.tau), round(float(abs(channel.a[0, 0]) ** 2), 3)  # the straight path has K / (K + 1)
-        (3, 0.909)
     """
 
     Settings = GeometricSettings

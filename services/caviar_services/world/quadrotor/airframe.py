@@ -16,13 +16,17 @@ on them turns the body counter-clockwise.
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import msgspec
 
 from caviar_protocol.arrays import quantity
+from caviar_protocol.errors import DeclarationError, suggestion
+from caviar_protocol.plugins import load_plugin, origin, plugins
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 
+PLANTS = "caviar.plants"
+"""Group of entry points, each a subclass of `Plant`, named as ``engine`` has it."""
 GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s²]."""
 
@@ -113,6 +117,11 @@ class Plant:
         >>> round(body.position[2], 9), round(work / 0.002)  # it hovers, with 169 W
         (30.0, 169)
     """
+
+    extra: ClassVar[str] = ""
+    """Extra of the distribution that brings its libraries, as `Service.extra`."""
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Distributions whose versions may change a flight, as `Service.packages`."""
 
     def __init__(self, airframe: Airframe, gravity: float = GRAVITY) -> None:
         self.airframe = airframe
@@ -227,6 +236,27 @@ class Plant:
                 (wrench[3] + (jx - jy) * o * p) / jz,
             ),
         )
+
+
+def plant_named(engine: str) -> type[Plant]:
+    """Find what moves rigid bodies: `Plant` for ``caviar``, else a plug-in of the group ``caviar.plants``.
+
+    Raises:
+        DeclarationError: No plug-in has the name, or it is no `Plant`.
+
+    Example:
+        >>> plant_named("caviar").__name__
+        'Plant'
+    """
+    if engine == "caviar":
+        return Plant
+    point = plugins(PLANTS).get(engine)
+    if point is None:
+        raise DeclarationError(f"is {engine!r}; {suggestion(engine, ['caviar', *plugins(PLANTS)])}")
+    found = load_plugin(point, type)
+    if not issubclass(found, Plant):
+        raise DeclarationError(f"{engine!r} is {origin(point)}, which is not a Plant")
+    return found
 
 
 def lagged(speeds: Rotors, commands: Rotors, left: float) -> Rotors:

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 from caviar_protocol.space.coordinates import Pose, Vector, dot, rotated, unrotated
 from caviar_services.world.quadrotor.airframe import Body
-from caviar_services.world.scenery import Obstacles
+from caviar_space.obstacles import Obstacles
 
 OnCollision = Literal["stop", "bounce", "land", "fall", "ignore"]
 

@@ -14,7 +14,7 @@ from caviar_services.world.quadrotor.contacts import Contact, ball_contact, box_
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
 from caviar_services.world.quadrotor.state import COLLIDED, ENERGY, Order, QuadrotorState
 from caviar_services.world.quadrotor.wind import NOISES
-from caviar_services.world.scenery import Obstacles
+from caviar_space.obstacles import Obstacles
 
 # Scripted objects are looked up at these instants [ns], and move in straight lines between them.
 _SCRIPT_NS = 100_000_000

@@ -1,0 +1,150 @@
+"""Commands of `caviar` by name: its own, former names, and those that entry points add.
+
+A distribution adds a command with an entry point of the group ``caviar.commands``. Its name is what is typed
+after ``caviar``; its value, ``module:object``, is a function for Typer, or a ``typer.Typer``, which becomes a
+group of commands. The module is imported when the command is typed, and for the list of ``caviar -h``: slow
+imports stand in the function. A name that `caviar` itself has is not replaced.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from functools import cache
+from importlib.metadata import EntryPoint
+from typing import Any
+
+import typer
+from rich.markup import escape
+from typer.core import TyperCommand, TyperGroup
+
+from caviar_protocol.errors import DeclarationError, one_line
+from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.plugins import claims
+
+PANELS = RUN, LOOK, DATASETS, POLICIES, OPERATE, LABORATORIES, PLUG_INS = (
+    "Run", "Look at a run", "Datasets", "Policies", "Operate", "Laboratories", "Plug-ins"
+)  # fmt: skip
+"""Panels of commands in the help, in their order."""
+
+ENTRY_POINT_GROUP = "caviar.commands"
+
+GROUPS = {
+    "dataset": (DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."),
+    "policy": (
+        POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."
+    ),
+    "keys": (OPERATE, "caviar_clients.cli.keys:app", "Keys: who may take part in a run, and as what."),
+}  # fmt: skip
+"""Panel, place and help of groups that are imported when one of their commands is typed."""
+
+FORMER = {
+    "generate": "dataset generate", "look": "dataset look", "verify": "dataset verify",
+    "tables": "dataset tables", "train": "policy train", "evaluate": "policy evaluate",
+    "export-policy": "policy export", "swap": "policy swap", "budget": "measure budget",
+    "tradeoff": "measure tradeoff", "stability": "measure stability", "bench": "measure bench",
+    "map": "plot map", "video": "plot video", "why": "status",
+}  # fmt: skip
+"""Names that commands had before they were in groups: they go on, and no help shows them."""
+
+
+class LazyGroup(TyperGroup):
+    """Group of commands that is known by name, and imported when one of its commands is asked for.
+
+    Args:
+        name: What is typed.
+        panel: Panel in the help.
+        target: ``module:object``, a ``typer.Typer``.
+        help: What the help says of it.
+    """
+
+    def __init__(self, name: str, panel: str, target: str, help: str) -> None:  # noqa: A002 - Typer's name
+        super().__init__(name=name, help=help, rich_help_panel=panel, no_args_is_help=True)
+        self._target = target
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        if not self.commands:
+            self.commands.update(typer.main.get_group(pkgutil.resolve_name(self._target)).commands)
+        return super().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        self.list_commands(ctx)
+        return super().get_command(ctx, cmd_name)
+
+
+class Commands(TyperGroup):
+    """Group of all commands, listed by their panels. Entry points are read for names that are not its own."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands.update({name: LazyGroup(name, *entry) for name, entry in GROUPS.items()})
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        names = dict.fromkeys([*self.commands, *sorted(added())])
+        shown = {name: self.get_command(ctx, name) for name in names if name not in FORMER}
+        return sorted(shown, key=lambda name: PANELS.index(shown[name].rich_help_panel))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        first, *rest = FORMER.get(cmd_name, cmd_name).split(" ")
+        command = self.commands.get(first) or added_command(first)
+        return command.get_command(ctx, *rest) if rest and isinstance(command, TyperGroup) else command
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if self.get_command(ctx, args[0]) is None:  # Typer suggests what is in self.commands
+            self.commands.update({name: self.get_command(ctx, name) for name in (*FORMER, *added())})
+        return super().resolve_command(ctx, args)
+
+
+@cache
+def added() -> dict[str, list[EntryPoint]]:
+    """Entry points by the command that they add: one, or those of all distributions that claim the name."""
+    found: dict[str, list[EntryPoint]] = {}
+    for point in claims(ENTRY_POINT_GROUP):
+        found.setdefault(point.name, []).append(point)
+    return {name: [p for p in points if _is_own(p)] or points for name, points in found.items()}
+
+
+@cache
+def added_command(name: str) -> Any:
+    """Load the command that an entry point adds.
+
+    Args:
+        name: What is typed.
+
+    Returns:
+        The command; None: no distribution adds one of this name. One that cannot be loaded says so in its
+        help, and raises `DeclarationError` when it runs.
+    """
+    points = added().get(name)
+    if points is None:
+        return None
+    panel = LABORATORIES if _is_own(points[0]) else PLUG_INS
+    sources = " and ".join(f"{p.value} of {p.dist.name} {p.dist.version}" for p in points if p.dist)
+    if len(points) > 1:
+        return _refusing(name, panel, f"{name} is {sources}; uninstall one of them")
+    holder = typer.Typer()
+    try:
+        loaded = points[0].load()
+        if isinstance(loaded, typer.Typer):
+            holder.add_typer(loaded, name=name, rich_help_panel=panel)
+        else:
+            holder.command(name, rich_help_panel=panel)(loaded)
+        return typer.main.get_group(holder).commands[name]
+    except (Exception, SystemExit) as error:  # whatever a module of others does when it is imported
+        reason = f"{type(error).__name__}: {one_line(str(error))}"
+        return _refusing(name, panel, f"{name} is {sources}, which cannot be loaded: {reason}")
+
+
+def _is_own(point: EntryPoint) -> bool:
+    return point.dist is not None and point.dist.name == DISTRIBUTION
+
+
+def _refusing(name: str, panel: str, text: str) -> TyperCommand:
+    """A command that shows ``text`` in the help, and raises it whatever its arguments are."""
+
+    def refuse() -> None:
+        raise DeclarationError(text)
+
+    anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+    return TyperCommand(
+        name, callback=refuse, help=escape(text), rich_help_panel=panel, context_settings=anything
+    )

@@ -1,0 +1,1 @@
+"""Commands of the laboratories. `caviar -h` imports these modules: heavy imports stand in functions."""

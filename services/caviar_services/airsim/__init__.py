@@ -1,5 +1,0 @@
-"""AirSim's RPC: its messages and types, and what answers its calls from the frames of a run.
-
-`caviar_services.agent.airsim` is the agent that serves it, `caviar_services.world.airsim` the world that
-calls it. Positions and directions are NED (north, east, down) at this edge alone.
-"""

@@ -1,1 +1,0 @@
-"""Triangle meshes: shapes of moving objects, and the scenery."""
