@@ -59,7 +59,7 @@ class Reply(Protocol):
 
 @dataclass
 class _Delivery:
-    """What a world still owes of the scenery that it announced."""
+    """Files of the scenery that a world announced and still owes."""
 
     # By digest: not asked for yet.
     waiting: dict[str, m.Asset]
@@ -68,7 +68,7 @@ class _Delivery:
 
     @property
     def owed(self) -> tuple[m.Asset, ...]:
-        """All of it, those asked for first."""
+        """All files that are owed, those asked for first."""
         return (*(incoming.asset for incoming in self.coming.values()), *self.waiting.values())
 
 

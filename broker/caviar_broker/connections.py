@@ -1,4 +1,4 @@
-"""Who connects and who goes: whose each connection is, and what is answered to those who have no place."""
+"""Connections of a run: whose each one is, and the answer to those who have no place in it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPLAINTS = (m.Error, m.Stale, m.Refuse, m.HeartbeatAck)
 
 @dataclass(slots=True)
 class Connection:
-    """What is known of one routing id."""
+    """A connection, by its routing id."""
 
     service: str
     heartbeat: bool
@@ -108,7 +108,7 @@ class Connections:
         )
 
     def unreadable(self, route: bytes, error: ProtocolError) -> None:
-        """What came is not in the protocol."""
+        """Answer a message that is not in the protocol."""
         answer: m.Message = m.Error(code=error.code, message=str(error))
         if isinstance(error, VersionError):
             answer = m.Refuse(code=error.code, message=str(error))
@@ -230,7 +230,7 @@ class Connections:
         self._tell(kind, text, "", "refused")
 
     def _stranger(self, route: bytes) -> str:
-        """What to call a connection that is no service's."""
+        """Name of a connection that is no service's, for messages."""
         origin = self._guard.origin(route)
         return f"a connection from {origin}" if origin else "a connection"
 

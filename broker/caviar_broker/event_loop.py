@@ -140,7 +140,7 @@ class EventLoop:
         return ready if ready or wait_ns <= 0 else self.poll_sockets(until)
 
     def poll_sockets(self, until: int) -> list[Source]:
-        """Which sockets and prompt descriptors can be read, until that instant [ns] at the latest."""
+        """Sockets and prompt descriptors that can be read, until that instant [ns] at the latest."""
         while True:
             # Asked before it is waited for: only then does a socket's descriptor tell of what comes. One call
             # for all of them: asking each for its EVENTS takes 4 µs a socket.

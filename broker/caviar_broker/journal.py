@@ -379,7 +379,7 @@ class JournalFile:
 
 
 def _behind(pieces: Sequence[bytes | memoryview], written: int) -> list[bytes | memoryview]:
-    """What of these is left to be written."""
+    """Rest of the buffers that is left to be written."""
     left: list[bytes | memoryview] = []
     for piece in pieces:
         if written < len(piece):

@@ -1,4 +1,4 @@
-"""When entries of the journal count as handed over, and when they go to the disk.
+"""Writer of the journal: when entries count as handed over, and when they go to the disk.
 
 Clause 18 says that nothing relies on an entry before it is handed over: `JournalWriter.confirmed` counts
 entries for which ``write`` has returned, so that they outlive the broker's process, and that under
@@ -62,7 +62,7 @@ class JournalWriter:
 
     @property
     def path(self) -> Path:
-        """Of the file."""
+        """Path of the file."""
         return self._file.path
 
     @property

@@ -254,7 +254,7 @@ _NOTHING = ResumeState(None, None, ())
 
 
 def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last: Path) -> ResumeState:
-    """What journal and recording say.
+    """State of a run by its journal and its recording.
 
     Raises:
         RunError: They are no files, or those of another run, or every frame is finished and there

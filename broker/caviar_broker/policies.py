@@ -153,7 +153,7 @@ def _alone(directory: Path) -> Iterator[None]:
 
 
 def policy_outcome(directory: Path, agent: str, digest: str) -> Mapping[str, Any]:
-    """What came of a policy that was offered.
+    """Outcome of a policy that was offered.
 
     Args:
         directory: Of the run.

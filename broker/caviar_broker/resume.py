@@ -1,4 +1,4 @@
-"""What the journal says that a broker needs to resume a run, after ``kill -9`` too (contract, clause 18).
+"""State of a run by its journal, from which a broker resumes it, after ``kill -9`` too (contract, clause 18).
 
 1. `launch` finds the directory of a run that did not end, and calls `read_resumption`.
 2. `journal_format.JournalReader` reads the journal's entries, up to the first one that is damaged.
@@ -34,7 +34,7 @@ _STATES = {
 
 @dataclass(frozen=True)
 class ResumeState:
-    """What another broker left of a run."""
+    """State in which another broker left a run."""
 
     resumption: Resumption | None
     """None where no episode had begun."""

@@ -1,4 +1,4 @@
-"""What a run directory says about its run: the record that another broker resumes from, and the recording.
+"""Record of a run in its directory: the one that another broker resumes from, and the recording.
 
 The recording tells a broker how far it goes, whose it is, and what a replay repeats. Its readers are imported
 by the functions that read: a broker that begins a run reads none, and they take an eighth of its start.
@@ -66,7 +66,7 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
 
 
 def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What is of another version than before; empty where nothing is.
+    """Names of what is of another version than before; empty where nothing is.
 
     Args:
         before: Versions that began the run.

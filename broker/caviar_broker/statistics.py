@@ -12,7 +12,7 @@ import numpy as np
 
 
 class ServiceStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """How a service kept its budget."""
+    """Statistics of how a service kept its budget."""
 
     p50_ms: float
     p99_ms: float
@@ -22,7 +22,7 @@ class ServiceStatistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecentStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """How a service keeps its budget now."""
+    """Statistics of how a service keeps its budget now."""
 
     p50_ms: float | None
     """Of the newest `RECENT` latencies; None: there is none yet."""
@@ -40,7 +40,7 @@ RECENT = 512
 
 
 class DeadlineStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """How long after its deadline each decision was taken (clause 9)."""
+    """Statistics of how long after its deadline each decision was taken (clause 9)."""
 
     decisions: int
     p99_ms: float
@@ -48,7 +48,7 @@ class DeadlineStatistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PaceStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run kept its pace (clause 8); no slips where it is free."""
+    """Statistics of the pace of a run (clause 8); no slips where it is free."""
 
     slips: int
     """Frames that were released later than they were due."""
@@ -118,7 +118,7 @@ class Statistics:
 
     @property
     def finished_ns(self) -> Sequence[int]:
-        """When each frame was finished [ns], on the clock of `frame`."""
+        """Instants at which frames were finished [ns], on the clock of `frame`."""
         return self._finished_at
 
     @property
@@ -164,7 +164,7 @@ class Statistics:
         return found
 
     def deadlines(self) -> DeadlineStatistics:
-        """How late the decisions at deadlines were."""
+        """Statistics of the decisions at deadlines."""
         lateness = np.asarray(self._lateness, np.int64)
         return DeadlineStatistics(
             decisions=len(lateness),

@@ -1,4 +1,4 @@
-"""Which services live: the operating system is asked about local ones, connections about remote ones."""
+"""Life of the services: the operating system is asked about local ones, connections about remote ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LocalProcess:
         self.fd = os.pidfd_open(pid)
 
     def verdict(self) -> str:
-        """How the process ended, as far as the system says."""
+        """End of the process in words, as far as the system says."""
         fields = _stat(self.pid)
         if fields is not None and fields[0] == "Z":
             return describe_exit(os.waitstatus_to_exitcode(int(fields[-1])))
@@ -96,7 +96,7 @@ SUPERVISOR_NS = 1_000_000_000
 
 @dataclass
 class _Watched:
-    """What the watchdog knows of one incarnation of a service."""
+    """One incarnation of a service as the watchdog knows it."""
 
     since: int
     process: LocalProcess | None = None

@@ -7,6 +7,7 @@
 | ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
 | ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |
+| ``caviar.formats`` | format of ``caviar dataset export`` | a subclass of `datasets.formats.Format` |
 | ``caviar.commands`` | what is typed after ``caviar`` | a function for Typer, or a ``typer.Typer`` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 

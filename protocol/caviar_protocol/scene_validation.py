@@ -304,8 +304,8 @@ def _wrong_device_number(device: Device) -> str:
     if isinstance(device, AntennaDevice):
         panels = [(*p.position_m, p.yaw_deg, p.pitch_deg, p.roll_deg) for p in device.array.panels]
         numbers = (device.array.vertical_spacing, device.array.horizontal_spacing, *itertools.chain(*panels))
-        if not all(map(math.isfinite, numbers)):
-            return f"{what} spacings and panels of its array {_numbers(numbers)} are not finite"
+        if not all(abs(number) <= MAX_COORDINATE_M for number in numbers):
+            return f"{what} spacings and panels of its array {_numbers(numbers)} are no numbers up to 1e9"
     if max(map(abs, device.position)) > MAX_COORDINATE_M:
         return f"{what} position {_numbers(device.position)} m: at most {MAX_COORDINATE_M:g} m are possible"
     norm = math.hypot(*device.orientation)

@@ -30,6 +30,9 @@ burst = "harbour:BURST"
 [project.entry-points."caviar.observations"]
 height = "harbour:Height"
 
+[project.entry-points."caviar.formats"]
+positions = "harbour:Positions"
+
 [project.entry-points."caviar.commands"]
 ships = "harbour:ships"
 """
@@ -42,6 +45,7 @@ import numpy as np
 from caviar_protocol.cell.traffic import Offered, TrafficModel
 from caviar_protocol.observations import Bounds, Part
 from caviar_protocol.space.scene import device_pose
+from caviar_clients.datasets.formats import Format
 from caviar_services.world.base import ObjectState, World
 
 
@@ -69,6 +73,16 @@ def burst(traffic, place):
     return Offered(np.array([0.0, 0.1 * traffic.period_s]), np.array([rate, 0.0]), traffic.period_s)
 
 
+class Positions(Format):
+    """A line for each user of each scene."""
+
+    def write(self, dataset, folder):
+        users = dataset.users()
+        columns = [users[name] for name in ("episode", "scene", "x_m")]
+        lines = [",".join(map(str, row)) for row in zip(*columns)]
+        (folder / "positions.csv").write_text("\\n".join(lines))
+
+
 BURST = TrafficModel(burst, needs=("rate_bit_s", "period_s"))
 
 
@@ -94,7 +108,7 @@ SCENARIO = """
 name = "harbour"
 frames = 10
 sampling_period_ns = 100_000_000
-record = ["scene", "link"]
+record = ["scene", "channel", "link"]
 
 [[carriers]]
 name = "mm"
@@ -200,6 +214,22 @@ def test_its_world_and_traffic_model_run(site: Path, tmp_path: Path) -> None:
 
 def test_its_part_of_the_observation_is_observed(site: Path) -> None:
     assert python(site, OBSERVE, site.parent / "harbour.toml") == pytest.approx([9.0])
+
+
+def test_its_format_is_one_of_export(site: Path, tmp_path: Path) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    here = {"PYTHONPATH": str(site)}
+    scenario = site.parent / "harbour.toml"
+    done = caviar("dataset", "generate", scenario, "--episodes", "1", "--workers", "1", "--out", data, **here)
+    assert done.status == 0, done.output
+    export = ("dataset", "export", data, "--to", "positions", "--out", out)
+    assert caviar(*export, **here).output == f"{out}\n"
+    rows = [line.split(",") for line in (out / "positions.csv").read_text().splitlines()]
+    assert [float(x) for _, _, x in rows] == pytest.approx([0.5 * frame for frame in range(10)])
+    assert "not empty" in caviar(*export, **here).output
+    again = caviar("dataset", "export", data, "--to", "position", "--out", tmp_path / "other", **here)
+    assert (again.status, "did you mean 'positions'" in again.output) == (1, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out"]
 
 
 def test_its_command_is_one_of_caviar(site: Path) -> None:

@@ -62,7 +62,7 @@ class LogFile:
 
     @property
     def error(self) -> str:
-        """Why lines are missing; empty where none is. Waits `LOG_S` for those on their way."""
+        """Reason why lines are missing; empty where none is. Waits `LOG_S` for those on their way."""
         self._wait_for(0)
         return self._error
 
@@ -147,7 +147,7 @@ class Outbox:
 
     @property
     def log_error(self) -> str:
-        """Why the log is incomplete; empty where it is not."""
+        """Reason why the log is incomplete; empty where it is not."""
         return self._log.error
 
     @property

@@ -265,7 +265,7 @@ class ControlServer:
         return {"ok": True, "state": view.state, "paused": view.paused, "frame": view.frame}
 
     def _gateway(self, _: Mapping[str, Any]) -> Answer:
-        """What the gateway needs to connect: a user who may ask here may read the keys directory as well."""
+        """Place and key with which the gateway connects: who may ask here may read the keys folder, too."""
         access = self.server.access
         if access is None:
             return {"ok": True, "keys": None}

@@ -83,7 +83,7 @@ class CheckpointHistory:
 
     @property
     def pending(self) -> AnsweredGrant | None:
-        """What is to be answered once more; None: the service is where it was."""
+        """The grant to be answered once more; None: the service is where it was."""
         return self.grants[self.position] if self.position < len(self.grants) else None
 
     @property
@@ -167,7 +167,7 @@ class Checkpoints:
             self._run.send(member, Checkpoint(**self._run.ids(member), frame=history.last))
 
     def saving_since(self, member: Member) -> int | None:
-        """When a service that saves its state was asked to [ns]; None: it does not."""
+        """Instant at which a service was asked to save its state, which it does [ns]; None: it does not."""
         history = self.histories.get(member.name)
         return history.asked_at if history is not None and history.asked is not None else None
 

@@ -105,7 +105,7 @@ class FrameClock:
         self.settle(now)
 
     def next_deadline(self) -> int | None:
-        """When `expire` has to be called at the latest [ns]; None if nothing is awaited."""
+        """Latest instant at which `expire` has to be called [ns]; None if nothing is awaited."""
         # Kept between looks at the deadlines: only `settle` can change it.
         if not self._deadline_is_known:
             dispatcher = self._episodes.dispatcher
@@ -161,7 +161,7 @@ class FrameClock:
 
     @property
     def state(self) -> RunState:
-        """Of the run as a whole."""
+        """State of the run as a whole."""
         return self._run.state
 
     @property
@@ -171,7 +171,7 @@ class FrameClock:
 
     @property
     def graph(self) -> Graph | None:
-        """Which service gets what from which; None until all services have joined."""
+        """Graph of the products that services get of each other; None until all services have joined."""
         return self._run.graph
 
     @property
@@ -214,7 +214,7 @@ class FrameClock:
 
     @property
     def error(self) -> str:
-        """Why the run ended early; empty if it did not."""
+        """Reason why the run ended early; empty if it did not."""
         return self._run.error
 
     @property
@@ -223,11 +223,11 @@ class FrameClock:
         return self._run.culprit
 
     def member(self, name: str) -> Member | None:
-        """What is known of a service; None for a name that the run does not expect."""
+        """A service as the broker knows it; None for a name that the run does not expect."""
         return self._run.members.get(name)
 
     def status(self, now: int) -> RunStatus:
-        """Who does what, and who is waited for, at the time ``now`` [ns]."""
+        """Status of run and services, and the services that are waited for, at the time ``now`` [ns]."""
         return status_of(self._run, self._episodes, now)
 
     def validate(self) -> None:

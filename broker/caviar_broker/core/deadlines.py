@@ -47,7 +47,7 @@ class Deadlines:
         return True
 
     def next_release(self) -> int | None:
-        """When the frame that a service asked for in vain will be due [ns]; None if there is none."""
+        """Instant at which the frame is due that a service asked for in vain [ns]; None if there is none."""
         return self._pacer.next_instant()
 
     # --- budgets -----------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ class Deadlines:
 
 
 def _budget_end(participant: Participant) -> tuple[int, Task] | None:
-    """When the budget of what a service has to do next is up [ns], and the task; None: no budget runs."""
+    """End of the budget of the next task of a service [ns], and the task; None: no budget runs."""
     task, plan = participant.tasks.get(participant.next_frame), participant.plan
     if task is None:
         return None

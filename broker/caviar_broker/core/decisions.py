@@ -95,7 +95,7 @@ class DecisionTable:
         return None
 
     def gather_inputs(self, participant: Participant, frame: int) -> TaskInputs:
-        """What is decided about the inputs of a service in a frame; all of them must be."""
+        """Inputs of a service in a frame; all of them must be decided."""
         # The service's own last decision is relied on too. What was decided in this very frame would be
         # decided again. Entries become safe in order, so nothing is missing between them.
         before = participant.tasks.get(frame - 1)
@@ -126,7 +126,7 @@ class DecisionTable:
         return TaskInputs(tuple(inputs), tuple(products), cause, entry)
 
     def describe_waiting(self, source: str) -> str:
-        """Which services wait for which input of a source now, for its blame; empty if none does."""
+        """Services that wait for an input of a source now, for its blame; empty if none does."""
         found = []
         for name in self._graph.consumers[source]:
             consumer = self.participants[name]

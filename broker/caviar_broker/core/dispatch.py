@@ -270,7 +270,7 @@ class Dispatcher:
             self.wake_for_pace()
 
     def next_deadline(self) -> int | None:
-        """When `expire` has something to do at the earliest [ns]; None: never."""
+        """Earliest instant at which `expire` has something to do [ns]; None: never."""
         instants = [self.deadlines.next(), self.deadlines.next_release() if self._waiting_for_pace else None]
         return min((instant for instant in instants if instant is not None), default=None)
 

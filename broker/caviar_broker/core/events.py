@@ -1,4 +1,4 @@
-"""What goes into the core and what comes out of it."""
+"""Events that go into the core, and actions that come out of it."""
 
 from __future__ import annotations
 
@@ -234,8 +234,8 @@ class Notice(msgspec.Struct, frozen=True):
 
 
 class Latency(msgspec.Struct, frozen=True):
-    """What p50 and p99 are computed from: one for each grant once it is answered, late or not, or will never
-    be; and one for each frame that a service could not be granted before its deadline."""
+    """Latency of a grant, of which p50 and p99 are computed: one for each grant once it is answered, late or
+    not, or will never be; and one for each frame that a service could not be granted before its deadline."""
 
     service: str
     episode: int

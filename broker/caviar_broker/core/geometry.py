@@ -61,7 +61,7 @@ class _Awaited:
 
 
 class GeometryLedger:
-    """Which meshes there are in which frame of the episode, and what services have yet to load.
+    """Meshes by frame of the episode, and those that services have yet to load.
 
     Args:
         run: The run.
@@ -157,7 +157,7 @@ class GeometryLedger:
         return change
 
     def _wrong(self, member: Member, offered: GeometryChange, frame: int) -> str:
-        """Why nothing of what a world announces can be used; empty: it can."""
+        """Reason why a world cannot announce meshes; empty: it can."""
         if member.role != "world":
             return "only a world announces meshes"
         if not has_capability(member, GEOMETRY):

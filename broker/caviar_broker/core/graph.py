@@ -26,7 +26,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Graph:
-    """Which service gets what from which, among those that are run."""
+    """Graph of the products that the services of a run get of each other."""
 
     order: tuple[str, ...]
     """Active services, producers before the consumers of their frame."""

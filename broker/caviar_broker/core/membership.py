@@ -84,7 +84,7 @@ class Registration:
             self._prepare_whoever_can(now)
 
     def _held_open(self, member: Member, local: bool) -> int:
-        """How long a service may try to come back by itself once its connections are lost [ns].
+        """Time in which a service may come back by itself once its connections are lost [ns].
 
         A connection within one machine is lost with the broker alone. What started the broker starts the
         local services again too, and one that tried to come back would take the place of its successor.
@@ -185,7 +185,7 @@ class Registration:
         return run.plan.max_faces
 
     def _missing_pattern(self) -> tuple[str, str] | None:
-        """What to say of the first pattern file that neither a world nor the broker has, and its world."""
+        """Message about the first pattern file that neither a world nor the broker has, and its world."""
         known = {asset.name for asset in self._run.scenery()}
         for pattern in self._run.plan.patterns:
             if pattern.name not in known:
@@ -281,7 +281,7 @@ class Registration:
 
 
 def _prefixes(worlds: Iterable[Member]) -> dict[str, tuple[str, ...]]:
-    """What each world that is ready declared of the names of its objects."""
+    """Prefixes of the names of objects, by world that is ready."""
     return {world.name: world.ready.prefixes for world in worlds if world.ready}
 
 
@@ -290,7 +290,7 @@ def _dotted(version: tuple[int, int]) -> str:
 
 
 def _contradiction(member: Member, hello: Hello) -> str:
-    """How a HELLO contradicts the scenario or what the service said before; empty if it does not."""
+    """Contradiction of a HELLO to the scenario, or to what the service said before; empty: there is none."""
     if hello.role != member.role:
         return f"{hello.name!r} is the run's {member.role}, this one says that its role is {hello.role}"
     if member.plan.use and hello.implementation and hello.implementation != member.plan.use:
@@ -397,7 +397,7 @@ class Liveness:
     # --- deadlines -----------------------------------------------------------------------------------
 
     def next_deadline(self) -> int | None:
-        """When the silence of a service will be too long [ns]; None: none has to say anything."""
+        """Instant at which the silence of a service is too long [ns]; None: none has to say anything."""
         run = self._run
         if run.state is RunState.FINISHED:
             return None
@@ -431,7 +431,7 @@ class Liveness:
             run.fail(f"the journal was not written for {waited:g} s; the disk may be full or gone", "", now)
 
     def _due(self, member: Member) -> int | None:
-        """When a service has to have shown life or progress [ns]."""
+        """Instant by which a service has to show life or progress [ns]."""
         timeouts = self._run.plan.timeouts
         if not self._run.takes_part(member):
             return None

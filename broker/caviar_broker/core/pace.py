@@ -1,4 +1,4 @@
-"""When a frame of an episode may begin: the user's pause (`PauseGate`) and real time (`Pacer`)."""
+"""Begin of the frames of an episode: the user's pause (`PauseGate`) and real time (`Pacer`)."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Pacer:
         return slip > self._real_ns(self._plan.sampling_period_ns) // 10
 
     def next_instant(self) -> int | None:
-        """When the frame that was asked for in vain will be due [ns]; None if there is none."""
+        """Instant at which the frame is due that was asked for in vain [ns]; None if there is none."""
         return self._due() if self._awaited else None
 
     def withdraw(self) -> None:

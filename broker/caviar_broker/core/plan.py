@@ -107,7 +107,7 @@ class ServicePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Timeouts:
-    """How long the core waits for what [ns]; see `caviar_protocol.scenario.schema.Timeouts`."""
+    """Time-outs of the core [ns]; see `caviar_protocol.scenario.schema.Timeouts`."""
 
     connect: int = 30 * SECOND
     ready: int = 120 * SECOND
@@ -238,7 +238,7 @@ def plan_run(scenario: Scenario, run: str, welcome: Mapping[str, Mapping[str, An
 
 
 def _features(scenario: Scenario, world: str) -> tuple[Feature, ...]:
-    """What the devices of a world, or of all for the empty name, need a service to know."""
+    """Features that a service has to know for the devices of a world, or of all for the empty name."""
     found = []
     for index, device in enumerate(scenario.devices):
         if world and world_of(scenario, index) != world:

@@ -16,7 +16,7 @@ from caviar_protocol.policies import DECISION, EARLIER, NEXT, REFUSED, SHA256
 
 
 class PolicyState(msgspec.Struct, frozen=True):
-    """Which policy an agent serves, and which it is to change to."""
+    """Policy that an agent serves, and the one that it is to change to."""
 
     serving: str = ""
     """SHA-256; empty: it has not decided a frame yet."""
@@ -29,7 +29,7 @@ class PolicyState(msgspec.Struct, frozen=True):
 
 
 class PolicySwaps:
-    """What is announced to the agents of one run that serve policies.
+    """Announcements to the agents of one run that serve policies.
 
     Args:
         given: SHA-256 of the files that each agent was given so far, by its name, the scenario's first.
@@ -57,7 +57,7 @@ class PolicySwaps:
         return tuple(self._given)
 
     def state(self, agent: str) -> PolicyState:
-        """What an agent of `agents` serves."""
+        """State of an agent of `agents`."""
         return self._states[agent]
 
     def offer(self, agent: str, digest: str) -> None:
@@ -76,7 +76,7 @@ class PolicySwaps:
         return {**settings, SHA256: given[0], EARLIER: given[1:]}
 
     def announced(self, agent: str) -> Mapping[str, str]:
-        """What a GRANT says to an agent."""
+        """Decisions with which a GRANT announces a policy to an agent."""
         state = self._states.get(agent)
         return {NEXT: state.wanted} if state is not None and state.wanted else {}
 

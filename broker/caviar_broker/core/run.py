@@ -51,7 +51,7 @@ _DOING = {
 
 @dataclass(slots=True)
 class Member:
-    """What the broker knows of a service: its part in the run, its state, and what has been heard of it.
+    """A service as the broker knows it: its part in the run, its state, and what has been heard of it.
 
     What it may use of the broker, as its memory limit, is in `caviar_broker.security.limits.PeerLimits`.
     """
@@ -117,23 +117,23 @@ class Member:
         self.progress, self.phase, self.grace_ns = progress, phase, grace_ns
 
     def silent_until(self, since: int, limit: int) -> int:
-        """When a silence that began at ``since`` or at its last progress becomes a stall [ns].
+        """Instant at which a silence that began at ``since`` or at its last progress becomes a stall [ns].
 
         A phase that declared a longer grace, such as compilation, has that (clause 14).
         """
         return max(since, self.advanced_at) + max(limit, self.grace_ns)
 
     def rejoin(self, timeouts: Timeouts) -> int:
-        """How long its return is waited for once it is lost [ns]; 0: not at all."""
+        """Time for which its return is waited for once it is lost [ns]; 0: not at all."""
         return timeouts.rejoin if self.plan.rejoin is None else self.plan.rejoin
 
     @property
     def doing(self) -> str:
-        """What its state means, for people."""
+        """Its state in words."""
         return _DOING[self.state]
 
     def last_words(self, now: int) -> str:
-        """What its last heartbeat said."""
+        """Its last heartbeat in words."""
         if self.heard_at is None:
             return "no heartbeat ever came"
         phase = f"phase {self.phase!r}" if self.phase else "no phase stated"
@@ -180,7 +180,7 @@ class Snapshot:
 
 @dataclass(frozen=True, kw_only=True)
 class Resumption:
-    """What the core needs to resume a run that another broker left, read from its journal."""
+    """State of a run that another broker left, as its journal has it."""
 
     episode: int
     seed: int
@@ -365,7 +365,7 @@ class Run:
         self.actions.append(Send(member.name, grant, order.products))
 
     def ids(self, member: Member) -> dict[str, int]:
-        """What every message of an episode to a service carries (clause 1)."""
+        """Fields that every message of an episode to a service carries (clause 1)."""
         return {"epoch": self.plan.epoch, "attempt": member.attempt, "episode": self.episode}
 
     def enter_journal(self, outcome: str, service: str, frame: int, now: int, **facts: Any) -> None:

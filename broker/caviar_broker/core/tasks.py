@@ -54,7 +54,7 @@ class Ledger:
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """What consumers of a frame get of one (topic, source)."""
+    """Decision about one (topic, source) of a frame: what its consumers get."""
 
     provenance: GrantInput
     """As a consumer in the same frame is granted it, and as the journal has it."""

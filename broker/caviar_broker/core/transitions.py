@@ -36,7 +36,7 @@ class RunState(Enum):
 
 
 class RunEvent(Enum):
-    """What moves a run on."""
+    """Events that move a run on."""
 
     ALL_JOINED = auto()
     ALL_READY = auto()
@@ -65,7 +65,7 @@ class ServiceState(Enum):
 
 
 class ServiceEvent(Enum):
-    """What moves a service on."""
+    """Events that move a service on."""
 
     HELLO = auto()
     PREPARE = auto()
@@ -101,7 +101,7 @@ class TaskState(Enum):
 
 
 class TaskEvent(Enum):
-    """What moves a task on."""
+    """Events that move a task on."""
 
     GRANT = auto()
     ANSWER = auto()

@@ -97,7 +97,7 @@ class Gateway:
             self.connections -= 1
 
     def _refusal(self, socket: WebSocket, token: Token | None, shown: bool) -> str:
-        """Why a request is refused; empty where it is not."""
+        """Reason why a request is refused; empty where it is not."""
         if strange := foreign(socket.headers, self._tokens):
             return strange
         if token is not None:

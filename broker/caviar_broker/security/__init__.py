@@ -1,1 +1,1 @@
-"""Who may take part, and how much of the broker one peer may use."""
+"""Access to a run, and the share of the broker that one peer may use."""

@@ -223,7 +223,7 @@ class Access:
         return _stamp(self.directory / AUTHORIZED), _stamp(self.directory / TOKENS)
 
     def _token_refusal(self, name: str, role: str) -> str:
-        """Why no peer of the gateway may appear as that service; the gateway checks whose token it is."""
+        """Reason why no peer of the gateway may appear as that service; the gateway checks its token."""
         roles = [token.role for token in self._tokens if token.name == name and token.of_service]
         if not roles:
             return f"there is no token of a service {name!r} ({self._remedy(name, role or 'ROLE')})"

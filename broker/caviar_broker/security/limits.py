@@ -1,4 +1,4 @@
-"""What one peer may use of the broker, and what happens to one that takes more: it is named and cut off.
+"""Limits of what one peer may use of the broker: one that takes more is named and cut off.
 
 Bounded are the memory that messages of a peer take while they wait, the size of a message, the rate of
 messages that were not asked for, and what an unauthenticated connection, which has not said HELLO, may send.
@@ -114,7 +114,7 @@ class PeerLimits:
 
 @dataclass(eq=False, slots=True)
 class _Peer:
-    """What the guard knows of one routing id."""
+    """A peer as the guard knows it, by its routing id."""
 
     route: bytes
     # The connection that had the descriptor of its first message then: its own, or a later one.

@@ -59,7 +59,7 @@ class TcpConnection:
 
     @property
     def origin(self) -> str:
-        """Where it comes from, for people: an address, or a process of this machine."""
+        """Origin of the connection in words: an address, or a process of this machine."""
         return self.address or self.process
 
     def end(self) -> None:

@@ -29,7 +29,9 @@ PANELS = RUN, LOOK, DATASETS, POLICIES, OPERATE, LABORATORIES, PLUG_INS = (
 ENTRY_POINT_GROUP = "caviar.commands"
 
 GROUPS = {
-    "dataset": (DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."),
+    "dataset": (
+        DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables, export."
+    ),
     "policy": (
         POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."
     ),

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
-from caviar_protocol.arrays import Float64Array, Payload, Position, Quaternion, Vector3, array, quantity
+from caviar_protocol.arrays import Float64Array, Payload, Quaternion, Vector3, array, quantity
 
 DUAL_POLARIZATIONS = {"VH": ("V", "H"), "cross": ("-45", "+45"), "circular": ("RHCP", "LHCP")}
 """Polarizations of two elements at one place."""
@@ -22,7 +22,7 @@ class Panel(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         2
     """
 
-    position_m: Annotated[Position, quantity("m", "centre of the panel, in the device's axes")] = (
+    position_m: Annotated[Vector3, quantity("m", "centre of the panel, in the device's axes")] = (
         0.0,
         0.0,
         0.0,
