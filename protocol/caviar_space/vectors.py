@@ -23,14 +23,13 @@ def cross(one: Float64Array, other: Float64Array) -> Float64Array:
 
 
 def unit(vectors: Float64Array) -> Float64Array:
-    """Unit vectors along vectors, and zero along one of no length, Shape ``[…, 3]``.
+    """Unit vectors along vectors of any length but zero, Shape ``[…, 3]``.
 
     Example:
         >>> unit(np.array([[0.0, 3.0, 4.0]])).tolist()
         [[0.0, 0.6, 0.8]]
     """
-    length = np.sqrt((vectors**2).sum(-1, keepdims=True))
-    units: Float64Array = vectors / np.where(length > 0, length, 1.0)
+    units: Float64Array = vectors / np.sqrt((vectors**2).sum(-1, keepdims=True))
     return units
 
 

@@ -26,7 +26,6 @@ from caviar_services.channel.propagation.utd import (
 )
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_space.vectors import unit
 
 # Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`.
 _POLE = 100 * 2.0**-24
@@ -208,9 +207,16 @@ def _dyad(
     direct = count == 0
     first = np.where(direct[:, None], end, padded[:, 0])
     last = np.where(direct[:, None], start, padded[rows, np.maximum(count - 1, 0)])
-    sent = np.stack(spherical_basis(unit(first - start), _POLE), axis=-2)
-    taken = np.stack(spherical_basis(unit(last - end), _POLE), axis=-2)
+    sent = np.stack(spherical_basis(_unit(first - start), _POLE), axis=-2)
+    taken = np.stack(spherical_basis(_unit(last - end), _POLE), axis=-2)
     return np.stack([np.einsum("pix,pij,pjy->pxy", taken, of_carrier, sent) for of_carrier in jones])
+
+
+def _unit(vectors: Float64Array) -> Float64Array:
+    """Unit vectors, and zero along one of no length."""
+    length = np.sqrt((vectors**2).sum(-1, keepdims=True))
+    units: Float64Array = vectors / np.where(length > 0, length, 1.0)
+    return units
 
 
 Ends = tuple[Sequence[Antenna], Sequence[Antenna]]
