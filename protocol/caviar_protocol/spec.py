@@ -89,7 +89,7 @@ def type_text(hint: Any) -> str:
     if origin in (Union, UnionType):
         return " or ".join(type_text(member) for member in arguments if member is not NoneType)
     if origin is Literal:
-        return ", ".join(f"`{value}`" for value in arguments)
+        return ", ".join(f"`{value}`" if value != "" else "empty" for value in arguments)
     if origin is tuple and arguments[1:] == (...,):
         return f"list of {type_text(arguments[0])}"
     if origin is tuple:
