@@ -23,13 +23,16 @@ from caviar_protocol.geometry import MAX_FACES, MeshCheck, wrong_name
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import world_of
 from caviar_protocol.scenario.schema import pattern_asset
+from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, FILE, codebook_digest, codebook_file
 
 FILES_AT_ONCE = 8
 """Files that a world is asked for at a time: a city has thousands, and queues are finite."""
 
 
 def pattern_files(scenario: Scenario, store: AssetStore) -> tuple[PatternFile, ...]:
-    """The pattern files of a scenario's devices, put into the store: worlds need not bring them.
+    """The files of a scenario's antennas, put into the store: worlds need not bring them.
+
+    Patterns of elements, and codebooks.
 
     Args:
         scenario: With absolute paths, as it is loaded.
@@ -46,6 +49,12 @@ def pattern_files(scenario: Scenario, store: AssetStore) -> tuple[PatternFile, .
             # A replayed world brings what was recorded, whatever the file has become since.
             known = scenario.replay is None and Path(path).is_file()
             asset = store.add(name, Path(path)) if known else None
+            found.setdefault(name, PatternFile(name, key, path, world_of(scenario, index), asset))
+        if device.array is not None and (digest := codebook_digest(device.array)):
+            # Named by its content, so that what was recorded cannot be another one.
+            content, name = codebook_file(device.array), CODEBOOKS_FOLDER + digest
+            key, path = f"devices[{index}].array.codebook", device.array.codebook.removeprefix(FILE)
+            asset = None if content is None else store.add(name, content)
             found.setdefault(name, PatternFile(name, key, path, world_of(scenario, index), asset))
     return tuple(found.values())
 

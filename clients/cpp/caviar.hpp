@@ -650,6 +650,7 @@ CameraDevice#camera name:str! parent:str="" position:Vector3=[0.0,0.0,0.0]
 AntennaArray rows:int>=1<=1024=1 columns:int>=1<=1024=1 vertical_spacing:float>0=0.5
   horizontal_spacing:float>0=0.5 pattern:iso|dipole|hw_dipole|tr38901="iso"
   polarization:V|H|-45|+45|RHCP|LHCP|VH|cross|circular="V" pattern_file:str="" panels:[Panel]=[]
+  codebook:str="dft"
 Panel position_m:Vector3=[0.0,0.0,0.0] yaw_deg:float=0.0 pitch_deg:float=0.0 roll_deg:float=0.0
 Channel rung:str! options:ChannelOptions=@ expected_error_db:float? carriers:[Carrier]! tx:[str]!
   rx:[str]! los:|b1[T,R]! offsets:<i8[L1]! object_names:[str]=[] id:<u8[P]! a:<c16[C,P]! tau:<f8[P]!

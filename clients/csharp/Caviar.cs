@@ -438,7 +438,7 @@ Demand topic:s1..128 parts:l256(s1..128)=[]
 GrantInput topic:s1..128 source:s1..128 status:e(fresh,held,absent,late) frame:i-1=-1 t_ns:i=0 age:i0=0 fidelity:s='' digest:D='' cause:s='' geometry:D=''
 Report source:s1..128 decisions:m(s)={} measured:m(i0)={} counts:m(i0)={} geometry:GeometryChange=?
 ProductHeader topic:s1..128 digest:d fidelity:s=''
-AntennaArray rows:i1..1024=1 columns:i1..1024=1 vertical_spacing:f<0=0.5 horizontal_spacing:f<0=0.5 pattern:e(iso,dipole,hw_dipole,tr38901)='iso' polarization:e(V,H,-45,+45,RHCP,LHCP,VH,cross,circular)='V' pattern_file:s='' panels:l(Panel)=[]
+AntennaArray rows:i1..1024=1 columns:i1..1024=1 vertical_spacing:f<0=0.5 horizontal_spacing:f<0=0.5 pattern:e(iso,dipole,hw_dipole,tr38901)='iso' polarization:e(V,H,-45,+45,RHCP,LHCP,VH,cross,circular)='V' pattern_file:s='' panels:l(Panel)=[] codebook:s='dft'
 OccupancyGrid origin:t3(f) cell:t3(f) occupancy:a(|i1,X,Y,Z)
 RoadStop road:s position:f0 duration:f0 lane:i0=0
 Panel position_m:t3(f)=[0.0,0.0,0.0] yaw_deg:f=0.0 pitch_deg:f=0.0 roll_deg:f=0.0

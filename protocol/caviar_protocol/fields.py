@@ -301,6 +301,7 @@ SINCE: dict[str, str] = {
     "AntennaArray.pattern_file": "1.4",
     "AntennaArray.panels": "1.4",
     "Panel": "1.4",
+    "AntennaArray.codebook": "1.6",
     "Channel.error_bound_db": "1.4",
     "Channel.error_reference": "1.4",
     "Link.serving": "1.5",
@@ -335,8 +336,8 @@ VALUES_SINCE: dict[str, dict[str, str]] = {
 PARTS_SINCE: dict[str, str] = {"channel.hf": "1.4", "channel.taps": "1.4"}
 """Minor version that brought a part of a topic; 1.0 unless said here."""
 
-CHANGES_OTHERS = frozenset({"AntennaArray.pattern_file", "AntennaArray.panels"})
-"""Fields that change what others mean, or what has to be delivered: the elements of an array, an asset."""
+CHANGES_OTHERS = frozenset({"AntennaArray.pattern_file", "AntennaArray.panels", "AntennaArray.codebook"})
+"""Fields that change what others mean, or what has to be delivered: elements and beams, an asset."""
 
 
 def parse_version(since: str) -> Version:

@@ -6,6 +6,7 @@
 | ``caviar.plants`` | engine of a quadrotor in the world ``flight`` | a subclass of its `Plant` |
 | ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
+| ``caviar.codebooks`` | codebook of antenna arrays | a `caviar_protocol.space.codebooks.Codebook` class |
 | ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |
 | ``caviar.formats`` | format of ``caviar dataset export`` | a subclass of `datasets.formats.Format` |
 | ``caviar.commands`` | what is typed after ``caviar`` | a function for Typer, or a ``typer.Typer`` |

@@ -24,6 +24,7 @@ from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import CaviarError, PayloadError, ProductError, one_line
 from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.codebooks import codebook_digest, codebook_file
 from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_protocol.validation import ContentCheck, ContentRules
 from caviar_services.places import place_of_error
@@ -98,6 +99,17 @@ def is_needed(service: Service[Any], order: m.Prepare) -> bool:
         order: PREPARE, with the demand for its products.
     """
     return bool(order.demand) or service.role in ("agent", "recorder") or not service.outputs
+
+
+def missing_codebooks(service: Service[Any]) -> list[str]:
+    """SHA-256 of the codebooks from files that a service uses and this process does not have.
+
+    Args:
+        service: The service, which knows the devices of the run.
+    """
+    arrays = [device.array for device in service.run.devices if device.array is not None]
+    wanted = {codebook_digest(array): array for array in arrays if service.role in ("agent", "link")}
+    return [digest for digest, array in wanted.items() if digest and codebook_file(array) is None]
 
 
 def content_rules(service: Service[Any], order: m.Prepare) -> ContentRules:

@@ -23,6 +23,7 @@ from caviar_protocol.errors import AssetError, ProtocolError, RunError
 from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
+from caviar_protocol.space.codebooks import add_codebook_files
 from caviar_protocol.validation import ContentCheck
 from caviar_services.asset_fetcher import AssetFetcher, FetchedFile
 from caviar_services.conversion import (
@@ -34,6 +35,7 @@ from caviar_services.conversion import (
     frame_inputs,
     granted_frame,
     is_needed,
+    missing_codebooks,
     plain_done,
     run_info,
     sorted_products,
@@ -264,7 +266,7 @@ class ServiceSession:
             if offered:
                 self._send(m.AssetOffer(**self._identity, assets=tuple(offered)), ())
             self._found = {}
-            if own := service.own_files:
+            if own := [*missing_codebooks(service), *service.own_files]:
                 self._files.fetch(own, partial(self._own_file, order, offered), now)
             else:
                 self._fetch_scenery(order, offered, now)
@@ -332,6 +334,7 @@ class ServiceSession:
             self._scenery.fail(f"the broker cannot deliver {self._scenery.name}: {error.message}", now)
 
     def _load(self, order: m.Prepare, assets: Sequence[m.Asset]) -> None:
+        add_codebook_files(self._found[digest] for digest in missing_codebooks(self.running))
         files = self._store.folder_of(assets) if assets else {}
         demand = {entry.topic: frozenset(entry.parts) for entry in order.demand}
         preparation = Preparation(

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.image_method import image_points, path_lengths
 from caviar_services.channel.sionna.model import SionnaChannel

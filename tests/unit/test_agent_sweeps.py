@@ -13,6 +13,7 @@ from link_builders import CARRIER, antenna, channel_of, frame_of, given, random_
 
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.space.beams import beam_gains
+from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Panel, Scene
 from caviar_services.agent.pilots import PILOT_TIME, PILOTS, PilotAgent, PilotSettings, share_left
 from caviar_services.agent.sweeps import (
@@ -25,7 +26,6 @@ from caviar_services.agent.sweeps import (
     narrowing,
     used_elements,
 )
-from caviar_services.antenna_arrays import dft_codebook
 from caviar_services.service import RunInfo, StepResult
 
 SECOND = Carrier(name="second", frequency_hz=60e9)

@@ -11,14 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.space.beams import beam_towards
+from caviar_protocol.space.antenna_arrays import element_positions, steering_vector
+from caviar_protocol.space.dft import beam_towards, dft_codebook, pointing_directions
 from caviar_protocol.topics import AntennaArray
-from caviar_services.antenna_arrays import (
-    dft_codebook,
-    element_positions,
-    pointing_directions,
-    steering_vector,
-)
 
 SIZES = [(1, 1), (1, 8), (8, 1), (1, 5), (4, 3), (2, 7), (1, 64)]
 

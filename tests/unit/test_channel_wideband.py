@@ -10,9 +10,9 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.antenna_arrays import element_positions
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, ChannelOptions
-from caviar_services.antenna_arrays import element_positions
 from caviar_services.channel.arrays.channel_matrices import check_size, empty_parts, superposed
 from caviar_services.channel.assemble import Product, assemble
 from caviar_services.channel.paths import Antenna, PathTable

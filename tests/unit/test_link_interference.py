@@ -11,8 +11,8 @@ from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import encode_payload
+from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import AntennaDevice, Carrier, Link
-from caviar_services.antenna_arrays import dft_codebook
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.cell import CellLink
 from caviar_services.link.cell_settings import CellSettings

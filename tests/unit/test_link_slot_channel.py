@@ -16,8 +16,8 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import quaternion_from_euler
+from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Link, Scene
-from caviar_services.antenna_arrays import dft_codebook
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link import cell as module

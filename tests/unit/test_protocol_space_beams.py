@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 from link_builders import random_h
 
-from caviar_protocol.space.beams import (
-    beam_gain,
-    beam_gains,
-    beam_towards,
-    coupled_polarizations,
-    straight_beams,
-    subarrays,
-)
+from caviar_protocol.space.antenna_arrays import steering_vector, subarrays
+from caviar_protocol.space.beams import beam_gains, coupled_polarizations, straight_beams
+from caviar_protocol.space.dft import beam_gain, beam_towards, dft_beam, dft_codebook, pointing_directions
 from caviar_protocol.topics import AntennaArray, Panel
-from caviar_services.antenna_arrays import dft_beam, dft_codebook, pointing_directions, steering_vector
 
 CROSS = AntennaArray(rows=2, columns=4, polarization="cross")
 SIDES = (Panel(position_m=(0.0, 0.1, 0.0), yaw_deg=90.0), Panel(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0))

@@ -15,6 +15,8 @@ from caviar_protocol.messages import Asset, GrantInput, Policy, Role
 from caviar_protocol.scenario import REMOTE_REJOIN_S, Scenario, ServiceSpec, instants_ns
 from caviar_protocol.scenario.conversion import Source
 from caviar_protocol.scenario.rules import resolved, world_of
+from caviar_protocol.scenario.schema import published_array
+from caviar_protocol.topics import AntennaArray
 
 SECOND = 1_000_000_000
 """[ns]"""
@@ -43,12 +45,12 @@ class Feature:
 
 @dataclass(frozen=True)
 class PatternFile:
-    """A pattern of antenna elements that a device of the scenario names."""
+    """A file of antennas that a device of the scenario names: a pattern of elements, or a codebook."""
 
     name: str
     """Of the asset that it travels as."""
     key: str
-    """Where it stands: ``devices[0].array.pattern_file``."""
+    """Where it stands: ``devices[0].array.pattern_file``, ``devices[0].array.codebook``."""
     path: str
     """On the machine of the broker."""
     world: str
@@ -266,7 +268,14 @@ def briefings(scenario: Scenario, directory: Path) -> dict[str, dict[str, Any]]:
     """
     # As the recording has it: a service and a reader of the recording see the same values.
     plain = resolved(scenario)
-    devices = [device | {"world": world_of(scenario, index)} for index, device in enumerate(plain["devices"])]
+    # A codebook without the path of its file: worlds publish it as it stands here.
+    codebooks = [published_array(device.array or AntennaArray()).codebook for device in scenario.devices]
+    devices = [
+        device
+        | {"world": world_of(scenario, index)}
+        | ({"array": device["array"] | {"codebook": codebooks[index]}} if device["array"] else {})
+        for index, device in enumerate(plain["devices"])
+    ]
     common = {
         "carriers": plain["carriers"],
         "sampling_period_ns": scenario.run.sampling_period_ns,

@@ -27,10 +27,10 @@ from caviar_clients.plots.user_curves import (
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.space.beams import subarray_of
+from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.codebooks import codebook_of
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
-from caviar_services.antenna_arrays import dft_codebook, steering_vector
 from caviar_services.channel.propagation.patterns import element_amplitude
 from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
@@ -120,7 +120,7 @@ def plot_run(
 def beam_amplitude(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
     """Work out the amplitude of a codebook beam: ``|c_k* a(k̂)| / sqrt(N)`` times that of the element pattern.
 
-    `caviar_protocol.space.beams.beam_gain` is the array factor alone.
+    `caviar_protocol.space.codebooks.Codebook.gain` is the array factor alone.
 
     A pattern that comes from a file is left out.
 
@@ -133,9 +133,9 @@ def beam_amplitude(array: AntennaArray, beam: int, directions: Float64Array) -> 
         Amplitudes, Shape ``[N]``.
     """
     # A codebook of several panels numbers the beams of one panel after those of the other.
-    part, own = subarray_of(array, beam)
+    part, own = codebook_of(array).part_of(beam)
     local = directions @ rotation_matrix(part.orientation)
-    response = steering_vector(part.array, local) @ dft_codebook(part.array)[own].conj()
+    response = steering_vector(part.array, local) @ codebook_of(part.array).vector(own).conj()
     element = np.ones(len(local)) if array.pattern_file else element_amplitude(array.pattern, local)
     gain: Float64Array = np.abs(response) / np.sqrt(part.array.size) * element
     return gain

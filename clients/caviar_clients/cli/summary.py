@@ -22,6 +22,7 @@ from caviar_protocol.messages import Report, Status
 from caviar_protocol.policies import REFUSED
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.space.codebooks import DFT
 from caviar_protocol.topics import Channel, Link
 from caviar_protocol.topics.channel import INSIDE_PREFIX, UNMATCHED_PREFIX, Cause
 from caviar_protocol.topics.scene import (
@@ -418,7 +419,7 @@ class _LinkTotals:
 def _random_power(link: Link, channels: Sequence[Channel]) -> Float64Array:
     """Mean |y|² over all beam pairs of each user; NaN where its H is not recorded.
 
-    The codebooks are orthonormal bases, so the sum over all pairs is the squared Frobenius norm of H.
+    DFT codebooks are orthonormal bases, so the sum over all pairs is the squared Frobenius norm of H.
     """
     mean = {
         (channel.tx[matrix.tx], channel.rx[matrix.rx], channel.carriers[matrix.carrier].name): np.vdot(
@@ -438,7 +439,10 @@ def _db(ratio: float | None) -> float | None:
 
 
 def _measure(
-    frame: RecordedFrame, sources: dict[tuple[str, str], SourceSummary], totals: _LinkTotals
+    frame: RecordedFrame,
+    sources: dict[tuple[str, str], SourceSummary],
+    totals: _LinkTotals,
+    orthonormal: bool,
 ) -> None:
     links: list[Link] = []
     channels: list[Channel] = []
@@ -448,10 +452,16 @@ def _measure(
             sources[entry.topic, entry.source].bytes += product.size
         if entry.status is Status.FRESH and entry.topic == "link":
             links.append(cast(Link, product.payload))
-        elif entry.status is Status.FRESH and entry.topic == "channel":
+        elif entry.status is Status.FRESH and entry.topic == "channel" and orthonormal:
             channels.append(cast(Channel, product.payload))
     for link in links:
         totals.add(link, channels)
+
+
+def _has_dft_alone(scenario: dict[str, Any]) -> bool:
+    devices = scenario.get("devices")
+    arrays = [device.get("array") for device in devices or () if isinstance(device, dict)]
+    return all(array.get("codebook", DFT) == DFT for array in arrays if isinstance(array, dict))
 
 
 def _episodes_planned(scenario: dict[str, Any]) -> int:
@@ -474,6 +484,7 @@ def summarise(recording: Recording) -> RunSummary:
     metadata, damage = recording.metadata, list(recording.damage)
     sources: dict[tuple[str, str], SourceSummary] = {}
     totals, reports = _LinkTotals(), ReportTally()
+    orthonormal = _has_dft_alone(metadata.scenario)
     episodes: dict[int, int] = {}  # to the last instant [ns]
     for frame in recording.frames():
         episodes[frame.episode] = max(frame.t_ns, episodes.get(frame.episode, 0))
@@ -484,7 +495,7 @@ def summarise(recording: Recording) -> RunSummary:
             setattr(source, entry.status.value, getattr(source, entry.status.value) + 1)
         # A frame whose payloads are damaged still has its entries, and counts with them.
         try:
-            _measure(frame, sources, totals)
+            _measure(frame, sources, totals, orthonormal)
         except RecordingError as error:
             damage.append(str(error))
     return RunSummary(

@@ -120,7 +120,7 @@ def with_own_traffic(scenario: Scenario) -> Scenario:
 
 
 def _without_folders(value: Any) -> Any:
-    if isinstance(value, str) and value.startswith("/"):
+    if isinstance(value, str) and value.startswith(("/", "file:/")):  # a codebook: ``file:PATH#SHA-256``
         return f"file:{Path(value).name}"
     if isinstance(value, Mapping):
         return {key: _without_folders(item) for key, item in value.items()}

@@ -26,6 +26,7 @@ from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
 
 _READS = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(?:select|with)\b", re.IGNORECASE | re.DOTALL)
 KEPT_RECORDINGS = 16
@@ -57,6 +58,7 @@ class Dataset:
         self.directory, self._remote = located(path)
         """Folder of this machine; of an address that in the cache."""
         self._catalogue = Catalogue(self.directory.catalogue)
+        add_codebook_files(self.assets.glob(f"{CODEBOOKS_FOLDER}*"))
         there = self._catalogue.episodes()
         self.episodes = tuple(there) if episodes is None else _numbers(episodes)
         """Numbers of the episodes, in the order in which they are read."""

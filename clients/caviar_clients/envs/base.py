@@ -373,7 +373,7 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
             raise PayloadError(self._refusal(action, chosen, moment))
         commands = []
         for place, pair in moment.users:
-            tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
+            tx_beam, rx_beam = divmod(chosen[place], pair.beams[1])
             commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
         return sorted(commands, key=lambda choice: (choice.rx, choice.tx))
 

@@ -65,7 +65,7 @@ class PolicyPlayer:
         if card is None:
             raise ScenarioError(f"{called} has no card; export it with caviar policy export")
         self._model, self._users = model, Users(scenario, users, transmitters=card.transmitters)
-        sizes = tuple((place.tx.size, place.rx.size) for place in self._users.places)
+        sizes = tuple(place.beams for place in self._users.places)
         if sizes != card.codebooks:
             raise ScenarioError(
                 f"{called} was trained for {list(card.codebooks)}, TX × RX beams of each user, and "
@@ -97,7 +97,7 @@ class PolicyPlayer:
                     f"{self._called} chose pair {chosen[place]} for {pair.rx.name} in frame {frame.number}; "
                     f"its output 'action' has to be an index from 0 to {count - 1}: export it again"
                 )
-            tx_beam, rx_beam = divmod(chosen[place], pair.rx.array.size)
+            tx_beam, rx_beam = divmod(chosen[place], pair.beams[1])
             commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
         commands.sort(key=lambda choice: (choice.rx, choice.tx))
         return StepResult(products={"action": Action(commands=tuple(commands))})

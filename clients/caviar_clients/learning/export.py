@@ -56,7 +56,7 @@ def card_of(env: BeamEnv, **facts: Any) -> PolicyCard:
             continue
     made = PolicyCard(
         observe=tuple(env.observation_space.spaces),
-        codebooks=tuple((place.tx.size, place.rx.size) for place in env.users.places),
+        codebooks=tuple(place.beams for place in env.users.places),
         transmitters=getattr(env, "transmitters", ("*",)),  # a recorded user has one
         environment=f"caviar/{type(env).__name__.removesuffix('Env')}-v0",
         scenario=env.scenario.run.name,

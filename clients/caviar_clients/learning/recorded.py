@@ -216,7 +216,7 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
         tracks, pair = self.tracks, self.tracks.pair
         abs_y = tracks.swept[rows, beams]
         snr = tracks.power_over_noise[rows] * abs_y**2
-        tx_beam, rx_beam = np.divmod(beams, pair.rx.array.size)
+        tx_beam, rx_beam = np.divmod(beams, pair.beams[1])
         return BatchLink(
             tx=(pair.tx.name,),
             rx=(pair.rx.name,),

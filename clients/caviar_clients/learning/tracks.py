@@ -198,14 +198,14 @@ class _Reader:
         towards_rx, towards_tx = directions(scene, budget.users)
         for u, user in self._wanted(budget.users, channel):
             observer = self._observing(user, path)
-            shape = user.tx.array.size * user.rx.array.size
+            shape = user.beam_pairs
             sent, taken = straight_beams(user.tx.array, towards_rx[u], user.rx.array, towards_tx[u])
             moment = Moment(NoProducts(), scene, None, ((0, user),))
             self._append(
                 path, frame, user,
                 {
                     "swept": swept[u].reshape(-1) if u in swept else np.zeros(shape),
-                    "straight": sent * user.rx.array.size + taken,
+                    "straight": sent * user.beams[1] + taken,
                     "has_path": channels.has_path[u],
                     "los": channels.los[u],
                     "power_over_noise": budget.power_over_noise[u],

@@ -8,12 +8,12 @@ import numpy as np
 
 from caviar_clients.plots.map import MapData, chosen_beam, draw_antennas, draw_beam, draw_objects
 from caviar_clients.plots.style import GREY
-from caviar_protocol.arrays import UInt8Array
+from caviar_protocol.arrays import Float64Array, UInt8Array
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
-from caviar_protocol.space.beams import beam_gain
+from caviar_protocol.space.codebooks import codebook_of
 from caviar_protocol.space.scene import Pair, device_pose
-from caviar_protocol.topics import Link, Scene
+from caviar_protocol.topics import AntennaArray, Link, Scene
 
 SIZE_IN, DPI = (6.4, 4.8), 100
 """640×480 pixels."""
@@ -55,7 +55,7 @@ class MapRenderer:
         if pair is not None and link is not None:
             users = zip(link.tx, link.rx, link.carrier, strict=True)
             user = next((u for u in users if u[:2] == (pair.tx.name, pair.rx.name)), None)
-        data = MapData(scene, None, link, None, beam_gain, user, title)
+        data = MapData(scene, None, link, None, _beam_gain, user, title)
         axes = self._axes
         axes.clear()
         self._widen(scene)
@@ -80,3 +80,7 @@ class MapRenderer:
         if len(seen):
             self._low = np.minimum(self._low, seen.min(0) - MARGIN_M)
             self._high = np.maximum(self._high, seen.max(0) + MARGIN_M)
+
+
+def _beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
+    return codebook_of(array).gain(beam, directions)

@@ -34,10 +34,10 @@ from caviar_protocol.arrays import (
     UInt64Array,
 )
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.antenna_arrays import element_positions, steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles, unit_vectors
 from caviar_protocol.topics import AntennaDevice, Channel, ChannelMatrix, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_services.antenna_arrays import element_positions, steering_vector
 from caviar_services.channel.arrays.channel_matrices import carrier_phase
 from caviar_services.channel.paths import Antenna
 

@@ -21,6 +21,7 @@ from caviar_protocol.messages import Input
 from caviar_protocol.scenario import DeviceSpec, Scenario
 from caviar_protocol.scenario.schema import ServiceSpec
 from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Channel
 from caviar_services.link.base import channels_of
@@ -89,7 +90,7 @@ def radio_table(scenario: str | Path, cell_m: float) -> RadioTable:
     settings = BeamLinkSettings()
     budget = LinkBudget.of(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
     channels = channels_of(channel, budget.users)
-    swept = np.zeros((len(places), budget.users[0].tx.array.size))
+    swept = np.zeros((len(places), beam_count(budget.users[0].tx.array)))
     for group in sweep_users(budget.users, channels.h):
         swept[list(group.users)] = np.reshape(group.abs_y, (len(group.users), -1))
     ahead = zip(budget.users, *directions(scene, budget.users), strict=True)

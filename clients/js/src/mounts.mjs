@@ -129,6 +129,7 @@ function arrayOf(array) {
     horizontal_spacing = 0.5,
     pattern = "iso",
     polarization = "V",
+    codebook = "dft",
   } = array ?? {};
   const file = array?.pattern_file ? `patterns/${array.pattern_file.split("/").at(-1)}` : "";
   return {
@@ -140,6 +141,7 @@ function arrayOf(array) {
     polarization,
     pattern_file: file,
     panels: array?.panels ?? [],
+    codebook,
   };
 }
 

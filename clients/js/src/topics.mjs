@@ -38,6 +38,7 @@ const NO_ARRAY = {
   polarization: "V",
   pattern_file: "",
   panels: [],
+  codebook: "dft",
 };
 const antennaArray = new Struct({
   rows: optional(integer(1, 1024), 1),
@@ -51,6 +52,7 @@ const antennaArray = new Struct({
   ),
   pattern_file: optional(text, ""),
   panels: optional(list(panel), []),
+  codebook: optional(text, "dft"),
 });
 const device = tagged({
   antenna: new Struct({

@@ -190,6 +190,7 @@ export interface AntennaArray {
   polarization: string;
   pattern_file: string;
   panels: { position_m: Vector3; yaw_deg: number; pitch_deg: number; roll_deg: number }[];
+  codebook: string;
 }
 interface Mounted {
   name: string;

@@ -110,7 +110,7 @@ function device(spec, parent) {
     orientation: unlessEqual(floats(turned), floats([1, 0, 0, 0])),
   };
   if (spec.kind === "antenna") {
-    const { rows, columns, vertical_spacing, horizontal_spacing, pattern, polarization, pattern_file, panels } = spec.array ?? {};
+    const { rows, columns, vertical_spacing, horizontal_spacing, pattern, polarization, pattern_file, panels, codebook } = spec.array ?? {};
     const array = spec.array && {
       rows: integer(rows, 1), columns: integer(columns, 1), vertical_spacing: float(vertical_spacing, 0.5),
       horizontal_spacing: float(horizontal_spacing, 0.5), pattern: integer(pattern, "iso"), polarization: integer(polarization, "V"),
@@ -118,7 +118,7 @@ function device(spec, parent) {
       panels: panels?.length ? panels.map(({ position_m, yaw_deg, pitch_deg, roll_deg }) => ({
         position_m: unlessEqual(floats(position_m), floats([0, 0, 0])),
         yaw_deg: float(yaw_deg, 0), pitch_deg: float(pitch_deg, 0), roll_deg: float(roll_deg, 0),
-      })) : undefined,
+      })) : undefined, codebook: integer(codebook, "dft"),
     };
     return { ...common, role: spec.role, array: unlessEqual(array ?? {}, {}), power_dbm: float(spec.power_dbm, 0),
       carriers: spec.carriers?.length ? spec.carriers : undefined };

@@ -277,8 +277,8 @@ class LastBeam(OfLink):
     high = 1.0
 
     def _of_user(self, link: LinkFigures, user: int, pair: Pair) -> Float64Array:
-        tx_beam, receive = link.tx_beam[..., user], pair.rx.array.size
-        share = (tx_beam * receive + link.rx_beam[..., user] + 1) / (pair.tx.array.size * receive)
+        tx_beam, receive = link.tx_beam[..., user], pair.beams[1]
+        share = (tx_beam * receive + link.rx_beam[..., user] + 1) / (pair.beams[0] * receive)
         return np.where(tx_beam < 0, 0.0, share)
 
 

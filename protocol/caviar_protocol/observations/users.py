@@ -10,6 +10,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.scenario.schema import ServiceSpec, owned_by
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import Pair, pairs_of, share_carrier
 from caviar_protocol.topics import AntennaArray, Scene
 
@@ -42,9 +43,15 @@ class Place:
     rx: AntennaArray
 
     @property
+    def beams(self) -> tuple[int, int]:
+        """Sizes of the two codebooks, TX and RX."""
+        return beam_count(self.tx), beam_count(self.rx)
+
+    @property
     def beam_pairs(self) -> int:
         """Number of pairs of the two codebooks."""
-        return self.tx.size * self.rx.size
+        tx, rx = self.beams
+        return tx * rx
 
 
 class Users:

@@ -51,6 +51,7 @@ from caviar_protocol.recording.topics import (
     LinkArrays,
 )
 from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
 
 T = TypeVar("T", bound=str)
 Key: TypeAlias = T | tuple[T, str]
@@ -97,6 +98,7 @@ class Recording:
             more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
             warnings.warn(f"the recording is damaged: {self.damage[0]}{more}", RecordingWarning, stacklevel=2)
         self.metadata = self._read_metadata()
+        add_codebook_files(RunDirectory(self.directory).assets.glob(f"{CODEBOOKS_FOLDER}*"))
         self._starts = [0]
         for segment in self._segments:
             self._starts.append(self._starts[-1] + len(segment.chunks))

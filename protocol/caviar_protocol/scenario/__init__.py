@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import DeclarationError, ScenarioError
 from caviar_protocol.fields import MAX_SUBCARRIERS
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario.conversion import FILE, Place, Source, convert_table
@@ -42,6 +42,14 @@ from caviar_protocol.scenario.schema import (
     pattern_asset,
 )
 from caviar_protocol.scenario.toml import MAX_SIZE, dotted, key_lines, parse_toml
+from caviar_protocol.space.codebooks import (
+    CODEBOOKS_FOLDER,
+    DFT,
+    add_codebook_files,
+    beam_count,
+    codebook_digest,
+    named_by_content,
+)
 from caviar_protocol.topics.channel import Carrier
 
 SHOWN = 80
@@ -93,8 +101,8 @@ def find_scenario(scenario: Path | str) -> Path:
 def load_scenario(path: Path | str, settings: Sequence[str] = ()) -> Scenario:
     """Read and check a scenario.
 
-    Strings that begin with ``file:`` in settings of services, and in the ``pattern_file`` of antennas, are
-    paths relative to the file's folder; they come out as absolute paths.
+    Strings that begin with ``file:`` in settings of services, and in ``pattern_file`` and ``codebook`` of
+    antennas, are paths relative to the file's folder; they come out as absolute paths.
 
     Args:
         path: A file, or the name of a scenario that ships, as of `find_scenario`.
@@ -385,9 +393,12 @@ def _with_files(scenario: Scenario, folder: Path) -> Scenario:
         )
         for name, service in scenario.services.items()
     }
+    if scenario.replay is not None:
+        add_codebook_files(RunDirectory(Path(scenario.replay.recording)).assets.glob(f"{CODEBOOKS_FOLDER}*"))
     devices = tuple(
-        _with_pattern(device, folder, Place("devices", scenario.source).at(index).at("array"))
+        _with_codebook(_with_pattern(device, folder, array), folder, array)
         for index, device in enumerate(scenario.devices)
+        for array in [Place("devices", scenario.source).at(index).at("array")]
     )
     _check_patterns(devices, scenario.source)
     return msgspec.structs.replace(scenario, services=services, devices=devices)
@@ -406,6 +417,23 @@ def _with_pattern(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
         link = folder / name.removeprefix(FILE)
         path = link.parent.resolve() / link.name
     found = msgspec.structs.replace(device.array, pattern_file=str(path))
+    return msgspec.structs.replace(device, array=found)
+
+
+def _with_codebook(device: DeviceSpec, folder: Path, array: Place) -> DeviceSpec:
+    """A device whose codebook is there; that of a file with the absolute path and the SHA-256."""
+    if device.array is None or device.array.codebook == DFT:
+        return device
+    place, found = array.at("codebook"), device.array
+    try:
+        if found.codebook.startswith(FILE) and not codebook_digest(found):
+            path = absolute_paths(found.codebook, folder, place)
+            found = msgspec.structs.replace(found, codebook=named_by_content(f"{FILE}{path}"))
+        beam_count(found)
+    except ScenarioError as error:
+        raise place.error(error.message) from error
+    except DeclarationError as error:
+        raise place.error(str(error)) from error
     return msgspec.structs.replace(device, array=found)
 
 

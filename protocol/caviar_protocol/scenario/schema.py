@@ -22,6 +22,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.files import Durability
 from caviar_protocol.messages import Policy, Role
 from caviar_protocol.scenario.conversion import Source
+from caviar_protocol.space.codebooks import FILE, codebook_digest
 from caviar_protocol.space.coordinates import Vector, multiply, quaternion_from_euler
 from caviar_protocol.topics.channel import Carrier
 from caviar_protocol.topics.scene import AntennaArray, AntennaDevice, CameraDevice, Device, LidarDevice
@@ -352,8 +353,14 @@ def pattern_asset(path: str) -> str:
     return f"{PATTERNS}{PurePath(path).name}"
 
 
-def _published(array: AntennaArray) -> AntennaArray:
-    """An array of a scenario as it is in a scene: its pattern file by the name of the asset."""
+def published_array(array: AntennaArray) -> AntennaArray:
+    """An array of a scenario as it is in a scene: its files by the names of their assets, without paths.
+
+    Args:
+        array: Of a device of the scenario.
+    """
+    if digest := codebook_digest(array):
+        array = msgspec.structs.replace(array, codebook=f"{FILE}#{digest}")
     if not array.pattern_file:
         return array
     return msgspec.structs.replace(array, pattern_file=pattern_asset(array.pattern_file))
@@ -378,7 +385,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
                 position=position,
                 orientation=orientation,
                 role=spec.role,
-                array=_published(spec.array or AntennaArray()),
+                array=published_array(spec.array or AntennaArray()),
                 power_dbm=spec.power_dbm,
                 carriers=spec.carriers,
             )

@@ -1,32 +1,21 @@
-"""Beams of DFT codebooks: which one points where, its gain, and |y| of all pairs of them, for arrays of
-panels and polarizations.
+"""Pairs of beams of two arrays: |y| of all pairs, the best of them, and the pair along the straight line.
 
-`Link` defines the beams by their index. An array is a set of uniform subarrays: the elements of one panel and
-one polarization. Elements and beams are both in order of the subarrays, so whatever is known of uniform
-arrays holds for each of these blocks.
+What one array's beams are says its codebook (`caviar_protocol.space.codebooks`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int32Array, Int64Array
-from caviar_protocol.space.coordinates import (
-    UnitQuaternion,
-    Vector,
-    quaternion_from_euler,
-    rotation_matrix,
-    unrotated,
-)
-from caviar_protocol.topics.scene import AntennaArray, Panel
+from caviar_protocol.space.codebooks import DFT, codebook_of
+from caviar_protocol.topics.scene import AntennaArray
 
 
 def straight_beams(
@@ -51,170 +40,8 @@ def straight_beams(
     sent = taken = 0
     if not (transmit.is_uniform and receive.is_uniform):
         sent, taken = coupled_polarizations(transmit, receive)
-    return beam_towards(transmit, towards_rx, sent), beam_towards(receive, towards_tx, taken)
-
-
-def beam_towards(array: AntennaArray, direction: Sequence[float], polarization: int = 0) -> int:
-    """Beam with the greatest ``|c_k* a(k̂)|`` towards a direction.
-
-    Along one axis of N elements with a spacing of d wavelengths, and u the direction's cosine,
-    ``|c_k* a| = |sin(πNv)| / (sqrt(N)·|sin πv|)`` with ``v = d·u − k/N`` (Tse and Viswanath, section
-    7.3.4). The numerator is the same for all k, so the best k is the one nearest to N·d·u, modulo N:
-    wrapped beams, end-fire directions and grating lobes need no special cases.
-
-    Args:
-        array: The array.
-        direction: Unit vector in device axes.
-        polarization: Which of dual polarizations, by its index.
-
-    Returns:
-        Index of the beam: of several panels one of the panel that faces the direction most, of two beams with
-        equal gain the one of lower index.
-
-    Example:
-        >>> beam_towards(AntennaArray(rows=1, columns=8), (1.0, 0.0, 0.0))  # boresight
-        0
-    """
-    if array.is_uniform:
-        return _uniform_beam(array, direction)
-    mine = subarrays(array)[polarization :: len(array.polarizations)]
-    # The panel whose boresight is nearest: the first coordinate is its cosine.
-    faced = max(mine, key=lambda part: part.towards(direction)[0])
-    return faced.first + _uniform_beam(faced.array, faced.towards(direction))
-
-
-def _uniform_beam(array: AntennaArray, direction: Sequence[float]) -> int:
-    _, y, z = direction
-    column = _nearest(array.columns, array.horizontal_spacing * y)
-    row = _nearest(array.rows, -array.vertical_spacing * z)  # rows count from +z to −z
-    return column * array.rows + row
-
-
-def _nearest(size: int, turns: float) -> int:
-    """The k of 0 … size − 1 with the least ``|turns − k/size|`` modulo 1."""
-    exact = size * turns
-    # Half a beam rounds down, so that of two equal beams the lower index is taken; `round` would go to even.
-    below = math.ceil(exact - 0.5)
-    is_tie = exact - below == 0.5
-    beam = below % size
-    return 0 if is_tie and beam == size - 1 else beam
-
-
-def beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
-    """Amplitude of a beam towards directions, 1 at its greatest.
-
-    Args:
-        array: The array.
-        beam: Index of the beam.
-        directions: Unit vectors in device axes, Shape ``[..., 3]``.
-
-    Returns:
-        The array factor ``|sin(πNv)| / (N·|sin πv|)`` of `beam_towards` over columns times that over rows,
-        of the beam's own subarray, Shape ``[...]``.
-
-    Example:
-        >>> boresight = np.array([[1.0, 0.0, 0.0]])
-        >>> [beam_gain(AntennaArray(columns=8), beam, boresight).round(6).item() for beam in (0, 1)]
-        [1.0, 0.0]
-    """
-    if not array.is_uniform:
-        part, beam = subarray_of(array, beam)
-        turned = rotation_matrix(part.orientation)
-        array, directions = part.array, directions @ turned
-    column, row = divmod(beam, array.rows)
-    gain: Float64Array = _factor(
-        array.columns, array.horizontal_spacing * directions[..., 1] - column / array.columns
-    ) * _factor(array.rows, -array.vertical_spacing * directions[..., 2] - row / array.rows)
-    return gain
-
-
-def subarray_of(array: AntennaArray, beam: int) -> tuple[Subarray, int]:
-    """The subarray that a beam is of.
-
-    Args:
-        array: The array of a device.
-        beam: Index of a beam of the whole array.
-
-    Returns:
-        The subarray, and the beam's index in the subarray's own codebook.
-
-    Example:
-        >>> part, own = subarray_of(AntennaArray(columns=8, polarization="VH"), 11)
-        >>> part.array.polarization, own
-        ('H', 3)
-    """
-    number, own = divmod(beam, array.rows * array.columns)
-    return subarrays(array)[number], own
-
-
-def _factor(size: int, v: Float64Array) -> Float64Array:
-    v = v - np.round(v)
-    sine = np.sin(np.pi * v)
-    # At its maxima the array factor is 0/0.
-    peak = np.abs(sine) < 1e-9
-    factor: Float64Array = np.where(
-        peak, 1.0, np.abs(np.sin(np.pi * size * v)) / (size * np.abs(np.where(peak, 1.0, sine)))
-    )
-    return factor
-
-
-@dataclass(frozen=True)
-class Subarray:
-    """All elements of one panel and one polarization.
-
-    Example:
-        >>> vertical, horizontal = subarrays(AntennaArray(columns=8, polarization="VH"))
-        >>> horizontal.elements
-        slice(8, 16, None)
-    """
-
-    array: AntennaArray
-    """A uniform array (`AntennaArray.is_uniform`)."""
-    first: int
-    """Index of its first element among those of the whole array, and of its first beam among all beams."""
-    position: Vector
-    """Of its centre in the device's axes [m]."""
-    orientation: UnitQuaternion
-    """Rotates its axes into the device's."""
-
-    @property
-    def elements(self) -> slice:
-        """Its elements, or its beams, among those of the whole array."""
-        return slice(self.first, self.first + self.array.size)
-
-    def towards(self, direction: Sequence[float]) -> Vector:
-        """A direction in the axes of the subarray.
-
-        Args:
-            direction: Unit vector in the device's axes.
-        """
-        x, y, z = direction
-        return unrotated(self.orientation, (x, y, z))
-
-
-# Arrays are few and frozen; link, agent and channel ask for their parts in every frame.
-@lru_cache(maxsize=256)
-def subarrays(array: AntennaArray) -> tuple[Subarray, ...]:
-    """The subarrays of an array: panels in their order, within each the polarizations.
-
-    Args:
-        array: The array of a device.
-
-    Example:
-        >>> [part.first for part in subarrays(AntennaArray(rows=2, columns=4, polarization="VH"))]
-        [0, 8]
-    """
-    found = []
-    first = 0
-    for panel in array.panels or (Panel(),):
-        turned = (math.radians(panel.yaw_deg), math.radians(panel.pitch_deg), math.radians(panel.roll_deg))
-        for polarization in array.polarizations:
-            part = array
-            if not array.is_uniform:
-                part = msgspec.structs.replace(array, polarization=polarization, panels=())
-            found.append(Subarray(part, first, panel.position_m, quaternion_from_euler(*turned)))
-            first += part.size
-    return tuple(found)
+    at_tx, at_rx = codebook_of(transmit), codebook_of(receive)
+    return at_tx.beam_towards(towards_rx, sent), at_rx.beam_towards(towards_tx, taken)
 
 
 @lru_cache(maxsize=64)
@@ -285,16 +112,15 @@ class BeamPairs(NamedTuple):
 
 
 def beam_gains(h: ArrayLike, tx: AntennaArray, rx: AntennaArray) -> Float64Array:
-    """|y| of every pair of DFT beams, the amplitude gain of the channel between them.
+    """|y| of every pair of beams, the amplitude gain of the channel between them.
 
     y = wᴴ H f (paper, eq. 1) with w = c_r for the RX beam r and f = conj(c_t) for the TX beam t, where c_k is
-    beam k of an array's codebook (`Link` defines it, `caviar_services.antenna_arrays.dft_codebook` has it as
-    vectors): a transmitter sends conj(c_t), so that t means the direction that it means at a receiver. It
-    is what `Link`, labels of datasets and agents count.
+    beam k of an array's codebook (`caviar_protocol.space.codebooks`): a transmitter sends conj(c_t), so that
+    t means the direction that it means at a receiver. It is what `Link`, labels of datasets and agents count.
 
-    Both conj(w) and f have entries exp(−j2πkn/N)/sqrt(N), so that all pairs are a Fourier transform over the
-    columns and rows of both arrays, and no codebook of N² entries has to be formed. Of several panels or
-    polarizations each block is transformed by itself.
+    Of DFT beams both conj(w) and f have entries exp(−j2πkn/N)/sqrt(N), so that all pairs are a Fourier
+    transform over the columns and rows of both arrays, and no codebook of N² entries has to be formed. Of
+    several panels or polarizations each block is transformed by itself.
 
     Args:
         h: Channel matrices, Shape ``[..., Nr, Nt]``.
@@ -302,7 +128,8 @@ def beam_gains(h: ArrayLike, tx: AntennaArray, rx: AntennaArray) -> Float64Array
         rx: Array of the receiver, of Nr elements.
 
     Returns:
-        |y| by TX beam and RX beam, Shape ``[..., Nt, Nr]``.
+        |y| by TX beam and RX beam, Shape ``[..., Kt, Kr]``: K beams of each end, of the DFT as many as
+        elements.
 
     Raises:
         ValueError: The arrays do not have the elements of ``h``.
@@ -319,6 +146,9 @@ def beam_gains(h: ArrayLike, tx: AntennaArray, rx: AntennaArray) -> Float64Array
             f"H has the shape {h.shape}, arrays of {rx.size} receiving and {tx.size} transmitting elements "
             f"need [..., {rx.size}, {tx.size}]"
         )
+    if tx.codebook != DFT or rx.codebook != DFT:
+        y = codebook_of(rx).vectors.conj() @ h @ codebook_of(tx).vectors.conj().T
+        return np.ascontiguousarray(np.abs(y).swapaxes(-1, -2))
     # Elements are numbered panel by panel, column by column (`AntennaArray`): so the axes
     # of the grid come out of a reshape, and the transform of one axis after the other is that of all.
     leading, grid = h.shape[:-2], _grid(tx, rx)

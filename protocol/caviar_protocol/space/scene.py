@@ -14,6 +14,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.coordinates import Pose, Vector, compose, unrotated
 from caviar_protocol.topics.scene import AntennaDevice, Device, Scene
 
@@ -201,6 +202,17 @@ class Pair:
     """Its ``position`` is that on its mount; `device_pose` gives the one in the world."""
     rx: AntennaDevice
     """The same."""
+
+    @property
+    def beams(self) -> tuple[int, int]:
+        """Sizes of the codebooks of both ends."""
+        return beam_count(self.tx.array), beam_count(self.rx.array)
+
+    @property
+    def beam_pairs(self) -> int:
+        """Number of pairs of them."""
+        sent, taken = self.beams
+        return sent * taken
 
     def uses(self, carrier: str) -> bool:
         """Whether both ends use a carrier.

@@ -236,14 +236,15 @@ class Link(Payload, frozen=True, kw_only=True, omit_defaults=True):
     c_k[i] = exp(+j2π(p·(i % rows)/rows + q·(i // rows)/columns))/sqrt(N) with p = k % rows and
     q = k // rows; a receiver uses w = c_k, a transmitter f = conj(c_k), so that an index means
     the same direction at both ends. With several panels or dual polarization, beam ``s·N + k`` is beam ``k``
-    of the ``s``-th block of N elements and 0 at all others.
+    of the ``s``-th block of N elements and 0 at all others. Another `AntennaArray.codebook` has other vectors
+    c_k, and its own number of them for each block.
 
-    The pair along the straight line has, at each end, the beam of the greatest |c_k* a| for the unit vector u
-    towards the other end, in the panel's axes: p is the integer nearest to −rows·vertical_spacing·u_z, modulo
-    rows, and q that nearest to columns·horizontal_spacing·u_y, modulo columns; of two as near the lower
-    index. Of several panels it is the one with the greatest u_x. Of polarizations it is the two that couple
-    best between upright devices that face each other, of equal ones the first: V to V, RHCP to RHCP, but
-    −45° to +45°.
+    The pair along the straight line has, at each end, the beam of the greatest |c_k* a| for the unit
+    vector u towards the other end, in the panel's axes. Of the DFT, p is the integer nearest to
+    −rows·vertical_spacing·u_z, modulo rows, and q that nearest to columns·horizontal_spacing·u_y, modulo
+    columns; of equal beams it is the one of lower index. Of several panels it is the one with the
+    greatest u_x. Of polarizations it is the two that couple best between upright devices that face each
+    other, of equal ones the first: V to V, RHCP to RHCP, but −45° to +45°.
 
     The SNR is P·|y|²/(k·T·B·F), with the transmit power P [W] of ``power_dbm``, B = ``bandwidth_hz`` of the
     carrier, k = 1.380649e-23 J/K, and temperature T and noise factor F as the link is set: 290 K and 9 dB

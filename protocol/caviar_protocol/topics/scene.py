@@ -60,6 +60,10 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Asset with the pattern of each element, in place of ``pattern``; in a scenario ``file:`` and a path."""
     panels: tuple[Panel, ...] = ()
     """Panels, each with all rows and columns; empty: one, at the device's own position and orientation."""
+    codebook: str = "dft"
+    """Beams of each panel and polarization: ``dft``; ``quantized:BITS``, these with phase shifters of so many
+    bits; ``file:#SHA-256``, those of the asset ``codebooks/SHA-256``, in a scenario ``file:`` and a path; or
+    another name that all services of the run know, with what follows a colon."""
 
     @property
     def polarizations(self) -> tuple[str, ...]:

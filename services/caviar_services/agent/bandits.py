@@ -179,17 +179,17 @@ class BanditAgent(Agent[BanditSettings]):
         self._asked = {}
         at_tx, at_rx = directions(scene, pairs)
         for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
-            where, receive = self._where(scene, pair), pair.rx.array.size
+            where, sizes = self._where(scene, pair), pair.beams
             for carrier in self.run.carriers:
-                context = Context(carrier.name, pair.tx.name, where, pair.tx.array.size, receive)
+                context = Context(carrier.name, pair.tx.name, where, *sizes)
                 bandit = self._bandits.get(context)
                 if bandit is None:
-                    bandit = self._bandits[context] = Bandit(pair.tx.array.size * receive)
+                    bandit = self._bandits[context] = Bandit(pair.beam_pairs)
                 self._asked[carrier.name, pair.tx.name, pair.rx.name] = context
                 if bandit.plays.any():
                     # A stream of its own for each user: who else is there does not move its draws.
                     stream = f"{carrier.name}/{pair.tx.name}/{pair.rx.name}"
-                    beams = divmod(self.pick(bandit, frame.generator(stream)), receive)
+                    beams = divmod(self.pick(bandit, frame.generator(stream)), sizes[1])
                 else:
                     beams = straight_beams(pair.tx.array, towards_rx, pair.rx.array, towards_tx)
                 yield BeamChoice(

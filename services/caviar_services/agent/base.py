@@ -18,6 +18,7 @@ import msgspec
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario.rules import BEAM
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaDevice, BeamChoice, Carrier, Scene, UserSchedule
 from caviar_protocol.topics.link import Command, SignalCommand
@@ -267,7 +268,7 @@ def checked_choices(
 
 
 def _check_beam(author: str, name: str, choice: BeamChoice, device: AntennaDevice) -> None:
-    beam, size = getattr(choice, name), device.array.size
+    beam, size = getattr(choice, name), beam_count(device.array)
     try:
         if 0 <= operator.index(beam) < size:  # NumPy's whole numbers are right, too
             return

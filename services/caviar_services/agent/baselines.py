@@ -69,8 +69,8 @@ class RandomAgent(Agent[AgentSettings]):
             yield BeamChoice(
                 tx=pair.tx.name,
                 rx=pair.rx.name,
-                tx_beam=int(generator.integers(pair.tx.array.size)),
-                rx_beam=int(generator.integers(pair.rx.array.size)),
+                tx_beam=int(generator.integers(pair.beams[0])),
+                rx_beam=int(generator.integers(pair.beams[1])),
             )
 
 

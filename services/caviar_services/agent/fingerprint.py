@@ -22,12 +22,13 @@ from caviar_protocol.arrays import Float64Array, quantity
 from caviar_protocol.errors import RecordingError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.scenario.schema import published_array
 from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.codebooks import DFT, beam_count
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, antennas, device_pose, directions
-from caviar_protocol.topics import Link, Scene
+from caviar_protocol.topics import AntennaArray, Link, Scene
 from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
-from caviar_services.link.base import User
 from caviar_services.service import Preparation, Prepared
 
 UNKNOWN = "users-without-fingerprint"
@@ -56,6 +57,13 @@ class Codebooks(NamedTuple):
     carrier: str
     tx_beams: int
     rx_beams: int
+    tx_codebook: str = DFT
+    rx_codebook: str = DFT
+
+    @classmethod
+    def of(cls, pair: Pair, carrier: str) -> Codebooks:
+        """Those of a pair of a scene."""
+        return cls(pair.tx.name, carrier, *pair.beams, pair.tx.array.codebook, pair.rx.array.codebook)
 
 
 class Fingerprints:
@@ -103,7 +111,7 @@ class Fingerprints:
         for u, (tx, rx, carrier) in enumerate(zip(link.tx, link.rx, link.carrier, strict=True)):
             if not link.has_path[u] or tx not in sizes or rx not in sizes:
                 continue
-            key = Codebooks(tx, carrier, sizes[tx].array.size, sizes[rx].array.size)
+            key = Codebooks.of(Pair(sizes[tx], sizes[rx]), carrier)
             cell = self._cell(device_pose(scene, sizes[rx]).position)
             pairs = self._seen[key].setdefault(cell, {})
             for rank, ((tx_beam, rx_beam), gain) in enumerate(zip(beams[u], power[u], strict=True)):
@@ -198,7 +206,11 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
             raise ScenarioError(str(error), key=key) from error
         self.run.progress("prepared", 0.0)
         if not any(map(self._is_here, table.codebooks)):
-            there = ", ".join(f"{c.tx!r} with {c.tx_beams} beams on {c.carrier}" for c in table.codebooks)
+            there = ", ".join(
+                f"{c.tx!r} with {c.tx_beams} beams on {c.carrier}"
+                + ("" if c.tx_codebook == DFT else f" ({c.tx_codebook})")
+                for c in table.codebooks
+            )
             raise ScenarioError(
                 f"{path} has fingerprints of {there or 'no transmitter'}, and the scenario none "
                 "of these; record a run of this scenario",
@@ -214,7 +226,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
             return False
         return any(
             fnmatchcase(known.tx, f"{device.on}/{device.name}" if device.on else device.name)
-            and (device.array is None or device.array.size == known.tx_beams)
+            and (device.array is None or _codebook(device.array) == (known.tx_beams, known.tx_codebook))
             for device in self.run.devices
         )
 
@@ -222,7 +234,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         """The best of the first few pairs of each user's cell."""
         for index, user in enumerate(sounding.users):
             position = device_pose(sounding.scene, user.rx).position
-            pairs = self._table.pairs(_codebooks(user), position)
+            pairs = self._table.pairs(Codebooks.of(user, user.carrier.name), position)
             if not pairs:
                 sounding.note(UNKNOWN)
                 yield Measured(index, *_straight(sounding.scene, user))
@@ -232,8 +244,10 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
                 yield found
 
 
-def _codebooks(user: User) -> Codebooks:
-    return Codebooks(user.tx.name, user.carrier.name, user.tx.array.size, user.rx.array.size)
+def _codebook(array: AntennaArray) -> tuple[int, str]:
+    """Size and name of a scenario's codebook, as they are in a scene."""
+    published = published_array(array)
+    return beam_count(published), published.codebook
 
 
 def _straight(scene: Scene, pair: Pair) -> tuple[int, int]:

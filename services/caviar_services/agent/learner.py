@@ -217,7 +217,7 @@ class LearnerAgent(Agent[LearnerSettings]):
         share = max(settings.explore_least, 1.0 - frame.number / settings.explore_frames)
         for place, pair in users:
             features = self._features(seen, place)
-            beams = pair.tx.array.size, pair.rx.array.size
+            beams = pair.beams
             # A stream of its own for each user: who else is there does not move its draws.
             draws = frame.generator(f"{pair.tx.name}/{pair.rx.name}")
             if draws.random() < share:

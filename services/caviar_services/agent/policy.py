@@ -265,7 +265,7 @@ class PolicyAgent(Agent[PolicySettings]):
         known = KnownDevices(self.run.devices, _grids(model, called, key))
         transmitters = card.transmitters if card else ("*",)
         places = Users(known, self.settings.users, self.settings.except_users, transmitters)
-        sizes = tuple((place.tx.size, place.rx.size) for place in places.places)
+        sizes = tuple(place.beams for place in places.places)
         if card is not None and card.codebooks != sizes:
             raise ScenarioError(
                 f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
@@ -366,7 +366,7 @@ class PolicyAgent(Agent[PolicySettings]):
                     f"the policy chose pair {index} of {size} for {pair.rx.name}; it gives one index for "
                     f"each of {len(places)} places, from 0 on"
                 )
-            tx_beam, rx_beam = divmod(int(index), pair.rx.array.size)
+            tx_beam, rx_beam = divmod(int(index), pair.beams[1])
             yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
 
 

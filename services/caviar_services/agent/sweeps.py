@@ -19,13 +19,16 @@ import numpy as np
 from msgspec.structs import replace
 
 from caviar_protocol.arrays import Complex128Array, Int64Array, quantity
+from caviar_protocol.scenario import DeviceSpec, Scenario
+from caviar_protocol.scenario.conversion import Place, Source
 from caviar_protocol.space.beams import beam_gains, best_pairs
+from caviar_protocol.space.codebooks import DFT
 from caviar_protocol.topics import AntennaArray
 from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.base import User
 from caviar_services.link.beam_sweep import sweep_users
-from caviar_services.service import RunInfo
+from caviar_services.service import Preparation, Prepared, RunInfo
 
 
 def sweep_all(sounding: Sounding, indices: Iterable[int]) -> Iterator[Measured]:
@@ -39,7 +42,7 @@ def sweep_all(sounding: Sounding, indices: Iterable[int]) -> Iterator[Measured]:
         The pair of each user that has a path: without one there is nothing to measure but noise.
     """
     users, chosen = sounding.users, set(indices)
-    sounding.count_shared((users[u], users[u].tx.array.size * users[u].rx.array.size) for u in sorted(chosen))
+    sounding.count_shared((users[u], users[u].beam_pairs) for u in sorted(chosen))
     h = [sounding.h[u] if u in chosen else None for u in range(len(users))]
     for group in sweep_users(users, h):
         for u, abs_y in zip(group.users, group.abs_y, strict=True):
@@ -160,6 +163,16 @@ class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
 
     Settings = HierarchicalSettings
 
+    @classmethod
+    def check_scenario(cls, settings: HierarchicalSettings, scenario: Scenario, place: Place) -> None:
+        """Raise `ScenarioError` where an antenna has another codebook than that of the DFT."""
+        _require_dft(scenario.devices, scenario.source)
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """Look at the codebooks of a run whose scenario is on another machine, too."""
+        _require_dft(self.run.devices, Source())
+        return super().prepare(preparation)
+
     def select(self, sounding: Sounding) -> Iterator[Measured]:
         """The pair that the levels lead to; no choice for a user without a path."""
         users, branching = sounding.users, self.settings.branching
@@ -170,6 +183,21 @@ class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
             matrix = sounding.h[u]
             if matrix is not None:
                 yield Measured(u, *_descend(sounding, users[u], matrix, of_user))
+
+
+def _require_dft(devices: Sequence[DeviceSpec], source: Source) -> None:
+    for index, device in enumerate(devices):
+        if device.array is not None and device.array.codebook != DFT:
+            raise (
+                Place("devices", source)
+                .at(index)
+                .at("array")
+                .at("codebook")
+                .error(
+                    f"is {device.array.codebook!r}, and 'hierarchical-sweep' narrows DFT beams alone; write "
+                    f"{DFT!r}, or use another agent"
+                )
+            )
 
 
 class End(msgspec.Struct, frozen=True):

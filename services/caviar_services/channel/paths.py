@@ -21,7 +21,7 @@ from caviar_protocol.arrays import (
     UInt8Array,
     UInt64Array,
 )
-from caviar_protocol.space.beams import subarrays
+from caviar_protocol.space.antenna_arrays import subarrays
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene

@@ -19,6 +19,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import PayloadError, ProductError
 from caviar_protocol.messages import GrantInput, Input, Role, Status
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Scene, UserSchedule
 from caviar_services.channel.batch import ChannelBatch, MemberSeed, SceneAt
@@ -393,11 +394,12 @@ class _FrameCommands:
 
     def _require_in_codebook(self, action: GrantInput, user: User, command: BeamChoice) -> None:
         for side, beam, device in (("TX", command.tx_beam, user.tx), ("RX", command.rx_beam, user.rx)):
-            if not 0 <= beam < device.array.size:
+            count = beam_count(device.array)
+            if not 0 <= beam < count:
                 raise _wrong(
                     action,
                     f"it chose {side} beam {beam} for {_user(user.tx.name, user.rx.name)}; "
-                    f"the codebook of {device.name!r} has beams 0 to {device.array.size - 1}",
+                    f"the codebook of {device.name!r} has beams 0 to {count - 1}",
                 )
 
     def _no_such_user(self, action: GrantInput, tx: str, rx: str, carrier: str) -> None:

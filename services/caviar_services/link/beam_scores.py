@@ -173,7 +173,7 @@ def _score(scene: Scene, users: Users, choices: Choices, swept: Sequence[Swept],
     """Read off the chosen, the best and the baseline pairs of all users."""
     towards_rx, towards_tx = directions(scene, users)
     # Users with fewer pairs than others fill up with −1 (`_listed`), so that the lists are one array.
-    k = min(top_k, max((user.tx.array.size * user.rx.array.size for user in users), default=0))
+    k = min(top_k, max((user.beam_pairs for user in users), default=0))
     chosen, baseline = [0.0] * len(users), [0.0] * len(users)
     tx_beams, rx_beams = choices.tx_beam.tolist(), choices.rx_beam.tolist()
     for group in swept:

@@ -22,12 +22,13 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.multipath import subcarrier_weights
+from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.beams import beam_gains
+from caviar_protocol.space.codebooks import beam_count, codebook_of
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_services.antenna_arrays import dft_beam, steering_vector
 from caviar_services.link.base import Users
 
 
@@ -105,12 +106,16 @@ def beam_responses(
             found.append(np.zeros((user.carrier.slots, user.carrier.subcarriers), np.complex128))
             continue
         for beam, device in ((tx_beam, user.tx), (rx_beam, user.rx)):
-            if beam >= device.array.size:
+            count = beam_count(device.array)
+            if beam >= count:
                 raise PayloadError(
                     f"beam {beam} of user {user} does not exist; the codebook of {device.name!r} has beams "
-                    f"0 to {device.array.size - 1}"
+                    f"0 to {count - 1}"
                 )
-        ends = dft_beam(user.tx.array, tx_beam).conj(), dft_beam(user.rx.array, rx_beam).conj()
+        ends = (
+            codebook_of(user.tx.array).vector(tx_beam).conj(),
+            codebook_of(user.rx.array).vector(rx_beam).conj(),
+        )
         index, tx, rx = indices
         # The one amplitude of a path is that between two of its devices' subarrays.
         uniform = user.tx.array.is_uniform and user.rx.array.is_uniform

@@ -192,7 +192,7 @@ class BeamBatch(LinkBatch):
         first = self._scene_at(number)
         figure, temperature = self._settings.noise_figure_db, self._settings.temperature_k
         budget = LinkBudget.of(first.scene, self._carriers, figure, temperature)
-        elements = max((user.tx.array.size * user.rx.array.size for user in budget.users), default=1)
+        elements = max((user.beam_pairs for user in budget.users), default=1)
         each = self._channels.width(len(self._members)) * len(self._carriers) * elements
         count = max(1, min(self._channels.reach(number), self._frames - number, HELD // each))
         frames = [first]
@@ -244,4 +244,4 @@ def _swept(found: BatchChannels, user: User, pair: int, carrier: int) -> Float64
 def _straight(user: User, towards_rx: Sequence[float], towards_tx: Sequence[float]) -> int:
     """Index of the pair along the straight line."""
     sent, taken = straight_beams(user.tx.array, towards_rx, user.rx.array, towards_tx)
-    return sent * user.rx.array.size + taken
+    return sent * user.beams[1] + taken

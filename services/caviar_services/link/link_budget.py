@@ -112,5 +112,5 @@ class LinkBudget:
             carrier=tuple(user.carrier.name for user in users),
             bandwidth=np.array([user.carrier.bandwidth_hz for user in users], dtype=np.float64),
             power_over_noise=np.array([transmit_power(user) for user in users]) / noise,
-            receive_beams=np.array([user.rx.array.size for user in users], np.int64),
+            receive_beams=np.array([user.beams[1] for user in users], np.int64),
         )

@@ -16,11 +16,12 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError
+from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.codebooks import codebook_of
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_services.antenna_arrays import dft_beam, steering_vector
 from caviar_services.link.base import Users
 
 MOST_POINTS = 64
@@ -158,6 +159,6 @@ def _gains(
             device.array, directions @ rotation_matrix(device_pose(scene, device).orientation)
         )
         chosen, place = np.unique(beams[whose[here]], return_inverse=True)
-        vectors = np.array([dft_beam(device.array, beam).conj() for beam in chosen.tolist()])
+        vectors = np.array([codebook_of(device.array).vector(beam).conj() for beam in chosen.tolist()])
         gains[here] = (steered * vectors[place]).sum(-1)
     return gains

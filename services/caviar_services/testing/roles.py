@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.coordinates import Pose
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import (
@@ -53,8 +54,10 @@ def _products(played: Played, topic: str, cls: type[P]) -> Iterator[P]:
 
 
 def _array_sizes(scene: Scene) -> dict[str, int]:
-    """Elements of each antenna, which are the beams of its codebook too, by name."""
-    return {device.name: device.array.size for role in ("tx", "rx") for device in antennas(scene, role)}
+    """Beams of each antenna, by name."""
+    return {
+        device.name: beam_count(device.array) for role in ("tx", "rx") for device in antennas(scene, role)
+    }
 
 
 def _sorted(names: Iterable[str]) -> bool:

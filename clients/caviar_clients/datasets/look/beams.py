@@ -14,6 +14,8 @@ from caviar_clients.datasets.look.distributions import beams_height, draw_beams
 from caviar_clients.datasets.look.html import absent, figure
 from caviar_clients.datasets.look.pictures import PANELS, picture
 from caviar_clients.datasets.texts import counted, percent
+from caviar_protocol.errors import CaviarError
+from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.topics import AntennaArray
 
 MOST_PAIRS = 2**24
@@ -23,7 +25,7 @@ BEAM_COLUMNS = ("users.tx_beam", "users.rx_beam")
 """Columns of which values that cannot be are left out: the rest of the row may be right."""
 
 _SWEEPS = ("beams", "cell")
-"""Links whose codebooks have a beam for each element of an array; others have those that they choose."""
+"""Links that take beams of the codebooks of arrays; others have those that they choose."""
 
 _MOST_BEAMS = 2**31
 """That a recorded index of a beam can number."""
@@ -125,17 +127,17 @@ def _limit(content: Content, role: str) -> int:
 
 
 def _codebook(content: Content, role: str) -> int:
-    """Beams that the largest array of this role has."""
+    """Beams that the largest codebook of this role has."""
     return max(_sizes(content, role), default=1)
 
 
 def _sizes(content: Content, role: str) -> list[int]:
-    """Elements of the arrays of this role."""
+    """Beams of the arrays of this role."""
     found = []
     for device in scenario_of(content.data).get("devices", ()):
         if device.get("role") in (role, "both") and isinstance(array := device.get("array"), dict):
             try:
-                found.append(msgspec.convert(array, AntennaArray).size)
-            except msgspec.ValidationError:  # of another version: a beam for each place, at least
+                found.append(beam_count(msgspec.convert(array, AntennaArray)))
+            except (msgspec.ValidationError, CaviarError):  # of another version, or machine
                 found.append(array.get("rows", 1) * array.get("columns", 1))
     return found

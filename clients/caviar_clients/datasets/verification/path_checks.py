@@ -17,10 +17,10 @@ import numpy as np
 
 from caviar_clients.datasets.verification.findings import Finding
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
+from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES, Interaction
-from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.paths import Antenna, Turning
 from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 

@@ -40,6 +40,7 @@ from caviar_protocol.errors import AssetError, CaviarError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.scenario.schema import PATTERNS
+from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
@@ -92,6 +93,7 @@ class PhysicsChecks:
             self._surfaces = Surfaces(triangles, outside=lambda number, normal: True)
         self._carriers = _carriers(settings)
         self._budget = _link_settings(settings)
+        add_codebook_files(file for name, file in self.files.items() if name.startswith(CODEBOOKS_FOLDER))
         self._patterns = Patterns()
         try:
             tables = {

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
+from caviar_protocol.space.antenna_arrays import element_positions
 from caviar_protocol.topics import AntennaArray, Interaction
-from caviar_services.antenna_arrays import element_positions
 from caviar_services.channel.arrays.element_paths import Bend, ElementPaths
 from caviar_services.channel.paths import Antenna
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.errors import RunError
+from caviar_protocol.space.codebooks import DFT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.paths import Antenna
@@ -294,7 +295,7 @@ def beams_of(array: AntennaArray, beam: BeamChoice, name: str) -> range:
         name: Of the transmitter, for errors.
 
     Raises:
-        RunError: The codebook has no such beam.
+        RunError: The codebook has no such beam, or is not that of the DFT.
 
     Example:
         >>> beams_of(AntennaArray(rows=2, columns=4), "best", "bs")
@@ -302,6 +303,11 @@ def beams_of(array: AntennaArray, beam: BeamChoice, name: str) -> range:
     """
     if beam == "wide" or (beam == "best" and array.size == 1):
         return range(0)
+    if array.codebook != DFT:
+        raise RunError(
+            f"--beam {beam}: maps are made of DFT beams, and {name!r} has the codebook {array.codebook!r}; "
+            "write --beam wide"
+        )
     if beam == "best":
         return range(array.size)
     if not 0 <= beam < array.size:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import Pose, unrotated
 from caviar_protocol.space.scene import antennas
-from caviar_services.antenna_arrays import steering_vector
 from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.channel.statistical.waves import BLOCK, Draws, Line, superposed_waves, times, turned
 

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, quantity
+from caviar_protocol.space.antenna_arrays import element_phases
 from caviar_protocol.space.coordinates import (
     SPEED_OF_LIGHT,
     Pose,
@@ -33,7 +34,6 @@ from caviar_protocol.space.coordinates import (
 )
 from caviar_protocol.space.scene import device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
-from caviar_services.antenna_arrays import element_phases
 from caviar_services.channel.arrays.channel_matrices import turn_phase
 from caviar_services.channel.base import ChannelSettings
 
