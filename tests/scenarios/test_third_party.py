@@ -30,6 +30,9 @@ burst = "harbour:BURST"
 [project.entry-points."caviar.observations"]
 height = "harbour:Height"
 
+[project.entry-points."caviar.codebooks"]
+switched = "harbour:Switched"
+
 [project.entry-points."caviar.formats"]
 positions = "harbour:Positions"
 
@@ -44,6 +47,7 @@ import numpy as np
 
 from caviar_protocol.cell.traffic import Offered, TrafficModel
 from caviar_protocol.observations import Bounds, Part
+from caviar_protocol.space.codebooks import Codebook
 from caviar_protocol.space.scene import device_pose
 from caviar_clients.datasets.formats import Format
 from caviar_services.world.base import ObjectState, World
@@ -71,6 +75,13 @@ def burst(traffic, place):
     """All of a period within its first tenth."""
     rate = 10 * traffic.rate_bit_s / traffic.packet_bits
     return Offered(np.array([0.0, 0.1 * traffic.period_s]), np.array([rate, 0.0]), traffic.period_s)
+
+
+class Switched(Codebook):
+    """One element at a time."""
+
+    def block(self):
+        return np.eye(self.uniform.size)
 
 
 class Positions(Format):
@@ -154,6 +165,7 @@ kind = "antenna"
 role = "tx"
 position_m = [0.0, -40.0, 12.0]
 yaw_deg = 90.0
+array = { columns = 4, codebook = "switched" }
 
 [[devices]]
 name = "rx"
@@ -168,7 +180,9 @@ import json, sys
 import caviar
 run = caviar.open(sys.argv[1])
 x = run["scene"].select(names="ship.1").position[:, 0, 0]
-print(json.dumps({"x": x.tolist(), "arrived": float(run["link"].arrived.sum())}))
+link, one_element = run["link"], abs(run["channel"].a).max()
+figures = {"arrived": float(link.arrived.sum()), "gain": float(link.abs_y.max() / one_element)}
+print(json.dumps({"x": x.tolist(), **figures}))
 """
 
 OBSERVE = """
@@ -203,13 +217,14 @@ def python(site: Path, program: str, *arguments: str | Path) -> object:
     return json.loads(done.stdout)
 
 
-def test_its_world_and_traffic_model_run(site: Path, tmp_path: Path) -> None:
+def test_its_world_traffic_model_and_codebook_run(site: Path, tmp_path: Path) -> None:
     done = caviar("run", site.parent / "harbour.toml", "--out", tmp_path, PYTHONPATH=str(site))
     assert (done.status, done.leftovers) == (0, []), done.output
     found = python(site, READ, next(tmp_path.iterdir()))
     assert isinstance(found, dict)
     assert found["x"] == pytest.approx([0.5 * frame for frame in range(10)])
     assert found["arrived"] == pytest.approx(1.2e6)
+    assert found["gain"] == pytest.approx(1.0), "no beam has more than one element"
 
 
 def test_its_part_of_the_observation_is_observed(site: Path) -> None:
@@ -241,7 +256,7 @@ def test_its_command_is_one_of_caviar(site: Path) -> None:
 def test_it_is_named_where_it_is_not_installed(site: Path, tmp_path: Path) -> None:
     done = caviar("run", site.parent / "harbour.toml", "--out", tmp_path)
     assert done.status == 1
-    assert "no world is named 'harbour'" in done.output
+    assert "devices[0].array.codebook: 'switched' is no codebook" in done.output
 
 
 @pytest.mark.parametrize("lines", [PROJECT, MODULE])
