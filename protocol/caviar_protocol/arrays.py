@@ -242,7 +242,7 @@ KNOWN_SHAPES = 256
 
 @dataclass(frozen=True)
 class _Layout:
-    """What a payload class promises, for a quick look at one of its objects."""
+    """Layout of a payload class, for a quick look at one of its objects."""
 
     dtypes_of: Callable[[Any], tuple[Any, ...]]
     """Element types of the arrays that every object has, and ``shapes_of`` their shapes."""
@@ -273,7 +273,7 @@ def _layout(cls: type[Payload]) -> _Layout:
 
 
 def attributes(paths: Sequence[str]) -> Callable[[Any], tuple[Any, ...]]:
-    """All of these attributes at once."""
+    """Getter of these attributes, all at once."""
     if len(paths) > 1:
         return attrgetter(*paths)
     if not paths:

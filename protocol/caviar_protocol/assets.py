@@ -72,7 +72,7 @@ class AssetStore:
         return self._intact(asset.digest, asset.size)
 
     def path(self, digest: str) -> Path:
-        """Where the file with this digest is, or would be.
+        """Path of the file with this digest, which may not be there.
 
         Args:
             digest: SHA-256 of the file.
@@ -219,7 +219,7 @@ class IncomingAsset:
 
     @property
     def offset(self) -> int:
-        """How much has come [B]: where the next chunk begins."""
+        """Bytes that have come: the next chunk begins there."""
         return len(self._data)
 
     def add_chunk(self, offset: int, size: int, chunk: bytes | memoryview) -> bool:

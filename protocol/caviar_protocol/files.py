@@ -1,4 +1,4 @@
-"""How files of a run are written in one step and put on the disk, how they are opened, and temporary folders.
+"""Files of a run, written in one step, put on the disk, and opened; temporary folders.
 
 A process that dies loses nothing that it handed to the operating system. A
 machine that dies loses what was not synchronised yet, so ``run.durability`` says when that happens:

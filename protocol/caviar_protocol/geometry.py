@@ -75,7 +75,7 @@ def digest_in(name: str) -> str:
 
 
 def wrong_name(asset: Asset) -> str:
-    """What is wrong with the name of a mesh that is announced while a run goes on; empty: nothing.
+    """Error in the name of a mesh that is announced while a run goes on; empty: none.
 
     Args:
         asset: Its description.

@@ -79,7 +79,7 @@ def first_tap(carrier: Carrier, tau: Float64Array) -> int:
 
 
 def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
-    """What each path's amplitude is multiplied with on each subcarrier.
+    """Factors of each path's amplitude on each subcarrier.
 
     Args:
         carrier: With its numerology.
@@ -111,7 +111,7 @@ def subcarrier_weights(carrier: Carrier, tau: Float64Array, doppler: Float64Arra
 def tap_weights(
     carrier: Carrier, tau: Float64Array, doppler: Float64Array, first: int | Int64Array
 ) -> Complex128Array:
-    """What each path's amplitude is multiplied with in each tap.
+    """Factors of each path's amplitude in each tap.
 
     Args:
         carrier: With its numerology.
@@ -260,7 +260,7 @@ def _spread(a: Complex128Array, of: Float64Array) -> Float64Array:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What became of the paths between two products."""
+    """Births and deaths of paths between two products."""
 
     born: BoolArray
     """Which paths of the later product the earlier one does not have, Shape ``[P]`` of the later."""

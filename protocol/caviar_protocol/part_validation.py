@@ -52,7 +52,7 @@ class PartCheck:
         self._expected: tuple[object, dict[str, dict[Indices, tuple[int | None, ...]]]] = (None, {})
 
     def __call__(self, topic: str, payload: Payload) -> str:
-        """What is wrong with the parts of a product; empty: nothing."""
+        """Error in the parts of a product; empty: none."""
         demand = self.demand.get(topic, frozenset())
         if isinstance(payload, Channel):
             return self._wrong_channel(payload, demand)
@@ -126,7 +126,7 @@ def _wrong_entries(
 def _wrong_places(
     part: str, places: Sequence[Indices], expected: Mapping[Indices, object], channel: Channel
 ) -> str:
-    """What is wrong with the pairs that a part has entries for. A device is no pair with itself."""
+    """Error in the pairs that a part has entries for. A device is no pair with itself."""
     known = {*places}
     for place in expected:
         if place not in known and channel.tx[place[1]] != channel.rx[place[2]]:

@@ -72,7 +72,7 @@ class RunDirectory:
 
     @property
     def control_note(self) -> Path:
-        """Where the broker's control socket is, and other things that a client has to know."""
+        """Note with the place of the broker's control socket, and what else a client has to know."""
         return self.path / "control.json"
 
     def log(self, process: str) -> Path:
@@ -81,7 +81,7 @@ class RunDirectory:
 
     @property
     def manifest(self) -> Path:
-        """Which segments the recording has, and what each finished one is."""
+        """Manifest of the recording: its segments, and the record of each finished one."""
         return self.path / "recording.json"
 
     def segment(self, number: int) -> Path:

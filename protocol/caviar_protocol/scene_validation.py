@@ -208,7 +208,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 
 def wrong_description(scene: Scene, world: str, rules: SceneRules) -> str:
-    """What is wrong with names, meshes and devices of a scene.
+    """Error in the names, meshes and devices of a scene.
 
     Args:
         scene: Of one world.

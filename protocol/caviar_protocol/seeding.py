@@ -1,4 +1,4 @@
-"""Which seed a service gets: random generators and integer seeds.
+"""Seeds of services: random generators and integer seeds.
 
 They depend on neither process nor order (contract, clause 19).
 

@@ -72,7 +72,7 @@ def rows(cls: type[msgspec.Struct]) -> list[tuple[str, str, str, str, str, str]]
 
 
 def _later_values(field: str) -> str:
-    """Which values of a closed field a later minor version brought."""
+    """Values of a closed field that a later minor version brought."""
     later = VALUES_SINCE.get(field, {})
     found = [
         ", ".join(f"`{value}`" for value, of in later.items() if of == since) + f" since {since}"

@@ -193,13 +193,13 @@ def check_digest(entry: GrantInput, header: bytes | memoryview, body: bytes | me
 
 
 def wrong_values(payload: Payload) -> str:
-    """What is wrong with the numbers of a product that is no scene; empty: nothing."""
+    """Error in the numbers of a product that is no scene; empty: none."""
     judge = _JUDGES.get(type(payload))
     return "" if judge is None else judge(payload)
 
 
 def wrong_channel(channel: Channel) -> str:
-    """What is wrong with a channel; empty: nothing."""
+    """Error in a channel; empty: none."""
     found = _not_finite(channel)
     if not found and channel.tau.size and not _least(channel.tau) >= 0:
         index = int(np.argmin(channel.tau))
@@ -216,7 +216,7 @@ def wrong_channel(channel: Channel) -> str:
 
 
 def _wrong_gains(payload: Payload, field: str) -> str:
-    """What is wrong with amplitude gains: numbers that are none, or that no antennas have."""
+    """Error in amplitude gains: numbers that are none, or that no antennas have."""
     values = getattr(payload, field)
     # A sum of squares bounds every term of it; of large responses one look is enough. BLAS warns of nothing.
     if np.vdot(values, values).real <= _MAX_AMPLITUDE**2:
@@ -237,7 +237,7 @@ def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
 
 
 def wrong_link(link: Link) -> str:
-    """What is wrong with a link; empty: nothing."""
+    """Error in a link; empty: none."""
     found = _not_finite(link) or _negative(link.abs_y, "abs_y", "1") or _negative(link.snr, "snr", "1")
     found = found or _negative(link.sinr, "sinr", "1")
     if not found and link.arrived is not None:
@@ -261,7 +261,7 @@ _PACKETS = (
 
 
 def wrong_lidar(lidar: Lidar) -> str:
-    """What is wrong with scans; empty: nothing."""
+    """Error in scans; empty: none."""
     for scan in lidar.scans:
         found = _wrong_pose(scan) or _not_finite(scan) or _negative(scan.range, "range", "m")
         if found:
@@ -270,7 +270,7 @@ def wrong_lidar(lidar: Lidar) -> str:
 
 
 def wrong_images(payload: Camera | Depth | Segmentation) -> str:
-    """What is wrong with images; empty: nothing."""
+    """Error in images; empty: none."""
     for image in payload.images:
         found = _wrong_pose(image) or _not_finite(image)
         if found := found or _negative(getattr(image, "depth", None), "depth", "m"):
@@ -279,7 +279,7 @@ def wrong_images(payload: Camera | Depth | Segmentation) -> str:
 
 
 def wrong_action(action: Action) -> str:
-    """What is wrong with an action; empty: nothing."""
+    """Error in an action; empty: none."""
     for index, command in enumerate(action.commands):
         if not _has_numbers(type(command)):
             continue

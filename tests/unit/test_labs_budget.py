@@ -168,8 +168,8 @@ def test_the_measured_rate_leaves_out_the_warm_up(smoke: RecordedRun) -> None:
 def test_figures_are_written_as_json(smoke: RecordedRun, tmp_path: Path) -> None:
     timed(smoke, world=1, channel=12, link=3, agent=2, recorder=4)
     with (tmp_path / "screen").open("w") as file:
-        budget_run(smoke.recording.path, Console(width=80, file=file), tmp_path / "deep" / "budget.json")
-    found = json.loads((tmp_path / "deep" / "budget.json").read_text())
+        budget_run(smoke.recording.path, Console(width=80, file=file), tmp_path / "budget.json")
+    found = json.loads((tmp_path / "budget.json").read_text())
     assert found["bound"]["service"] == "channel"
     screen = (tmp_path / "screen").read_text()
     assert "channel bounds the frame rate under wait" in screen

@@ -17,10 +17,6 @@ import pytest
         ("seeding", "generator"),
         ("errors", "CaviarError"),
         ("spec", "main"),
-        ("paths", "changes"),
-        ("dispersion", "delay_spread"),
-        ("dispersion", "coherence"),
-        ("subarrays", "subarrays"),
     ],
 )
 def test_a_documented_path_stays_importable(module: str, name: str) -> None:

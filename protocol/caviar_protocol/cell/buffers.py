@@ -108,7 +108,7 @@ class PacketBuffers:
 
     @property
     def waiting(self) -> Int64Array:
-        """What waits in each buffer [bit], Shape ``[N]``."""
+        """Bits that wait in each buffer, Shape ``[N]``."""
         bits = self._bits
         waiting: Int64Array = bits[2] - bits[0] - bits[1]
         return waiting
@@ -121,7 +121,7 @@ class PacketBuffers:
 
     @property
     def totals(self) -> Totals:
-        """What became of the packets of each buffer since it was empty; a copy."""
+        """Totals of the packets of each buffer since it was empty; a copy."""
         self._settle()
         sent, dropped, arrived, _ = self._bits.copy()
         _, delivered, departed = self._packets
@@ -199,7 +199,7 @@ class PacketBuffers:
         return made
 
     def state(self) -> dict[str, Int64Array]:
-        """What the buffers hold, as arrays of whole numbers; equal states are equal arrays."""
+        """Content of the buffers as arrays of whole numbers; equal states are equal arrays."""
         # From the row that sums begin from: which rows before it are still there depends on when room was
         # made, and what is settled on when it was asked for.
         self._settle()

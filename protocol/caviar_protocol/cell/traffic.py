@@ -117,7 +117,7 @@ class Offered(msgspec.Struct, frozen=True):
 
     @staticmethod
     def of(traffic: Traffic, place: Place | None = None) -> Offered:
-        """What traffic offers.
+        """Packets that traffic offers over time.
 
         Args:
             traffic: Not of model ``full``, which offers what can be sent.

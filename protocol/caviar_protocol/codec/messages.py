@@ -39,7 +39,7 @@ _ABSENT = Status.ABSENT
 
 
 class _Opening(msgspec.Struct):
-    """What HELLO and WELCOME have in every major version."""
+    """Fields that HELLO and WELCOME have in every major version."""
 
     type: str
     version: Version

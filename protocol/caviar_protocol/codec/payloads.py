@@ -344,7 +344,7 @@ def _converter(hint: Any) -> Convert:
 
 
 def _without_alias(hint: Any) -> Any:
-    """What a hint stands for where it is a `TypeAliasType`, as NDArray is from NumPy 2.5 on."""
+    """Type that a hint stands for where it is a `TypeAliasType`, as NDArray is from NumPy 2.5 on."""
     alias = get_origin(hint) or hint
     if not hasattr(alias, "__value__"):
         return hint

@@ -1,4 +1,4 @@
-"""What a policy observes: parts by name, and the users that they are about.
+"""Observations of a policy: parts by name, and the users that they are about.
 
 Environments, training on recordings and agents that serve a trained policy read observations here, so that a
 policy sees the same numbers wherever it decides.
@@ -65,7 +65,7 @@ def is_feedback(name: str) -> bool:
 
 
 def inputs_of(names: Iterable[str]) -> tuple[Input, ...]:
-    """What parts need beside the scene and the link of the frame before, one input for each topic.
+    """Inputs of parts beside the scene and the link of the frame before, one for each topic.
 
     Args:
         names: Of the parts; those that do not exist need nothing.
@@ -163,7 +163,7 @@ class Observer:
 
     @property
     def inputs(self) -> tuple[Input, ...]:
-        """What the parts need beside the scene and the link of the frame before, one input for each topic."""
+        """Inputs of the parts beside the scene and the link of the frame before, one for each topic."""
         return inputs_of(self._parts)
 
     def read(self, moment: Moment) -> dict[str, NDArray[Any]]:

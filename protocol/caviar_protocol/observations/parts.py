@@ -74,7 +74,7 @@ class LinkFigures(Protocol):
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """What is known at a frame, from which observations are read."""
+    """Products and users of a frame, from which observations are read."""
 
     frame: ObservedFrame
     scene: Scene
@@ -236,7 +236,7 @@ class OfLink(Part):
         """The number of one user, Shape ``[...]`` as the link has beside its users."""
 
     def _together(self, numbers: Sequence[Float64Array]) -> Float64Array:
-        """What the numbers of a pair's carriers make: their mean."""
+        """Number of all carriers of a pair: the mean of theirs."""
         # One after the other, so that a mean does not depend on how many are worked out at once.
         return reduce(add, numbers) / len(numbers)
 

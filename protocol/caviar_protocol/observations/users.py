@@ -29,7 +29,7 @@ class KnownScenario(Protocol):
 
 @dataclass(frozen=True)
 class KnownDevices:
-    """What a run says to its agents about the scenario."""
+    """Devices of a scenario as a run tells them to its agents."""
 
     devices: Sequence[DeviceSpec]
     services: Mapping[str, ServiceSpec] = field(default_factory=dict)
@@ -37,7 +37,7 @@ class KnownDevices:
 
 @dataclass(frozen=True)
 class Place:
-    """What one place of the observation and of the action stands for."""
+    """Place of the observation and of the action, with the user that it stands for."""
 
     tx: AntennaArray
     rx: AntennaArray

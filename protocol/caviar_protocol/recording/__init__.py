@@ -344,7 +344,7 @@ class RecordedFrame:
 
     @cached_property
     def products(self) -> tuple[RecordedProduct, ...]:
-        """What is not absent, in the order of `inputs`.
+        """Products that are not absent, in the order of `inputs`.
 
         Raises:
             RecordingError: Bytes are damaged or missing; the text names the place.

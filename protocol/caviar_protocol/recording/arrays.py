@@ -261,7 +261,7 @@ class TopicArrays(Generic[P, K]):
 
     @property
     def cause(self) -> tuple[str, ...]:
-        """Why the product of each frame is held or absent: service and frame of origin. Length F."""
+        """Cause why the product of each frame is held or absent: service and frame of origin. Length F."""
         return tuple("; ".join(item.cause for item in items if item.cause) for items in self._provenance)
 
     # --- choosing -----------------------------------------------------------------------------
@@ -336,7 +336,7 @@ class TopicArrays(Generic[P, K]):
 
     @cached_property
     def keys(self) -> tuple[K, ...]:
-        """What the second axis counts: everything that occurs in one of these frames, sorted."""
+        """Keys of the second axis: everything that occurs in one of these frames, sorted."""
         if self._reference is not None:
             return tuple(key for key in self._reference.keys if self._is_wanted(key))
         found: dict[K, None] = {}

@@ -127,7 +127,7 @@ class RecordedSegments:
         return [(entry.episode, entry.frame) for segment in self.segments for entry in segment.entries]
 
     def record(self, segment: Segment) -> SegmentRecord | None:
-        """What the manifest says about a segment, where it was finished."""
+        """Record of a segment in the manifest, where it was finished."""
         records = self.manifest.segments if self.manifest else ()
         found = next((record for record in records if record.name == segment.path.name), None)
         return found if found is not None and found.finished else None
@@ -194,7 +194,7 @@ class RecordedSegments:
         return not self.segments and not self.trusted
 
     def _other_run(self, segment: Segment) -> str:
-        """What is said of a segment of another run than those before it; empty where it is of the same.
+        """Message about a segment of another run than those before it; empty where it is of the same.
 
         The recording is of the run of its first segment. A manifest of another run is left aside.
         """
@@ -227,7 +227,7 @@ class RecordedSegments:
 
 
 def recorded_until(path: Path) -> tuple[tuple[int, int] | None, tuple[str, ...]]:
-    """How far a recording goes without a gap.
+    """Place up to which a recording has no gap.
 
     Returns:
         last: (episode, frame) of the last frame before anything is missing; None: there is no frame.

@@ -37,7 +37,7 @@ class NamedArrays(TopicArrays[P, str], Generic[P]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the second axis counts."""
+        """Names of the second axis."""
         return self.keys
 
     def index(self, names: Iterable[str]) -> Int64Array:
@@ -324,7 +324,7 @@ class LidarArrays(SensorArrays[Lidar]):
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
-        """What ``object`` points into: all names that occur in these frames, sorted."""
+        """Names that ``object`` points into: all that occur in these frames, sorted."""
         return self._all_names("object_names")
 
 
@@ -358,10 +358,10 @@ class SegmentationArrays(SensorArrays[Segmentation]):
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
-        """What ``object`` points into: all names that occur in these frames, sorted."""
+        """Names that ``object`` points into: all that occur in these frames, sorted."""
         return self._all_names("object_names")
 
     @cached_property
     def material_names(self) -> tuple[str, ...]:
-        """What ``material`` points into: all names that occur in these frames, sorted."""
+        """Names that ``material`` points into: all that occur in these frames, sorted."""
         return self._all_names("material_names")

@@ -136,7 +136,7 @@ class Segment:
         return self.chunks[index].log_time - self.entries[index].t_ns
 
     def record(self) -> SegmentRecord:
-        """What the manifest says about a finished segment; reads all of it."""
+        """Record of a finished segment for the manifest; reads all of it."""
         instants = [(entry.episode, entry.frame) for entry in self.entries]
         return SegmentRecord(
             name=self.path.name,

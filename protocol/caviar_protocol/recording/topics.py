@@ -46,7 +46,7 @@ class UserArrays(TopicArrays[P, User], Generic[P]):
 
     @property
     def users(self) -> tuple[User, ...]:
-        """What axis U counts."""
+        """Users of axis U."""
         return self.keys
 
     @property
@@ -267,7 +267,7 @@ class ChannelArrays(UserArrays[Channel]):
 
     @property
     def error_reference(self) -> tuple[str, ...]:
-        """What stated errors are relative to in each frame; empty where none is stated. Length F."""
+        """Reference of the stated errors in each frame; empty where none is stated. Length F."""
         return tuple("" if channel is None else channel.error_reference for channel in self)
 
     def keys_of(self, payload: Channel) -> Sequence[User]:
@@ -364,7 +364,7 @@ class ActionArrays(UserArrays[Action]):
 
     @property
     def motion(self) -> MotionArrays:
-        """Where the agent sent objects, in the same frames."""
+        """Commands of motion to objects, in the same frames."""
         return MotionArrays(self._recording, self.topic, self.sources, self._indices)
 
     def keys_of(self, payload: Action) -> Sequence[User]:

@@ -273,7 +273,7 @@ def _syntax_error(error: tomllib.TOMLDecodeError, text: str, file: str) -> Scena
 
 
 def _toml_remedy(line: str) -> str:
-    """What is mostly wrong with a line that is no TOML; empty where that is not clear."""
+    """Remedy for a line that is no TOML; empty where none is clear."""
     _, equals, value = line.partition("=")
     value = value.partition("#")[0].strip()
     if not equals:
@@ -311,7 +311,7 @@ def _beside(path: Path) -> str:
 
 
 def _in_folder(folder: Path) -> str:
-    """What to write in place of a folder: the scenarios in it, or what can be done with a run."""
+    """Remedy for a folder: the scenarios in it, or what can be done with a run."""
     run = RunDirectory(folder)
     if run.record.exists() or run.manifest.exists():
         return f"; it is the directory of a run, whose world runs again with: caviar replay {folder}"

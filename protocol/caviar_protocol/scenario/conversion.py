@@ -62,7 +62,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where a value stands: a dotted key in a file that may be unknown.
+    """Place of a value: a dotted key in a file that may be unknown.
 
     Example:
         >>> source = Source(file="my.toml", lines={"devices[0].on": 12})
@@ -266,7 +266,7 @@ def _check_union(value: object, choices: tuple[inspect.Type, ...], place: Place)
 
 
 def _check_word_or(value: object, words: inspect.LiteralType, other: inspect.Type, place: Place) -> None:
-    """One of some words, or something that is no text."""
+    """Check a value that is one of some words, or no text."""
     if isinstance(value, str) and value in words.values:
         return
     while isinstance(other, inspect.Metadata):
@@ -342,7 +342,7 @@ def _in(unit: str) -> str:
 
 
 def _example(field: inspect.Field, place: Place) -> str:
-    """What to write for a key that is missing."""
+    """Example of what to write for a key that is missing."""
     kind = field.type
     while isinstance(kind, inspect.Metadata):
         kind = kind.type

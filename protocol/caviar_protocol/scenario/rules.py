@@ -49,7 +49,7 @@ def scenario_error(scenario: Scenario, key: str, message: str) -> ScenarioError:
 
 
 def settings_place(scenario: Scenario, service: str) -> Place:
-    """Where the settings of a service stand, for `caviar_protocol.scenario.conversion.convert_settings`.
+    """Place of the settings of a service, for `caviar_protocol.scenario.conversion.convert_settings`.
 
     Args:
         scenario: The scenario.
@@ -286,7 +286,7 @@ def plain(value: Any, *, defaults: bool = True) -> Any:
 
 
 def _prefix(name: str, world: ServiceSpec) -> str:
-    """What the names of a world's objects begin with: its setting, else its own name and a dot."""
+    """Prefix of the names of a world's objects: its setting, else its own name and a dot."""
     return str(world.settings.get("prefix") or f"{name}.")
 
 
@@ -330,7 +330,7 @@ def _check_timeouts(scenario: Scenario, place: Place) -> None:
 
 
 def _check_limits(scenario: Scenario, place: Place) -> None:
-    """What services need to take part at all is not too much."""
+    """Check that services may take what they need to take part at all."""
     limits, heartbeat_s = scenario.limits, scenario.timeouts.heartbeat_s
     # Each service has a connection for messages and one for heartbeats.
     needed = 2 * len(scenario.services)
@@ -473,7 +473,7 @@ def _check_ascending(
 
 
 def undefined_part(part: str, carriers: Sequence[Carrier]) -> str:
-    """What to write where no carrier says what a wideband part of ``channel`` consists of.
+    """Remedy where no carrier says what a wideband part of ``channel`` consists of.
 
     Args:
         part: Name of a part: ``hf``, ``taps``.

@@ -1,1 +1,1 @@
-"""Where things are: coordinates, scenes, beams, meshes."""
+"""Places and directions: coordinates, scenes, arrays, beams, meshes."""

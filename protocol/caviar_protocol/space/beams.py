@@ -165,7 +165,7 @@ def beam_gains(h: ArrayLike, tx: AntennaArray, rx: AntennaArray) -> Float64Array
 
 
 class _Grid(NamedTuple):
-    """How H is transformed."""
+    """Grid in which H is transformed."""
 
     shape: tuple[int, ...]
     """By panels, columns and rows of RX, then of TX, without those that are 1."""

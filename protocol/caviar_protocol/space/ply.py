@@ -248,7 +248,7 @@ class _Binary:
 
 
 def _first_list(element: _Element) -> int:
-    """Which property of an element is its first list: the corners of faces."""
+    """Place of the first list among the properties of an element: the corners of faces."""
     return next(i for i, (_, length, _) in enumerate(element.properties) if length)
 
 

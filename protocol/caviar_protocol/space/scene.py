@@ -259,7 +259,7 @@ def share_carrier(tx: Sequence[str], rx: Sequence[str]) -> bool:
 
 
 def directions(scene: Scene, pairs: Sequence[Pair]) -> tuple[list[Vector], list[Vector]]:
-    """Where the two devices of each pair see each other.
+    """Directions in which the two devices of each pair see each other.
 
     Args:
         scene: The scene of the pairs.
