@@ -97,6 +97,27 @@ def load_plugin(point: EntryPoint, kind: type[T]) -> T:
     return found
 
 
+def plugin_class(group: str, name: str, base: type[T]) -> type[T] | None:
+    """The class that a plug-in registers; None where none has the name.
+
+    Args:
+        group: Name of the group.
+        name: Of the entry point.
+        base: Of which it has to be a subclass.
+
+    Raises:
+        DeclarationError: It cannot be imported, or is no subclass; names the distribution and the object.
+    """
+    point = plugins(group).get(name)
+    if point is None:
+        return None
+    found = load_plugin(point, type)
+    if not issubclass(found, base):
+        what = f"{name} of {group} is {origin(point)}"
+        raise DeclarationError(f"{what}, which is no subclass of {base.__name__}")
+    return found
+
+
 def origin(point: EntryPoint) -> str:
     """Object of an entry point, and the distribution that declares it, for errors."""
     return f"{point.value} of {point.dist.name if point.dist is not None else 'an unnamed distribution'}"

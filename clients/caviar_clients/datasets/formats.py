@@ -9,8 +9,8 @@ from pathlib import Path
 
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.files import writing
-from caviar_protocol.errors import DeclarationError, RunError, suggestion
-from caviar_protocol.plugins import load_plugin, plugins
+from caviar_protocol.errors import RunError, suggestion
+from caviar_protocol.plugins import plugin_class, plugins
 
 FORMAT_PLUGINS = "caviar.formats"
 """Group of entry points, each a subclass of `Format`, named as the format is."""
@@ -46,16 +46,11 @@ def format_of(name: str) -> Format:
         RunError: There is none of this name; names those there are.
         DeclarationError: A plug-in cannot be loaded, or is no `Format`.
     """
-    added = plugins(FORMAT_PLUGINS)
-    cls: type = FORMATS.get(name, Format)
-    if name in added:
-        cls = load_plugin(added[name], type)
-    elif cls is Format:
-        known = [*FORMATS, *added]
+    cls = FORMATS.get(name) or plugin_class(FORMAT_PLUGINS, name, Format)  # type: ignore[type-abstract]  # compared, never made
+    if cls is None:
+        known = [*FORMATS, *plugins(FORMAT_PLUGINS)]
         hint = suggestion(name, known) if known else "no installed package adds one"
         raise RunError(f"--to {name!r} is no format of datasets; {hint}")
-    if not issubclass(cls, Format):
-        raise DeclarationError(f"{name} of {FORMAT_PLUGINS} is {added[name].value}, which is no Format")
     return cls()
 
 

@@ -27,8 +27,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
-from caviar_protocol.errors import DeclarationError, ScenarioError, suggestion
-from caviar_protocol.plugins import load_plugin, plugins
+from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.plugins import plugin_class, plugins
 from caviar_protocol.space.antenna_arrays import Subarray, facing, steering_vector, subarrays
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.dft import beam_gain, beam_towards, dft_beam, dft_codebook, pointing_directions
@@ -296,21 +296,16 @@ def codebook_of(array: AntennaArray) -> Codebook:
         8
     """
     name, _, argument = array.codebook.partition(":")
-    if name in CODEBOOKS:
-        return CODEBOOKS[name](array, argument)
-    added = plugins(CODEBOOK_PLUGINS)
-    if name not in added:
-        raise ScenarioError(f"{array.codebook!r} is no codebook; {suggestion(name, [*CODEBOOKS, *added])}")
-    cls = load_plugin(added[name], type)
-    if not issubclass(cls, Codebook):
-        text = f"{name} of {CODEBOOK_PLUGINS} is {added[name].value}, which is no subclass of Codebook"
-        raise DeclarationError(text)
+    cls = CODEBOOKS.get(name) or plugin_class(CODEBOOK_PLUGINS, name, Codebook)  # type: ignore[type-abstract]  # compared, never made
+    if cls is None:
+        known = suggestion(name, [*CODEBOOKS, *plugins(CODEBOOK_PLUGINS)])
+        raise ScenarioError(f"{array.codebook!r} is no codebook; {known}")
     return cls(array, argument)
 
 
 def beam_count(array: AntennaArray) -> int:
     """Number of beams of an array's codebook."""
-    return array.size if array.codebook == DFT else codebook_of(array).beams
+    return codebook_of(array).beams
 
 
 def codebook_digest(array: AntennaArray) -> str:

@@ -32,7 +32,8 @@ class Panel(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     roll_deg: Annotated[float, quantity("°", "about +x")] = 0.0
 
 
-class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+# The hash is kept: codebooks, subarrays and transforms are looked up by array in every frame.
+class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, cache_hash=True):
     """A uniform linear (one row or one column) or planar antenna array, of one or several panels.
 
     The antennas of a panel stand in its y–z plane, boresight +x. Their order is column-major: down

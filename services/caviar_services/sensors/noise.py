@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float32Array, quantity
-from caviar_protocol.errors import DeclarationError, PayloadError, suggestion
-from caviar_protocol.plugins import load_plugin, plugins
+from caviar_protocol.errors import PayloadError, suggestion
+from caviar_protocol.plugins import plugin_class, plugins
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_services.sensors.shading import encoded, linear
 
@@ -124,16 +124,9 @@ def noise_models(sensor: str) -> dict[str, type[SensorNoise]]:
         >>> sorted(noise_models("camera"))
         ['gaussian', 'shot']
     """
-    found: dict[str, type[SensorNoise]] = {}
-    for name, point in plugins(NOISE_PLUGINS).items():
-        if name.startswith(f"{sensor}:"):
-            found[name] = load_plugin(point, type)
-            if not issubclass(found[name], SensorNoise):
-                raise DeclarationError(
-                    f"{name} of {NOISE_PLUGINS} is {point.value}, which is no subclass of SensorNoise"
-                )
-    found |= {name: cls for name, cls in NOISE.items() if name.startswith(f"{sensor}:")}
-    return {name.partition(":")[2]: cls for name, cls in found.items()}
+    names = [name for name in (*plugins(NOISE_PLUGINS), *NOISE) if name.startswith(f"{sensor}:")]
+    found = {name: NOISE.get(name) or plugin_class(NOISE_PLUGINS, name, SensorNoise) for name in names}
+    return {name.partition(":")[2]: cls for name, cls in found.items() if cls is not None}
 
 
 def noise_model(sensor: str, table: Mapping[str, Any] | None, place: Place) -> SensorNoise | None:

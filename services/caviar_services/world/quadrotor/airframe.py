@@ -22,7 +22,7 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import DeclarationError, suggestion
-from caviar_protocol.plugins import load_plugin, origin, plugins
+from caviar_protocol.plugins import plugin_class, plugins
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 
 PLANTS = "caviar.plants"
@@ -248,14 +248,9 @@ def plant_named(engine: str) -> type[Plant]:
         >>> plant_named("caviar").__name__
         'Plant'
     """
-    if engine == "caviar":
-        return Plant
-    point = plugins(PLANTS).get(engine)
-    if point is None:
+    found = Plant if engine == "caviar" else plugin_class(PLANTS, engine, Plant)
+    if found is None:
         raise DeclarationError(f"is {engine!r}; {suggestion(engine, ['caviar', *plugins(PLANTS)])}")
-    found = load_plugin(point, type)
-    if not issubclass(found, Plant):
-        raise DeclarationError(f"{engine!r} is {origin(point)}, which is not a Plant")
     return found
 
 
