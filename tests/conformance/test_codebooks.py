@@ -18,7 +18,7 @@ UNIFORM = AntennaArray(rows=3, columns=4, horizontal_spacing=0.7)
 SEVERAL = replace(UNIFORM, polarization="cross", panels=(Panel(yaw_deg=90.0), Panel(yaw_deg=-70.0)))
 ARGUMENTS = {"dft": ["dft"], "quantized": ["quantized:1", "quantized:3"], "file": ["file:"]}
 
-# As a distribution of somebody else has it: a module, and the entry point that names its class.
+# A plug-in as another distribution has it: a module, and the entry point that names its class.
 PLUGIN = '''
 import numpy as np
 from caviar_protocol.space.antenna_arrays import steering_vector
