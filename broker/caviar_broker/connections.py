@@ -135,24 +135,21 @@ class Connections:
         self.clock.receive(ev.Joined(hello, local), time.monotonic_ns())
         member = self.clock.member(hello.name)
         if member is not None and member.attempt > attempt:
-            self._admit(route, hello, local)
+            # A new incarnation is in the run: nothing counts any more that comes from the one before.
+            name = hello.name
+            self.assets.forget(name)
+            earlier = self.watchdog.forget(name)
+            if earlier is not None:
+                self.loop.unwatch(earlier)
+            for old in [r for r, c in self.known.items() if c.service == name]:
+                del self.known[old]
+            self.routes[name] = route
+            self.known[route] = Connection(name, heartbeat=False)
+            self._guard.admit_service(route, name)
+            fd = self.watchdog.welcome(name, hello.pid if local else None)
+            if fd is not None:
+                self.loop.watch(fd, lambda: self._died(name, fd))
         self.perform()  # WELCOME goes to an admitted service; one turned away changes nothing
-
-    def _admit(self, route: bytes, hello: m.Hello, local: bool) -> None:
-        """A new incarnation is in the run: nothing counts any more that comes from the one before."""
-        name = hello.name
-        self.assets.forget(name)
-        earlier = self.watchdog.forget(name)
-        if earlier is not None:
-            self.loop.unwatch(earlier)
-        for old in [r for r, c in self.known.items() if c.service == name]:
-            del self.known[old]
-        self.routes[name] = route
-        self.known[route] = Connection(name, heartbeat=False)
-        self._guard.admit_service(route, name)
-        fd = self.watchdog.welcome(name, hello.pid if local else None)
-        if fd is not None:
-            self.loop.watch(fd, lambda: self._died(name, fd))
 
     def _attach(self, route: bytes, attach: m.Attach) -> None:
         if why := self._guard.refusal(route, attach.name):

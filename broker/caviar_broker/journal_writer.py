@@ -94,7 +94,10 @@ class JournalWriter:
             else:
                 self._wait_for_sync()
             if snapshot is not None:
-                self._compact(snapshot)
+                self.doing = "compaction"
+                if self._durability != "none":
+                    self._sync()
+                self._file.compact(snapshot)
         except RunError as error:
             self.error = error
         if self.error is None:
@@ -115,12 +118,6 @@ class JournalWriter:
                 self._sync()
             except RunError as error:
                 self.error = error
-
-    def _compact(self, snapshot: Snapshot) -> None:
-        self.doing = "compaction"
-        if self._durability != "none":
-            self._sync()
-        self._file.compact(snapshot)
 
     def _wait_for_sync(self) -> None:
         """Under ``periodic``: not more than a period of the run may depend on what is not on the disk."""

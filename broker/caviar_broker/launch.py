@@ -221,7 +221,13 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, .
         load_scenario(arguments.scenario, arguments.set), arguments.frames, arguments.seed, arguments.pace
     )
     scenario = attached(scenario, arguments.attach)
-    directory = _made(arguments.directory)
+    try:
+        arguments.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write the run to {arguments.directory}: {error.strerror}; choose another --directory"
+        ) from error
+    directory = arguments.directory.resolve()
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
     versions = versions_of(scenario)
     return (
@@ -275,16 +281,6 @@ def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last
             "to run its scenario again leave out --resume"
         )
     return replace(left, losses=(*damage, *left.losses)) if left.is_cut else left
-
-
-def _made(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(
-            f"cannot write the run to {directory}: {error.strerror}; choose another --directory"
-        ) from error
-    return directory.resolve()
 
 
 def parser() -> argparse.ArgumentParser:

@@ -69,7 +69,18 @@ class AssetStore:
         Args:
             asset: Description of the file.
         """
-        return self._intact(asset.digest, asset.size)
+        path = self.path(asset.digest)
+        try:
+            if path.stat().st_size != asset.size:
+                return False
+            # Hashed once a process and not once a run, of which an environment has thousands.
+            if asset.digest not in self._verified:
+                if file_digest(path) != asset.digest:
+                    return False
+                self._verified.add(asset.digest)
+        except OSError:
+            return False
+        return True
 
     def path(self, digest: str) -> Path:
         """Path of the file with this digest, which may not be there.
@@ -151,20 +162,6 @@ class AssetStore:
             except OSError as error:
                 raise AssetError(f"cannot lay out {asset.name!r} in {folder}: {error.strerror}") from error
         return {asset.name: folder / asset.name for asset in manifest}
-
-    def _intact(self, digest: str, size: int) -> bool:
-        path = self.path(digest)
-        try:
-            if path.stat().st_size != size:
-                return False
-            # Hashed once a process and not once a run, of which an environment has thousands.
-            if digest not in self._verified:
-                if file_digest(path) != digest:
-                    return False
-                self._verified.add(digest)
-        except OSError:
-            return False
-        return True
 
     def _lay_out(self, asset: Asset, target: Path) -> None:
         source = self.path(asset.digest)

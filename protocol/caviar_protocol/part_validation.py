@@ -55,28 +55,25 @@ class PartCheck:
         """Error in the parts of a product; empty: none."""
         demand = self.demand.get(topic, frozenset())
         if isinstance(payload, Channel):
-            return self._wrong_channel(payload, demand)
+            entries: dict[str, Sequence[Entry]] = {"h": payload.h, "hf": payload.hf, "taps": payload.taps}
+            if not (demand or payload.h or payload.hf or payload.taps):
+                return ""
+            names = [carrier.name for carrier in payload.carriers]
+            known = [carrier.name for carrier in self._carriers]
+            if known and names != known:
+                return f"its carriers are {names}, by the scenario they are {known}"
+            expected = self._shapes(payload)
+            for part, found in entries.items():
+                if (found or part in demand) and (
+                    problem := _wrong_entries(part, found, expected[part], payload)
+                ):
+                    return problem
+            return ""
         readings = getattr(payload, "images", getattr(payload, "scans", ()))
         for part in sorted(demand & TOPICS[topic].parts.keys()):
             for reading in readings:
                 if getattr(reading, TOPICS[topic].parts[part]) is None:
                     return f"{_undelivered(part)} of {reading.sensor!r}"
-        return ""
-
-    def _wrong_channel(self, channel: Channel, demand: frozenset[str]) -> str:
-        entries: dict[str, Sequence[Entry]] = {"h": channel.h, "hf": channel.hf, "taps": channel.taps}
-        if not (demand or channel.h or channel.hf or channel.taps):
-            return ""
-        names = [carrier.name for carrier in channel.carriers]
-        known = [carrier.name for carrier in self._carriers]
-        if known and names != known:
-            return f"its carriers are {names}, by the scenario they are {known}"
-        expected = self._shapes(channel)
-        for part, found in entries.items():
-            if (found or part in demand) and (
-                problem := _wrong_entries(part, found, expected[part], channel)
-            ):
-                return problem
         return ""
 
     def _shapes(self, channel: Channel) -> dict[str, dict[Indices, tuple[int | None, ...]]]:

@@ -10,7 +10,7 @@ the parts that were asked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pkgutil import resolve_name
 from typing import Any, get_type_hints
@@ -36,7 +36,6 @@ from caviar_protocol.topics import (
     Camera,
     Carrier,
     Channel,
-    ChannelTaps,
     Depth,
     Lidar,
     Link,
@@ -212,7 +211,10 @@ def wrong_channel(channel: Channel) -> str:
         for index, entry in enumerate(getattr(channel, name)):
             if found := _wrong_gains(entry, "h"):
                 return f"{name}[{index}]: {found}"
-    return _wrong_first_tap(channel.taps)
+    for index, entry in enumerate(channel.taps):
+        if abs(entry.first) > _MAX_TAP:
+            return f"taps[{index}].first is {entry.first}: it is a sample, at most {_MAX_TAP} from delay 0"
+    return ""
 
 
 def _wrong_gains(payload: Payload, field: str) -> str:
@@ -227,13 +229,6 @@ def _wrong_gains(payload: Payload, field: str) -> str:
     if strongest <= _MAX_AMPLITUDE:
         return ""
     return f"{field} has an amplitude gain of {strongest:g}: at most {_MAX_AMPLITUDE:g} is possible"
-
-
-def _wrong_first_tap(taps: Sequence[ChannelTaps]) -> str:
-    for index, entry in enumerate(taps):
-        if abs(entry.first) > _MAX_TAP:
-            return f"taps[{index}].first is {entry.first}: it is a sample, at most {_MAX_TAP} from delay 0"
-    return ""
 
 
 def wrong_link(link: Link) -> str:

@@ -231,10 +231,7 @@ class DecisionTable:
         participant.next_frame = task.frame + 1
         if self._last.next_frame > self.finished_frames:
             self._finish_frames()
-        self._note_decision(participant)
-
-    def _note_decision(self, participant: Participant) -> None:
-        """Have the dispatcher look again at the services that a decision may concern."""
+        # Have the dispatcher look again at the services that a decision may concern.
         latest, frame = participant.latest, participant.next_frame
         # Most services wait for the last input of their next frame now, and need not be looked at for that.
         if latest and frame < self.frames and not latest[0][1].has_decided(latest[0][0], frame):

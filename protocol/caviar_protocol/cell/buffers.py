@@ -146,7 +146,11 @@ class PacketBuffers:
         if self.slot - self._least_age - self._first >= self._low:
             self._drop_aged()
         if self._bounded:
-            packets = self._admit(packets)
+            # Count packets that find the buffer full as arrived and dropped; return the others.
+            admitted: Int64Array = np.minimum(packets, self.max_packets - self.waiting_packets)
+            refused = (packets - admitted) * self.packet_bits
+            self._bits[1:] += refused
+            packets = admitted
         high = self._high
         if high == self._until.shape[1]:
             self._make_room()
@@ -268,13 +272,6 @@ class PacketBuffers:
         self._bits[1, found] += came * self.packet_bits[found] - (sent + dropped - refused)
         self._packets[0, found] = came
         self._settled[:2, found] = came, slots
-
-    def _admit(self, packets: Int64Array) -> Int64Array:
-        """Count packets that find the buffer full as arrived and dropped; return the others."""
-        admitted: Int64Array = np.minimum(packets, self.max_packets - self.waiting_packets)
-        refused = (packets - admitted) * self.packet_bits
-        self._bits[1:] += refused
-        return admitted
 
     def _trimmed_low(self) -> int:
         """The last row of which all packets have left, in all buffers."""

@@ -121,7 +121,16 @@ def choices(kind: Any, encoded: bytes | bytearray | memoryview, complaint: str) 
         return ()
     # msgspec names the place as JSON Path does: `$.inputs[2].topic`.
     steps = [name or int(number) for name, number in _STEP.findall(found["path"])]
-    return _words(_at(_type_info(kind), value, steps))
+    expected = _at(_type_info(kind), value, steps)
+    match expected:
+        case tuple():
+            return expected
+        case inspect.LiteralType(values=values):
+            return tuple(map(str, values))
+        case inspect.EnumType(cls=cls):
+            return tuple(str(member.value) for member in cls)
+        case _:
+            return ()
 
 
 _type_info = cache(inspect.type_info)
@@ -137,7 +146,8 @@ def _at(
             expected = _element(expected, step)
             value = value[step] if isinstance(value, list) and step < len(value) else None
             continue
-        structs = _structs(expected)
+        members = expected.types if isinstance(expected, inspect.UnionType) else (expected,)
+        structs = [member for member in map(_bare, members) if isinstance(member, inspect.StructType)]
         tags = {struct.tag_field: struct for struct in structs}
         if step in tags and number == len(steps) - 1:
             return tuple(str(struct.tag) for struct in structs)
@@ -157,11 +167,6 @@ def _bare(expected: inspect.Type | None) -> inspect.Type | None:
     return expected
 
 
-def _structs(expected: inspect.Type | None) -> list[inspect.StructType]:
-    members = expected.types if isinstance(expected, inspect.UnionType) else (expected,)
-    return [member for member in map(_bare, members) if isinstance(member, inspect.StructType)]
-
-
 def _element(expected: inspect.Type | None, index: int) -> inspect.Type | None:
     match expected:
         case inspect.VarTupleType(item_type=element) | inspect.ListType(item_type=element):
@@ -170,18 +175,6 @@ def _element(expected: inspect.Type | None, index: int) -> inspect.Type | None:
             return elements[index]
         case _:
             return None
-
-
-def _words(expected: inspect.Type | tuple[str, ...] | None) -> tuple[str, ...]:
-    match expected:
-        case tuple():
-            return expected
-        case inspect.LiteralType(values=values):
-            return tuple(map(str, values))
-        case inspect.EnumType(cls=cls):
-            return tuple(str(member.value) for member in cls)
-        case _:
-            return ()
 
 
 _T = TypeVar("_T")

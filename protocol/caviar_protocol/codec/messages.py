@@ -153,7 +153,15 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if len(parts) != expected:
         raise DecodeError(f"{message_type(message)} announces {expected} parts, {len(parts)} came")
     if isinstance(message, AssetData):
-        _check_chunk(message, len(parts[1]))
+        length = len(parts[1])
+        if length > MAX_ASSET_CHUNK:
+            raise LimitError(f"ASSET_DATA carries {length} B, at most {MAX_ASSET_CHUNK} are accepted")
+        # A peer that sends more than it announced would fill the memory of the other.
+        if message.offset + length > message.size:
+            raise DecodeError(
+                f"ASSET_DATA carries bytes {message.offset} to {message.offset + length} of an asset of "
+                f"{message.size} B"
+            )
         return
     # What fits the smallest limit fits all of them: one look in C at the parts of most messages.
     if max(map(len, parts)) <= MAX_HEADER:
@@ -192,17 +200,6 @@ def _check_opening(header: Buffer) -> None:
     # No other message has a version, so no other can blame it.
     if opening.type in ("HELLO", "WELCOME"):
         check_version(opening.version)
-
-
-def _check_chunk(message: AssetData, length: int) -> None:
-    if length > MAX_ASSET_CHUNK:
-        raise LimitError(f"ASSET_DATA carries {length} B, at most {MAX_ASSET_CHUNK} are accepted")
-    # A peer that sends more than it announced would fill the memory of the other.
-    if message.offset + length > message.size:
-        raise DecodeError(
-            f"ASSET_DATA carries bytes {message.offset} to {message.offset + length} of an asset of "
-            f"{message.size} B"
-        )
 
 
 def _check_settings(message: Welcome, error: type[PayloadError] | type[DecodeError]) -> None:

@@ -159,7 +159,14 @@ def parse_scenario(
     scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
     # After the rules: what follows from keys is never what an error is about.
-    scenario = _with_numerologies(scenario)
+    # The scenario with all that follows from the keys of its carriers written out.
+    run, place = scenario.run, Place("carriers", scenario.source)
+    # Given instants have no period, so that slots need a duration of their own.
+    period = None if run.instants_s else run.sampling_period_ns
+    carriers = tuple(
+        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
+    )
+    scenario = msgspec.structs.replace(scenario, carriers=carriers)
     return _with_files(scenario, folder or Path())
 
 
@@ -288,7 +295,14 @@ def _toml_remedy(line: str) -> str:
 def _beside(path: Path) -> str:
     """The scenarios that stand where one was looked for, or those that ship."""
     if path.is_dir():
-        return _in_folder(path)
+        # Remedy for a folder: the scenarios in it, or what can be done with a run.
+        run = RunDirectory(path)
+        if run.record.exists() or run.manifest.exists():
+            return f"; it is the directory of a run, whose world runs again with: caviar replay {path}"
+        names = sorted(file.name for file in path.glob("*.toml"))
+        if not names:
+            return "; a scenario is a TOML file: caviar new NAME writes one"
+        return f"; {path.resolve()} has {', '.join(names)}: name one of them, as {path / names[0]}"
     shipped = shipped_scenarios()
     file = path.with_name(path.name + ".toml")
     if file.is_file():
@@ -308,28 +322,6 @@ def _beside(path: Path) -> str:
     close = difflib.get_close_matches(path.name, names, n=1)
     meant = f"; did you mean {path.with_name(close[0])}?" if close else ""
     return f"{meant}; {path.parent.resolve()} has {', '.join(names)}"
-
-
-def _in_folder(folder: Path) -> str:
-    """Remedy for a folder: the scenarios in it, or what can be done with a run."""
-    run = RunDirectory(folder)
-    if run.record.exists() or run.manifest.exists():
-        return f"; it is the directory of a run, whose world runs again with: caviar replay {folder}"
-    names = sorted(file.name for file in folder.glob("*.toml"))
-    if not names:
-        return "; a scenario is a TOML file: caviar new NAME writes one"
-    return f"; {folder.resolve()} has {', '.join(names)}: name one of them, as {folder / names[0]}"
-
-
-def _with_numerologies(scenario: Scenario) -> Scenario:
-    """The scenario with all that follows from the keys of its carriers written out."""
-    run, place = scenario.run, Place("carriers", scenario.source)
-    # Given instants have no period, so that slots need a duration of their own.
-    period = None if run.instants_s else run.sampling_period_ns
-    carriers = tuple(
-        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
-    )
-    return msgspec.structs.replace(scenario, carriers=carriers)
 
 
 def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:

@@ -91,7 +91,14 @@ class Perceptron:
             below = below * (layers[layer + 1] > 0)
             gradients[:0] = [layers[layer].T @ below, below.sum(0)]
             below = below @ self._parameters[2 * layer].T
-        self._step(gradients, rate)
+        self.updates += 1
+        first, second = (1 - decay**self.updates for decay in _DECAY)
+        for parameter, mean, square, gradient in zip(
+            self._parameters, self._means, self._squares, gradients, strict=True
+        ):
+            mean += (1 - _DECAY[0]) * (gradient - mean)
+            square += (1 - _DECAY[1]) * (gradient**2 - square)
+            parameter -= rate * (mean / first) / (np.sqrt(square / second) + _EPSILON)
 
     def state(self) -> PerceptronState:
         """What it learnt, to be saved."""
@@ -123,13 +130,3 @@ class Perceptron:
         for weights, offsets in zip(self._parameters[:-2:2], self._parameters[1:-2:2], strict=True):
             layers.append(np.maximum(layers[-1] @ weights + offsets, 0.0))
         return layers
-
-    def _step(self, gradients: Sequence[Float64Array], rate: float) -> None:
-        self.updates += 1
-        first, second = (1 - decay**self.updates for decay in _DECAY)
-        for parameter, mean, square, gradient in zip(
-            self._parameters, self._means, self._squares, gradients, strict=True
-        ):
-            mean += (1 - _DECAY[0]) * (gradient - mean)
-            square += (1 - _DECAY[1]) * (gradient**2 - square)
-            parameter -= rate * (mean / first) / (np.sqrt(square / second) + _EPSILON)

@@ -176,7 +176,7 @@ class HierarchicalSweepAgent(PilotAgent[HierarchicalSettings]):
     def select(self, sounding: Sounding) -> Iterator[Measured]:
         """The pair that the levels lead to; no choice for a user without a path."""
         users, branching = sounding.users, self.settings.branching
-        levels = {u: _levels_of(user, branching) for u, user in enumerate(users)}
+        levels = {u: _levels(user.tx.array, user.rx.array, branching) for u, user in enumerate(users)}
         first = ((users[u], of[0].tx.array.size * of[0].rx.array.size) for u, of in levels.items())
         sounding.count_shared(first)
         for u, of_user in levels.items():
@@ -237,10 +237,6 @@ def _descend(
         tx_beam, rx_beam = int(tx_beams[best.tx_beam[0, 0]]), int(rx_beams[best.rx_beam[0, 0]])
         before = level
     return tx_beam, rx_beam
-
-
-def _levels_of(user: User, branching: int) -> tuple[Level, ...]:
-    return _levels(user.tx.array, user.rx.array, branching)
 
 
 # Arrays are few and frozen, and asked for in every frame.

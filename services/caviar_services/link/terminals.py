@@ -135,23 +135,20 @@ class Terminals:
         block, within = divmod(number, self._frames)
         key = (block, frame.seed, frame.seed_episode)
         if self._drawn is None or self._drawn[0] != key:
-            self._drawn = key, self._draw(frame, block)
+            count = self._frames * self._settings.slots
+            drawn = np.zeros((count, len(self.names)), np.int64)
+            for index, ((rx, carrier), traffic) in enumerate(zip(self.names, self._traffic, strict=True)):
+                if traffic.model == "full":
+                    continue
+                random = None
+                if traffic_model(traffic.model, Place("traffic")).random:
+                    stream = f"{frame.service}/traffic/{rx}/{carrier}"
+                    random = generator(frame.seed, frame.seed_episode, stream, block)
+                offered = self._offered[id(traffic)]
+                drawn[:, index] = arrivals(offered, block * count, count, self._slot_s, random)
+            self._drawn = key, drawn
         slots = self._settings.slots
         return self._drawn[1][within * slots : (within + 1) * slots]
-
-    def _draw(self, frame: Frame, block: int) -> Int64Array:
-        count = self._frames * self._settings.slots
-        drawn = np.zeros((count, len(self.names)), np.int64)
-        for index, ((rx, carrier), traffic) in enumerate(zip(self.names, self._traffic, strict=True)):
-            if traffic.model == "full":
-                continue
-            random = None
-            if traffic_model(traffic.model, Place("traffic")).random:
-                stream = f"{frame.service}/traffic/{rx}/{carrier}"
-                random = generator(frame.seed, frame.seed_episode, stream, block)
-            offered = self._offered[id(traffic)]
-            drawn[:, index] = arrivals(offered, block * count, count, self._slot_s, random)
-        return drawn
 
     def state(self) -> TerminalState:
         """What outlives the frame."""

@@ -213,16 +213,7 @@ class World(Service[W]):
             ScenarioError: A device is mounted on an object that can never come; names its key.
         """
         series_of(str, f"{type(self).__name__}.prefixes", self.prefixes())
-        self._check_parents()
-        self._meshes.max_faces = preparation.max_faces
-        scenery = self.settings.scenery or "none"
-        return Prepared(
-            prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
-            notes=(f"scenery: {scenery}",),
-        )
-
-    def _check_parents(self) -> None:
-        """Refuse a device on an object that can never come."""
+        # Refuse a device on an object that can never come.
         # It would be missing in each frame, which looks like bad coverage.
         objects, prefixes = self.known_objects(self.settings), self.prefixes()
         known = prefixes if objects is None else tuple(objects)
@@ -243,6 +234,12 @@ class World(Service[W]):
                     f"{self.run.name!r} can be: {meant}{others}",
                     key=Place("devices").at(spec.name).at("on").key,
                 )
+        self._meshes.max_faces = preparation.max_faces
+        scenery = self.settings.scenery or "none"
+        return Prepared(
+            prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
+            notes=(f"scenery: {scenery}",),
+        )
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Begin an episode; the same arguments lead to the same scenes, bit by bit."""

@@ -196,7 +196,16 @@ class SumoWorld(World[SumoSettings]):
             if not states.file(episode).exists():
                 states.make(episode + 1, self._passed)
             simulation.start(states.arguments(episode))
-            self._take_over(simulation)
+            # Note the vehicles and persons of a saved state, in the order of their departure.
+            for domain, known in (
+                (simulation.api.vehicle, self._vehicles),
+                (simulation.api.person, self._persons),
+            ):
+                names = domain.getIDList()
+                if domain is simulation.api.vehicle:
+                    names = sorted(names, key=lambda name: (simulation.api.vehicle.getDeparture(name), name))
+                for name in names:
+                    known[name] = self._kind(domain, name)
             self._begin_here(simulation)
             return
         simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
@@ -248,18 +257,6 @@ class SumoWorld(World[SumoSettings]):
 
     def _passed(self, now_s: float, end_s: float) -> None:
         self.run.progress(f"one traffic for all episodes: {now_s:.0f} of {end_s:.0f} s", 0.0)
-
-    def _take_over(self, simulation: Simulation) -> None:
-        """Note the vehicles and persons of a saved state, in the order of their departure."""
-        for domain, known in (
-            (simulation.api.vehicle, self._vehicles),
-            (simulation.api.person, self._persons),
-        ):
-            names = domain.getIDList()
-            if domain is simulation.api.vehicle:
-                names = sorted(names, key=lambda name: (simulation.api.vehicle.getDeparture(name), name))
-            for name in names:
-                known[name] = self._kind(domain, name)
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """Vehicles, then persons, each in the order of their departure."""
@@ -391,7 +388,17 @@ class SumoWorld(World[SumoSettings]):
             speed = domain.getSpeed(name)
             pose = body_pose(bumper, towards, dimensions[0], dimensions[2], self._placement)
             if dimensions[0] > _LONG_M:
-                self._follow(name, bumper, angle, dimensions)
+                # Note a long vehicle whose rear is beside the way that its front has gone: it is one
+                # rigid box.
+                length, width, _ = dimensions
+                front = complex(bumper[0], bumper[1])
+                rear = front - cmath.rect(length, math.radians(90.0 - angle))
+                trail = self._trails.setdefault(name, [rear])
+                trail.append(front)
+                if distance_to_line(rear, trail) > width:
+                    self._beside_road.add(self._prefix + name)
+                while len(trail) > 2 and abs(trail[1] - front) > 2 * length:
+                    del trail[0]
             fx, fy, fz = towards.forward
             yield ObjectState(
                 name=self._prefix + name,
@@ -424,18 +431,6 @@ class SumoWorld(World[SumoSettings]):
                 dimensions=dimensions,
                 angular_velocity=(0.0, 0.0, turning(body.yaw_rate)),
             )
-
-    def _follow(self, name: str, bumper: Vector, angle: float, dimensions: Vector) -> None:
-        """Note a long vehicle whose rear is beside the way that its front has gone: it is one rigid box."""
-        length, width, _ = dimensions
-        front = complex(bumper[0], bumper[1])
-        rear = front - cmath.rect(length, math.radians(90.0 - angle))
-        trail = self._trails.setdefault(name, [rear])
-        trail.append(front)
-        if distance_to_line(rear, trail) > width:
-            self._beside_road.add(self._prefix + name)
-        while len(trail) > 2 and abs(trail[1] - front) > 2 * length:
-            del trail[0]
 
     def _yaw_rate(self, vehicle: str, angle: float) -> float:
         """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. One that SUMO puts

@@ -208,11 +208,8 @@ class Autopilot:
         mx = jx * (scale * ex - damping * o) + (jz - jy) * p * r
         my = jy * (scale * ey - damping * p) + (jx - jz) * r * o
         mz = jz * (scale * ez - damping * (r - wanted.yaw_rate)) + (jy - jx) * o * p
-        return self._mixed(wanted.thrust, mx, my, mz)
-
-    def _mixed(self, thrust: float, mx: float, my: float, mz: float) -> Rotors:
-        """Rotor speeds of a thrust and moments; where they cannot be had, yaw gives way first."""
-        mean, roll, pitch = 0.25 * thrust, self._per_side * mx, self._per_side * my
+        # Rotor speeds of a thrust and moments; where they cannot be had, yaw gives way first.
+        mean, roll, pitch = 0.25 * wanted.thrust, self._per_side * mx, self._per_side * my
         most = self._most
         span = abs(roll) + abs(pitch)
         if span > 0.5 * most:
