@@ -120,8 +120,8 @@ class _Reader:
                 if self._recorded is not None and self._recorded < (entry.episode, entry.frame):
                     raise RecordingError(
                         f"the recording has {self._recorded[1]} frames of episode {self._recorded[0]}, and "
-                        f"the journal begins after frame {entry.frame - 1} of episode {entry.episode}: what is "
-                        "between is lost, and the run cannot go on"
+                        f"the journal begins after frame {entry.frame - 1} of episode {entry.episode}: what "
+                        "is between is lost, and the run cannot go on"
                     )
                 self._begin, self._digest = entry, RunDigest(entry.digest)
                 self._clear()

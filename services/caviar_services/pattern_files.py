@@ -237,8 +237,8 @@ def _planet(file: Path, lines: list[str]) -> PatternTable:
             # How many lines follow a cut's key.
             if len(parts) < 2 or not parts[1].isdecimal() or not 1 <= int(parts[1][:9]) <= _MOST_ANGLES:
                 raise AssetError(
-                    f"{file}:{number}: is {' '.join(parts)!r:.80}; write {parts[0]} and how many lines follow, "
-                    f"up to {_MOST_ANGLES}"
+                    f"{file}:{number}: is {' '.join(parts)!r:.80}; write {parts[0]} and how many lines "
+                    f"follow, up to {_MOST_ANGLES}"
                 )
             cut = cuts[key] = _CutLines(file, number, key, int(parts[1]))
         elif key == "GAIN":

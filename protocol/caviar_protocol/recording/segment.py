@@ -125,8 +125,8 @@ class Segment:
             raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
         self._scan()
         if not self.finished and self._seals:
-            # Keep what is sealed of a segment that was not closed: after a power loss, pages in the middle may
-            # be zero while later ones are there, and CRCs find them.
+            # Keep what is sealed of a segment that was not closed: after a power loss, pages in the middle
+            # may be zero while later ones are there, and CRCs find them.
             good, crc = 0, 0
             for place, recorded in self._seals:
                 if zlib.crc32(self._data[good:place], crc) != recorded:
