@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
-    "world:sumo-actuated": "caviar_services.world.sumo_actuated:ActuatedSumoWorld",
+    "world:sumo-actuated": "caviar_services.world.sumo:ActuatedSumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
     "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
@@ -55,7 +55,7 @@ BUILT_IN: dict[str, str] = {
     "agent:hierarchical-sweep": "caviar_services.agent.sweeps:HierarchicalSweepAgent",
     "agent:last-sweep": "caviar_services.agent.sweeps:LastSweepAgent",
     "agent:fingerprint": "caviar_services.agent.fingerprint:FingerprintAgent",
-    "agent:out-of-band": "caviar_services.agent.out_of_band:OutOfBandAgent",
+    "agent:out-of-band": "caviar_services.agent.sweeps:OutOfBandAgent",
     "agent:ucb": "caviar_services.agent.bandits:UcbAgent",
     "agent:thompson": "caviar_services.agent.bandits:ThompsonAgent",
     "agent:learner": "caviar_services.agent.learner:LearnerAgent",

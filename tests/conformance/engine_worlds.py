@@ -41,7 +41,7 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.world.assets import RunTimeMeshes
 
 FRAMES = 300
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))

@@ -18,7 +18,7 @@ from caviar_services.frame import Frame, StepResult
 from caviar_services.run_time_geometry import AnnouncedMeshes
 from caviar_services.service import NoSettings, Service
 from caviar_services.session import ServiceSession
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.world.assets import RunTimeMeshes
 
 CRATE, BARREL = b"a crate", b"a barrel"
 IDS = {"epoch": 1, "attempt": 1}

@@ -25,8 +25,8 @@ from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.people import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
+from caviar_services.world.sumo_conventions import step_length_ms
 from caviar_services.world.sumo_process import load_libsumo
-from caviar_services.world.sumo_steps import step_length_ms
 
 pytestmark = [
     pytest.mark.slow,

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import MAX_DIMENSIONS, WIRE_DTYPES, Payload, require_finite
-from caviar_protocol.codec.decoding import Buffer, decode_bounded
+from caviar_protocol.codec.messages import Buffer, decode_bounded
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError
 from caviar_protocol.fields import MAX_BODY, MAX_HEADER
 from caviar_protocol.topics import PAYLOADS

@@ -22,7 +22,7 @@ from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.base import User, Users, channels_of, require_channel
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.service import Frame, RunInfo
 
 

@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.cell.rates import shannon
+from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.space.beams import beam_gains, straight_beams
 from caviar_protocol.space.scene import antennas, directions
 from caviar_protocol.topics import Carrier, Link
 from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import BatchLink, LinkBatch, User, Users
-from caviar_services.link.beam_scores import RewardKind, Scored, SweepingLink, SweepSettings
-from caviar_services.link.interference import Interferers
+from caviar_services.link.beam_scores import Interferers, RewardKind, Scored, SweepingLink, SweepSettings
 from caviar_services.link.link_budget import LinkBudget
 from caviar_services.service import Frame, StepResult
 

@@ -29,10 +29,8 @@ from caviar_protocol.scenario.schema import carries, fixed_device, mounted_devic
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
-from caviar_services.returned import series_of
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.assets import object_assets, pattern_assets
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult, series_of
+from caviar_services.world.assets import RunTimeMeshes, object_assets, pattern_assets
 from caviar_space.scenery import scenery_assets, scenery_file
 
 

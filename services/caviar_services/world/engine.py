@@ -26,8 +26,7 @@ from caviar_protocol.topics import Action
 from caviar_protocol.topics.link import Command
 from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 from caviar_services.checkpoint import restored, saved
-from caviar_services.returned import series_of
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult, series_of
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_space.meshes import Mesh, fitted, ply
 from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
