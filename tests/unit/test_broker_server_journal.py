@@ -144,7 +144,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thaws: bool
 ) -> None:
     monkeypatch.setattr(server, "DISK_NOTE_S", 0.5)
-    monkeypatch.setattr(journal_writer, "END_S", 0.1)
+    monkeypatch.setattr(journal, "END_S", 0.1)
     made: list[Frozen] = []
 
     def frozen(path: Path) -> Frozen:
@@ -192,7 +192,7 @@ def test_a_write_that_waits_for_a_sync_that_fails_ends_with_its_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No other sync comes after it; the entry is in the file, and does not count as handed over."""
-    monkeypatch.setattr(journal_writer, "SYNC_PERIOD_S", 0.02)
+    monkeypatch.setattr(journal, "SYNC_PERIOD_S", 0.02)
     asked, fails = threading.Event(), threading.Event()
 
     def sync_recording() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from caviar_broker.core.checkpoints import PolicySwaps
+from caviar_broker.core.policy_swaps import PolicySwaps
 from caviar_protocol.policies import DECISION, EARLIER, NEXT, REFUSED, SHA256
 
 FIRST, SECOND, THIRD = ("1" * 64, "2" * 64, "3" * 64)

@@ -18,11 +18,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from caviar_broker.core import events as ev
-from caviar_broker.core.checkpoints import PayloadSize, PolicyState
+from caviar_broker.core.checkpoints import PayloadSize
 from caviar_broker.core.episodes import Episodes
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.membership import Liveness, Registration
 from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.policy_swaps import PolicyState
 from caviar_broker.core.run import Member, Resumption, Run, Snapshot
 from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.transitions import RunState, ServiceState

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from caviar_broker.core.checkpoints import PolicySwaps
 from caviar_broker.core.events import Action, Finished, Journal, Notice, Product, Send
 from caviar_broker.core.graph import Graph
 from caviar_broker.core.pace import PauseGate
 from caviar_broker.core.plan import RunPlan, ServicePlan, Timeouts, duration
+from caviar_broker.core.policy_swaps import PolicySwaps
 from caviar_broker.core.tasks import GrantOrder, Ledger, Task
 from caviar_broker.core.transitions import (
     PRESENT,
