@@ -17,9 +17,8 @@ from caviar_broker.core.geometry import GEOMETRY, has_capability
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
-from caviar_protocol.assets import MAX_ASSET, AssetStore, IncomingAsset
+from caviar_protocol.assets import MAX_ASSET, MAX_FACES, AssetStore, IncomingAsset, MeshCheck, wrong_name
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import MAX_FACES, MeshCheck, wrong_name
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import world_of
 from caviar_protocol.scenario.schema import pattern_asset

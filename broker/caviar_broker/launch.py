@@ -52,8 +52,7 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import attached, load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from typing import Annotated, Any, cast, get_args
 import msgspec
 from msgspec import Meta
 
+from caviar_protocol.assets import recorded_meshes
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.geometry import recorded_meshes
 from caviar_protocol.messages import GeometryChange, Role, Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory

@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore, IncomingAsset
+from caviar_protocol.assets import AssetStore, IncomingAsset, wrong_name
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import wrong_name
 from caviar_services.frame import StepResult
 from caviar_services.service import Service
 
@@ -176,7 +175,7 @@ class AnnouncedMeshes:
         store: Where the files go, for the broker to fetch.
 
     Example:
-        >>> from caviar_protocol.geometry import mesh_name
+        >>> from caviar_protocol.assets import mesh_name
         >>> announced = AnnouncedMeshes(AssetStore(Path("cache")))
         >>> change = announced.change(7, StepResult(meshes={mesh_name(b"ply"): b"ply"}))
         >>> change.frame, len(change.assets), announced.change(8, StepResult())

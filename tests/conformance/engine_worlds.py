@@ -26,9 +26,9 @@ from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
 
 from caviar_protocol.arrays import WIRE_DTYPES
+from caviar_protocol.assets import digest_in
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.geometry import digest_in
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import (
     Action,

@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 import pytest
 
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore
+from caviar_protocol.assets import AssetStore, mesh_name
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import mesh_name
 from caviar_services.frame import Frame, StepResult
 from caviar_services.run_time_geometry import AnnouncedMeshes
 from caviar_services.service import NoSettings, Service

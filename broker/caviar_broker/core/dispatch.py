@@ -10,8 +10,7 @@ from collections.abc import Collection, Mapping
 
 from msgspec.structs import replace
 
-from caviar_broker.core.deadlines import Deadlines
-from caviar_broker.core.decisions import DecisionTable
+from caviar_broker.core.decisions import Deadlines, DecisionTable
 from caviar_broker.core.events import Product
 from caviar_broker.core.geometry import GeometryLedger
 from caviar_broker.core.pace import Pacer

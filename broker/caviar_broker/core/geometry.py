@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import ServiceState
+from caviar_protocol.assets import wrong_name
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.geometry import wrong_name
 from caviar_protocol.messages import (
     Asset,
     Done,

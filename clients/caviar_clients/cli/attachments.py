@@ -25,7 +25,7 @@ class _Alias(TyperOption):
     @property
     def help(self) -> str:  # type: ignore[override]
         """What the attachment says of itself; its module is imported where that is shown."""
-        from caviar_protocol.scenario.attachments import summary
+        from caviar_protocol.scenario import summary
 
         return summary(self.attachment)
 
@@ -35,7 +35,7 @@ class AttachingCommand(TyperCommand):
 
     def get_params(self, ctx: Any) -> list[Any]:
         """List the parameters, with the aliases after ``--attach``."""
-        from caviar_protocol.scenario.attachments import ATTACHMENTS  # `caviar --help` loads no scenarios
+        from caviar_protocol.scenario import ATTACHMENTS  # `caviar --help` loads no scenarios
 
         found = super().get_params(ctx)
         taken = {flag for parameter in found for flag in parameter.opts}

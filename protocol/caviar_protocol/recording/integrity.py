@@ -11,9 +11,9 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_protocol.assets import digest_in, recorded_meshes
 from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.geometry import digest_in, recorded_meshes
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,

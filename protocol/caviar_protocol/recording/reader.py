@@ -19,8 +19,8 @@ from typing import Any, Literal, TypeAlias, TypeVar, overload
 import numpy as np
 
 from caviar_protocol.arrays import Payload
+from caviar_protocol.assets import recorded_meshes
 from caviar_protocol.errors import RecordingError, suggestion
-from caviar_protocol.geometry import recorded_meshes
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import (
     FrameEntry,

@@ -32,15 +32,16 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Link
 from caviar_services.checkpoint import restored, saved
-from caviar_services.link.association import Layout, associate
 from caviar_services.link.base import wrong_choice
 from caviar_services.link.beam_scores import Scored, SweepingLink
 from caviar_services.link.nr import Blocks, NrRates, load_blocks
 from caviar_services.link.slot_rates import (
     Gains,
+    Layout,
     ShannonRates,
     SlotRates,
     SlotSinr,
+    associate,
     band_points,
     noise_rise,
     responses,

@@ -21,10 +21,9 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.scenario.rules import patterns_overlap
 from caviar_protocol.seeding import generator
 from caviar_services.checkpoint import Packed
-from caviar_services.link.association import AssociationRule
 from caviar_services.link.beam_scores import RewardKind, SweepSettings
 from caviar_services.link.nr import Adaptation
-from caviar_services.link.slot_rates import Sharing
+from caviar_services.link.slot_rates import AssociationRule, Sharing
 from caviar_services.service import Frame
 
 RateModel = Literal["shannon", "capped", "nr"]

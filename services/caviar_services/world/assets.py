@@ -10,8 +10,8 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import ClassVar
 
+from caviar_protocol.assets import digest_in, mesh_name
 from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.geometry import digest_in, mesh_name
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.scenario.schema import pattern_asset

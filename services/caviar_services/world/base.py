@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.fields import PRINTABLE
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place

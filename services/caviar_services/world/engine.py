@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import ITU_MATERIALS
 from caviar_protocol.errors import AssetError, CaviarError, PayloadError, suggestion
-from caviar_protocol.geometry import ITU_MATERIALS
 from caviar_protocol.messages import Input
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action

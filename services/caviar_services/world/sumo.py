@@ -28,10 +28,10 @@ from caviar_protocol.topics.scene import BESIDE_ROAD_PREFIX, SIMULATOR_SAYS_PREF
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
-from caviar_services.world.people import People
 from caviar_services.world.sumo_commands import Commanded, carry_out, traffic_commands
 from caviar_services.world.sumo_conventions import (
     Heading,
+    People,
     Placement,
     body_pose,
     check_spacing,

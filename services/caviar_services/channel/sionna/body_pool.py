@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from caviar_protocol.geometry import is_mesh_name, material_of
+from caviar_protocol.assets import is_mesh_name, material_of
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna.materials import ObjectMaterials, body_kind
 from caviar_services.channel.sionna.scene_loading import unit_mesh
