@@ -190,6 +190,7 @@ def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> Fas
     _orders(app, ask, operator)
     _policies(app, directory, [Depends(_bearer), Depends(_may(TRAINER, tokens))])
 
+    @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
     async def healthz() -> Any:
         """Whether the broker answers. Needs no token."""
         # Of `why` and not of `status`, which computes quantiles for every service.
