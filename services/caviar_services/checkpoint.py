@@ -22,7 +22,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What stands around a state."""
+    """Envelope around a state."""
 
     format: Literal["caviar-state-1"]
     implementation: str

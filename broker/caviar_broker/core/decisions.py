@@ -357,7 +357,7 @@ class Deadlines:
     # --- pace --------------------------------------------------------------------------------------
 
     def release(self, task: Task, now: int) -> bool:
-        """Whether the run is not paused, and real time has come to the task's frame (clause 8)."""
+        """Return whether the run is not paused, and real time has come to the task's frame (clause 8)."""
         if task.frame >= self._table.frames:
             return True
         if not self._gate.admits(task.frame, now):

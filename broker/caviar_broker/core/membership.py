@@ -254,7 +254,7 @@ class Registration:
             self._episodes.begin(now)
 
     def _accepted(self, member: Member, message: Ready, now: int) -> bool:
-        """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
+        """Return whether a READY agrees with what others hold and own; else the run ends (clauses 3, 4)."""
         # A service without geometry says none, and an empty digest is no contradiction.
         expected = geometry_digest(self._run.scenery())
         if member.role != "world" and message.geometry and message.geometry != expected:

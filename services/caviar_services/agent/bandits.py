@@ -73,7 +73,7 @@ class Feedbacks:
 
 
 class Bandit:
-    """What is known of the pairs of one user or cell.
+    """Statistics of the pairs of one user or cell.
 
     Args:
         arms: Number of pairs.
@@ -104,7 +104,7 @@ class Bandit:
 
 
 class Context(NamedTuple):
-    """What a bandit is of."""
+    """Subject of a bandit."""
 
     carrier: str
     tx: str

@@ -51,7 +51,7 @@ class FingerprintSettings(PilotSettings, frozen=True, kw_only=True, forbid_unkno
 
 
 class Codebooks(NamedTuple):
-    """What a fingerprint is of: a transmitter that stands still, a carrier, and beams of both ends."""
+    """Subject of a fingerprint: a transmitter that stands still, a carrier, and beams of both ends."""
 
     tx: str
     carrier: str
@@ -62,7 +62,7 @@ class Codebooks(NamedTuple):
 
     @classmethod
     def of(cls, pair: Pair, carrier: str) -> Codebooks:
-        """Those of a pair of a scene."""
+        """Codebooks of a pair of a scene."""
         return cls(pair.tx.name, carrier, *pair.beams, pair.tx.array.codebook, pair.rx.array.codebook)
 
 
@@ -90,7 +90,7 @@ class Fingerprints:
 
     @property
     def codebooks(self) -> tuple[Codebooks, ...]:
-        """What there are fingerprints of, sorted."""
+        """Codebooks of which there are fingerprints, sorted."""
         return tuple(sorted(self._seen))
 
     @property
@@ -218,7 +218,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         return Prepared(actuators=prepared.actuators, notes=(*prepared.notes, note))
 
     def _is_here(self, known: Codebooks) -> bool:
-        """Whether the scenario has such a transmitter and carrier. Receivers come and go."""
+        """Return whether the scenario has such a transmitter and carrier. Receivers come and go."""
         if all(carrier.name != known.carrier for carrier in self.run.carriers):
             return False
         return any(

@@ -40,7 +40,7 @@ _EPSILON = 1e-8
 
 
 class PerceptronState(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What a `Perceptron` learnt."""
+    """Weights that a `Perceptron` learnt."""
 
     updates: int
     parameters: tuple[Packed, ...]
@@ -125,7 +125,7 @@ class Perceptron:
             parameter -= rate * (mean / first) / (np.sqrt(square / second) + _EPSILON)
 
     def state(self) -> PerceptronState:
-        """What it learnt, to be saved."""
+        """State that it learnt, to be saved."""
         return PerceptronState(
             self.updates,
             *(
@@ -248,7 +248,7 @@ class Model:
         self.network.learn(self._features[rows], self._pairs[rows], self._worth[rows] / scale, rate)
 
     def state(self, beams: tuple[int, int]) -> _ModelState:
-        """All of it, to be saved."""
+        """State of all of it, to be saved."""
         count = min(self.seen, len(self._pairs))
         return _ModelState(
             beams=beams,

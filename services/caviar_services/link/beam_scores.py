@@ -400,7 +400,7 @@ def amplitudes(
 
 @dataclass(frozen=True, eq=False)
 class Interferers:
-    """Which users hear the transmitters of which others, while the same users are there; K pairs of these."""
+    """Users that hear the transmitters of others, while the same users are there; K pairs of these."""
 
     victims: Int64Array
     """The user that hears, Shape ``[K]``."""
@@ -413,7 +413,7 @@ class Interferers:
 
     @classmethod
     def of(cls, users: Users) -> Interferers:
-        """Of the users of a scene.
+        """Make it for the users of a scene.
 
         Args:
             users: All of them.

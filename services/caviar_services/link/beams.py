@@ -62,7 +62,7 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
 
     @classmethod
     def computes_batches(cls, settings: Mapping[str, object]) -> bool:
-        """Whether many episodes can be computed at once: without interference."""
+        """Return whether many episodes can be computed at once: without interference."""
         return super().computes_batches(settings) and not settings.get("interference", False)
 
     def batch(

@@ -59,7 +59,7 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepR
 
 @dataclass(frozen=True, eq=False)
 class _Played:
-    """What the slots of a frame gave each terminal, Shape ``[T]`` each."""
+    """Results of a frame's slots for each terminal, Shape ``[T]`` each."""
 
     blocks: Int64Array
     errors: Int64Array
@@ -69,7 +69,7 @@ class _Played:
 
 @dataclass(frozen=True, eq=False)
 class _Serving:
-    """Who serves whom, while that and the users stay the same."""
+    """Assignment of users to transmitters, while that and the users stay the same."""
 
     layout: Layout
     transmitters: Int64Array
@@ -342,7 +342,7 @@ class CellLink(SweepingLink[CellSettings]):
     def _schedule(
         self, terminals: Terminals, eligible: BoolArray, members: BoolArray, carried: Int64Array
     ) -> BoolArray:
-        """Which terminals are served in the slot, Shape ``[T]``."""
+        """Choose the terminals that are served in the slot, Shape ``[T]``."""
         match self.settings.scheduler:
             case "round-robin":
                 priority = round_robin(terminals.turns)

@@ -1,4 +1,4 @@
-"""What slots carry for the terminals that they serve: SINR with interference, and rate models.
+"""Bits that slots carry for the terminals that they serve: SINR with interference, and rate models.
 
 Channels at the instants of slots and over the band, for chosen beams, from the paths of a channel product.
 
@@ -38,7 +38,7 @@ AssociationRule = Literal["best", "sticky", "agent"]
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which users are of which terminal and transmitter, while the same users are there."""
+    """Assignment of users to terminals and transmitters, while the same users are there."""
 
     users: Users
     names: tuple[tuple[str, str], ...]
@@ -54,7 +54,7 @@ class Layout:
 
     @classmethod
     def of(cls, users: Users) -> Layout:
-        """Of the users of a scene.
+        """Make it for the users of a scene.
 
         Args:
             users: All of them.
@@ -308,12 +308,12 @@ class SlotSinr:
 
     @property
     def varies(self) -> bool:
-        """Whether the SNR of one slot is not that of all."""
+        """True if the SNR of one slot is not that of all."""
         return len(self._snr) > 1
 
     @property
     def is_disturbed(self) -> bool:
-        """Whether who is served changes the SINR of others."""
+        """True if who is served changes the SINR of others."""
         return self._noise_rise is not None or (self.at_once > 1 and not self.in_band)
 
     def alone(self, slot: int) -> Float64Array:
@@ -347,7 +347,7 @@ class SlotSinr:
 
 
 class Carried(NamedTuple):
-    """What a slot carries, Shape ``[T]`` each; of terminals that it does not serve, anything."""
+    """Bits that a slot carries, Shape ``[T]`` each; of terminals that it does not serve, anything."""
 
     bits: Int64Array
     """That come through."""
@@ -374,7 +374,8 @@ class SlotRates(ABC):
 
     @abstractmethod
     def carried(self, slot: int, served: BoolArray, waiting: Int64Array) -> Carried:
-        """What a slot carries for the terminals that it serves; `offered` was asked for the slot before.
+        """Compute what a slot carries for the terminals that it serves; `offered` was asked for the slot
+        before.
 
         Args:
             slot: Number of the slot in the frame.

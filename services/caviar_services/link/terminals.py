@@ -165,7 +165,7 @@ def check_cell_settings(settings: CellSettings, place: Place) -> None:
 
 
 def _is_given(settings: CellSettings, key: str, place: Place) -> bool:
-    """Whether a key stands in the file; of settings made in Python, whether it is not its default."""
+    """Return whether a key stands in the file; of settings made in Python, whether it is not its default."""
     return place.source.holds(place.at(key).key) or getattr(settings, key) != getattr(_DEFAULTS, key)
 
 
@@ -182,7 +182,7 @@ _NO_TRAFFIC = Traffic(model="constant", rate_bit_s=0.0)
 
 
 class TerminalState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What terminals know from earlier frames."""
+    """Memory of terminals from earlier frames."""
 
     names: tuple[Terminal, ...]
     buffers: dict[str, Packed]
@@ -305,7 +305,7 @@ class Terminals:
         return self._drawn[1][within * slots : (within + 1) * slots]
 
     def state(self) -> TerminalState:
-        """What outlives the frame."""
+        """State that outlives the frame."""
         return TerminalState(
             names=self.names,
             buffers={name: Packed.of(array, "<i8") for name, array in self.buffers.state().items()},

@@ -186,7 +186,7 @@ class Engine(ABC):
 
 
 class _State(msgspec.Struct, frozen=True, array_like=True):
-    """What outlives a frame."""
+    """State that outlives a frame."""
 
     elapsed_ns: int
     arrived: tuple[str, ...]
@@ -231,7 +231,7 @@ class EngineWorld(World[WorldSettings]):
         self._refused: dict[str, int] = {}
 
     def prefixes(self) -> tuple[str, ...]:
-        """Those of the engine."""
+        """Prefixes of the engine."""
         prefixes = self._engine.prefixes
         if isinstance(prefixes, str):
             author = f"{type(self._engine).__name__}.prefixes"
@@ -243,7 +243,7 @@ class EngineWorld(World[WorldSettings]):
         return ()
 
     def scenery(self) -> Mapping[str, Path | bytes]:
-        """What the engine offers while it is prepared, and the files that the scenario names."""
+        """Files that the engine offers while it is prepared, and the files that the scenario names."""
         if self._files is None:
             self._files = {}
             self._engine.prepare()

@@ -92,7 +92,7 @@ def check_spacing(between_episodes_s: float, step_ms: int) -> None:
 
 
 class Placement(NamedTuple):
-    """How the road network lies in the scene: turned about its origin, then shifted.
+    """Placement of the road network in the scene: turned about its origin, then shifted.
 
     Example:
         >>> Placement((100.0, 0.0, 0.0)).yaw
@@ -106,7 +106,7 @@ class Placement(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """Where a body on the road points [rad].
+    """Direction in which a body on the road points [rad].
 
     Example:
         >>> Heading(0.0, 0.0).forward
@@ -316,7 +316,7 @@ class People:
         self._counts: Counter[str] = Counter()
 
     def __contains__(self, name: str) -> bool:
-        """Whether a person is to be seen."""
+        """Return whether a person is to be seen."""
         return name in self._walks
 
     def clear(self) -> None:
@@ -335,7 +335,7 @@ class People:
             del self._walks[name]
 
     def taken_counts(self) -> dict[str, int]:
-        """What SUMO did, since this was last asked for, that no person does."""
+        """Counts, since they were last asked for, of what SUMO did that no person does."""
         counts = dict(self._counts)
         self._counts.clear()
         return counts

@@ -211,7 +211,7 @@ class TrafficStates:
         return self._folder / _name(episode)
 
     def missing(self, episodes: int) -> bool:
-        """Whether the state of one of the first episodes has to be made.
+        """Return whether the state of one of the first episodes has to be made.
 
         Args:
             episodes: Their number.

@@ -186,7 +186,7 @@ SCENERY, GROUND = "scenery", "ground"
 
 
 class Contact(NamedTuple):
-    """Where a ball touches something.
+    """Contact of a ball with something.
 
     Example:
         >>> Contact("scenery", (0.0, 0.0, 1.0), 0.02).velocity
