@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli.scenarios import new_scenario
-from caviar_clients.session.checks import checked_scenario, module_folders
+from caviar_clients.session.prepared import module_folders, prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import parse_scenario
 
@@ -30,7 +30,7 @@ def test_an_unknown_setting_names_the_implementation_and_what_it_has(
     path = new_scenario(str(tmp_path / "mine"))
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(ScenarioError, match=rf"^{path}:\d+: services\.channel\.settings\.{words}"):
-        checked_scenario(path)
+        prepare(path)
 
 
 def test_modules_of_rungs_are_looked_for_beside_the_scenario_too(tmp_path: Path) -> None:

@@ -29,8 +29,8 @@ from caviar_broker.core.events import Finished
 from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.cli.shared import print_line
 from caviar_clients.cli.summary import recorded_figures
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.files import PrivateFolder
 from caviar_protocol.host import DISTRIBUTION, PYTHON, install_command
@@ -188,7 +188,7 @@ def check_frames() -> Check:
 
 def _two_frames(folder: Path) -> tuple[Finished, float]:
     """How two embedded frames of `smoke` end, and their mean |y|."""
-    outcome = EmbeddedRun(checked_scenario(shipped_scenarios()["smoke"], frames=2), folder).run()
+    outcome = EmbeddedRun(prepare(shipped_scenarios()["smoke"], frames=2), folder).run()
     figures = recorded_figures(folder)
     return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 

@@ -16,14 +16,13 @@ import zmq
 
 from caviar_clients.cli.keys import BorrowedKey
 from caviar_clients.cli.processes import Child, end, wait
-from caviar_clients.session.checks import module_folders
+from caviar_clients.session.prepared import PreparedScenario, module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import PrivateFolder, file_system_of, open_to_append
 from caviar_protocol.host import PYTHON
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
-from caviar_services.registry import load
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -54,7 +53,7 @@ class Launcher:
     what the broker reports, until the run is over. Remote services are started by the user, at ``endpoint``.
 
     Args:
-        scenario: Checked, as `checked_scenario` returns it.
+        prepared: The scenario, as `prepare` returns it.
         path: The scenario's file.
         directory: The run's directory.
         frames, seed, pace: What replaces the scenario's; None: nothing.
@@ -67,7 +66,7 @@ class Launcher:
         settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
     """
 
-    scenario: Scenario
+    prepared: PreparedScenario
     path: Path
     directory: Path
     frames: int | None = None
@@ -80,6 +79,7 @@ class Launcher:
     pace: str | None = None
     attachments: Sequence[str] = ()
     settings: Sequence[str] = ()
+    scenario: Scenario = field(init=False)
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
     refused: bool = False
@@ -117,6 +117,7 @@ class Launcher:
     _listen_until: float | None = None
 
     def __post_init__(self) -> None:
+        self.scenario = self.prepared.scenario
         self._key = BorrowedKey(self.keys)
         if not self.bind and self.keys is None and len(self._local) == len(self.scenario.services):
             self.bind = self._private_address()
@@ -244,7 +245,7 @@ class Launcher:
         spec, path = self._local[name], RunDirectory(self.directory).log(name)
         command = [*PYTHON, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
-        if wanted := load(spec.role, spec.use).inputs_with(spec.settings):
+        if wanted := self.prepared.services[name].cls.inputs_with(spec.settings):
             command += ["--inputs", *(".".join((i.topic, *i.parts)) for i in wanted)]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]

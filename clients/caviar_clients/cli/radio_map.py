@@ -19,8 +19,8 @@ from caviar_clients.cli.shared import print_line, progress_bar, require_installe
 from caviar_clients.files import file_in, reserved, writing
 from caviar_clients.plots.map import RadioMapView, draw_servers, draw_values
 from caviar_clients.plots.rays import footprints
-from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.plausibility import implausible_values, in_hertz
+from caviar_clients.session.plausibility import in_hertz
+from caviar_clients.session.prepared import PreparedScenario, prepare
 from caviar_clients.session.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import DISTRIBUTION
@@ -213,11 +213,11 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
         for metric in options.metrics
     }
     arrays = picture.with_suffix(".npz")
-    if not is_recording(source):
-        for warning in implausible_values(checked_scenario(source)):
-            print_line(console, f"warning: {warning}")
+    prepared = None if is_recording(source) else prepare(source)
+    for warning in prepared.warnings if prepared else ():
+        print_line(console, f"warning: {warning}")
     with reserved(*pictures.values(), arrays):
-        mapped = _mapped(source, options, console)
+        mapped = _mapped(source, prepared, options, console)
         save(mapped.found, mapped.metadata, arrays)
         view = _view(mapped)
         for metric, file in pictures.items():
@@ -238,8 +238,10 @@ class _Mapped:
     scenery: Path | None
 
 
-def _mapped(source: Path, options: MapOptions, console: Console) -> _Mapped:
-    scenes = scene_at(source, options.frame)
+def _mapped(
+    source: Path, prepared: PreparedScenario | None, options: MapOptions, console: Console
+) -> _Mapped:
+    scenes = scene_at(source, options.frame, prepared)
     instant = scenes.instants[0]
     index = carrier_of(scenes.carriers, options.carrier)
     carrier = scenes.carriers[index]

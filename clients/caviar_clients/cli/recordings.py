@@ -227,7 +227,7 @@ def replay_run(
     from caviar_clients.cli.run import run_scenario
     from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
     from caviar_clients.replay.recorded import RecordedRun
-    from caviar_clients.session.checks import check_implementations, names_class
+    from caviar_clients.session.prepared import names_class, prepare
     from caviar_services.registry import find_modules_in
 
     found = RecordedRun(Recording(run))
@@ -235,7 +235,7 @@ def replay_run(
         find_modules_in(Path.cwd())
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)
-    check_implementations(plan.scenario)
+    prepare(plan.scenario)
     _print_plan(plan, found, console)
     with PrivateFolder("replay") as folder:
         scenario, figures = folder.path / f"{plan.scenario.run.name}.toml", folder.path / "summary.json"

@@ -26,8 +26,7 @@ from caviar_clients.cli.remote import key_text, reachable, start_command, waitin
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable
 from caviar_clients.files import printable, write_file
-from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.plausibility import implausible_values
+from caviar_clients.session.prepared import PreparedScenario, implemented, prepare
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
@@ -50,11 +49,11 @@ class EmbeddedLauncher:
     """A run in this process, with the interface of `caviar_clients.cli.launch.Launcher`.
 
     Args:
-        scenario: Checked, as `checked_scenario` returns it.
+        scenario: As `prepare` returns it.
         directory: The run's directory.
     """
 
-    def __init__(self, scenario: Scenario, directory: Path) -> None:
+    def __init__(self, scenario: PreparedScenario, directory: Path) -> None:
         from caviar_clients.session.embedded import EmbeddedRun
 
         self._directory = directory
@@ -225,10 +224,11 @@ def run_scenario(
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace, attachments, settings)
+    prepared = prepare(path, frames, seed, pace, attachments, settings)
+    scenario = prepared.scenario
     if bind:
         check_bind(bind, keys=keys is not None)
-    require_extras(scenario)
+    require_extras(prepared)
     if embedded:
         refuse_remote(scenario)
     if http and embedded:
@@ -242,16 +242,15 @@ def run_scenario(
     require_writable(json_file)
     directory = new_run_directory(out, scenario.run.name)
     print_line(console, f"run {directory}")
-    warnings = implausible_values(scenario)
-    for warning in warnings:
+    for warning in prepared.warnings:
         print_line(console, f"warning: {warning}", "yellow")
     # The child processes get the scenario as it was found: they read the file themselves.
     launcher: Launcher | EmbeddedLauncher
     if embedded:
-        launcher = EmbeddedLauncher(scenario, directory)
+        launcher = EmbeddedLauncher(prepared, directory)
     else:
         launcher = Launcher(
-            scenario,
+            prepared,
             find_scenario(path).resolve(),
             directory,
             frames,
@@ -263,7 +262,7 @@ def run_scenario(
             attachments=attachments,
             settings=settings,
         )
-    return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
+    return _follow(launcher, scenario, directory, console, json_file, keys, prepared.warnings, new=True)
 
 
 def resume_run(
@@ -287,13 +286,20 @@ def resume_run(
         RecordingError: The directory has no record of a run, or one that cannot be read.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = read_record(directory).scenario
+    prepared = implemented(read_record(directory).scenario)
     require_writable(json_file)
     print_line(console, f"run {directory}")
     launcher = Launcher(
-        scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True, force=force
+        prepared,
+        directory,
+        directory.resolve(),
+        bind=bind,
+        keys=keys,
+        http=http,
+        resume=True,
+        force=force,
     )
-    return _follow(launcher, scenario, directory, console, json_file, keys)
+    return _follow(launcher, prepared.scenario, directory, console, json_file, keys)
 
 
 def _follow(

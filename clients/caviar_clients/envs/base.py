@@ -20,9 +20,8 @@ from caviar_clients.envs.arguments import checked_names, checked_path, checked_p
 from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.plots.scene_map import MapRenderer
 from caviar_clients.session.base import Frame, Session
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import CONNECT_TIMEOUT_S, agent_of, open_session
-from caviar_clients.session.plausibility import implausible_values
+from caviar_clients.session.prepared import PreparedScenario, prepare
 from caviar_protocol import observations
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.keys import credentials
@@ -51,7 +50,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     last frame; the last observation has the scene of the last frame and its link.
 
     Args:
-        scenario: Scenario file, or the name of a scenario that ships.
+        scenario: Scenario file, the name of a scenario that ships, or one that is prepared.
         broker: ZeroMQ address of a broker that runs the scenario, with the agent's ``use = "remote"``; None:
             the run takes place in this process.
         agent: Name of the agent whose place is taken; None: the remote one, or the only one.
@@ -91,7 +90,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
 
     def __init__(
         self,
-        scenario: str | Path,
+        scenario: str | Path | PreparedScenario,
         broker: str | None = None,
         agent: str | None = None,
         users: str | Sequence[str] = "*",
@@ -111,7 +110,10 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         observe = checked_names("observe", observe)
         if not observe and self.needs_parts:
             raise ScenarioError("observe names no part; write observe=('aoa',)")
-        self.scenario = checked_scenario(checked_path("scenario", scenario))
+        if not isinstance(scenario, PreparedScenario):
+            scenario = prepare(checked_path("scenario", scenario))
+        self.prepared = scenario
+        self.scenario = self.prepared.scenario
         if not any(spec.role == "link" for spec in self.scenario.services.values()):
             raise Place("services", self.scenario.source).error(
                 "no service is a link, which says what beams achieve; add [services.link] with "
@@ -120,7 +122,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         if reward in OF_PACKETS:
             require_packets(self.scenario, f"reward {reward!r}")
         # A program may make hundreds of environments: Python shows the same warning once.
-        for text in implausible_values(self.scenario):
+        for text in self.prepared.warnings:
             warnings.warn(text, stacklevel=2)
         self.agent = agent_of(self.scenario, agent)
         self.render_mode = render_mode
@@ -285,7 +287,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
     def _open(self) -> Session:
         """Open the session of the environment's agent."""
         return open_session(
-            self.scenario,
+            self.prepared,
             self.agent,
             self.inputs(),
             self._broker,
@@ -358,7 +360,7 @@ class BeamSelectionEnv(SessionEnv[np.int64 | NDArray[np.int64]]):
         Discrete(64)
     """
 
-    def __init__(self, scenario: str | Path, **options: Any) -> None:
+    def __init__(self, scenario: str | Path | PreparedScenario, **options: Any) -> None:
         super().__init__(scenario, **options)
         self._sizes = sizes = [place.beam_pairs for place in self.users.places]
         self.action_space = spaces.Discrete(sizes[0]) if len(sizes) == 1 else spaces.MultiDiscrete(sizes)

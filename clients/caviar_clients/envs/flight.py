@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.envs.base import Moment, SessionEnv
+from caviar_clients.session.prepared import PreparedScenario
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario.schema import owned_by
 from caviar_protocol.space.beams import straight_beams
@@ -42,7 +43,7 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
         ScenarioError: The scenario has no such object, or the agent does not own its motion.
     """
 
-    def __init__(self, scenario: str | Path, vehicle: str | None, **options: Any) -> None:
+    def __init__(self, scenario: str | Path | PreparedScenario, vehicle: str | None, **options: Any) -> None:
         super().__init__(scenario, **options)
         self.vehicle, self._flown = self._flown_object(vehicle)
         self._max_speed = float(self._flown["max_speed_m_s"])

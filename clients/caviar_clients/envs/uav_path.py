@@ -17,7 +17,8 @@ from caviar_clients.envs.arguments import checked_names
 from caviar_clients.envs.base import Moment, Observation
 from caviar_clients.envs.deliveries import MOST_ADDRESSES, Box, Deliveries, greatest_power, rotary_wing_power
 from caviar_clients.envs.flight import FlightEnv, point
-from caviar_clients.session.checks import TRIES, Airspace
+from caviar_clients.session.airspace import TRIES, Airspace
+from caviar_clients.session.prepared import PreparedScenario
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.seeding import generator
@@ -144,7 +145,7 @@ class UavPathEnv(FlightEnv):
 
     def __init__(
         self,
-        scenario: str | Path = "uav-path",
+        scenario: str | Path | PreparedScenario = "uav-path",
         vehicle: str | None = None,
         reach_m: float = 5.0,
         box_m: tuple[Sequence[float], Sequence[float]] | None = None,

@@ -34,10 +34,10 @@ class Session(ABC):
             decides for all of them at once: frames are those of the first one.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
         >>> from caviar_clients.session.connected import open_session
+        >>> from caviar_clients.session.prepared import prepare
         >>> from caviar_protocol.topics import Action
-        >>> scenario, inputs = checked_scenario("smoke", frames=3), (Input(topic="scene"),)
+        >>> scenario, inputs = prepare("smoke", frames=3), (Input(topic="scene"),)
         >>> with open_session(scenario, "agent", inputs) as session:
         ...     frame = session.reset(seed=7)
         ...     while not frame.final:

@@ -15,15 +15,15 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario, names_class
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import PreparedScenario, names_class, prepare
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
+from caviar_protocol.scenario.rules import with_overrides
 from caviar_protocol.space.scene import pairs_of
 from caviar_protocol.topics import Carrier, Scene
-from caviar_services.registry import load
 from caviar_services.service import Preparation, Prepared, Service, StepResult
 
 T = TypeVar("T")
@@ -82,12 +82,13 @@ class Scenes:
         return dict(next(found, {}))
 
 
-def scenes_of(path: Path, frames: int) -> Scenes:
+def scenes_of(path: Path, frames: int, prepared: PreparedScenario | None = None) -> Scenes:
     """Take scenes, spread evenly over the first episode of a scenario or a recording.
 
     Args:
         path: Scenario file, run directory or segment.
         frames: Number of scenes, about: those without a transmitter or a receiver are left out.
+        prepared: The scenario of that file; None: it is prepared here.
 
     Raises:
         ScenarioError: The scenario is wrong, or has no carrier.
@@ -99,7 +100,12 @@ def scenes_of(path: Path, frames: int) -> Scenes:
         >>> len(scenes.instants), scenes.carriers[0].name
         (2, 'mmwave')
     """
-    found = _of_recording(path, frames) if is_recording(path) else _of_scenario(path, frames)
+    if is_recording(path):
+        found = _of_recording(path, frames)
+    else:
+        prepared = prepared or prepare(path)
+        instants, assets = _simulated(prepared)
+        found = _planned(path, prepared.scenario, _spread(instants, frames), assets, _middle(instants))
     if not found.carriers:
         raise ScenarioError(
             "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
@@ -115,12 +121,13 @@ def scenes_of(path: Path, frames: int) -> Scenes:
     return dataclasses.replace(found, instants=served, consecutive=_run(found.consecutive))
 
 
-def scene_at(path: Path, frame: int = 0) -> Scenes:
+def scene_at(path: Path, frame: int = 0, prepared: PreparedScenario | None = None) -> Scenes:
     """Take the scene of one frame of the first episode, as the only instant.
 
     Args:
         path: Scenario file, run directory or segment.
         frame: Number of the frame.
+        prepared: The scenario of that file; None: it is prepared here.
 
     Raises:
         ScenarioError: The scenario is wrong.
@@ -135,13 +142,14 @@ def scene_at(path: Path, frame: int = 0) -> Scenes:
         if instant is None:
             raise RecordingError(f"frame {frame} of {path} has no scene; choose another with --frame")
         return _recorded(recording, (instant,))
-    scenario = checked_scenario(path)
+    prepared = prepared or prepare(path)
+    scenario = prepared.scenario
     if not 0 <= frame < scenario.run.frames:
         last = scenario.run.frames - 1
         raise RunError(f"--frame {frame}: scenario {scenario.run.name!r} has the frames 0 to {last}")
     # A world's scene may depend on every frame before: the run is cut after the frame, not begun at it.
-    scenario = checked_scenario(path, frames=frame + 1)
-    instants, assets = _simulated(scenario)
+    scenario = with_overrides(scenario, frames=frame + 1)
+    instants, assets = _simulated(dataclasses.replace(prepared, scenario=scenario))
     return _planned(path, scenario, instants[-1:], assets)
 
 
@@ -197,16 +205,12 @@ def _instant(frame: RecordedFrame) -> Instant | None:
     return None if scene is None else Instant(frame.number, frame.t_ns, scene)
 
 
-def _of_scenario(path: Path, frames: int) -> Scenes:
-    scenario = checked_scenario(path)
-    instants, assets = _simulated(scenario)
-    return _planned(path, scenario, _spread(instants, frames), assets, _middle(instants))
-
-
-def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
+def _simulated(prepared: PreparedScenario) -> tuple[list[Instant], Mapping[str, Path]]:
     """Run the worlds of a scenario; their scene of each frame, and the files of their scenery."""
-    prepared: list[Preparation] = []
-    run = EmbeddedRun(worlds_only(scenario), None, seats={KEEPER: _keeper(prepared.append)})
+    preparations: list[Preparation] = []
+    # A class and not an object: an embedded run makes its services itself, as any other run does.
+    keeper = type("Keeper", (Keeper,), {"on_prepare": staticmethod(preparations.append)})
+    run = EmbeddedRun(worlds_only(prepared), None, seats={KEEPER: keeper})
     seat, instants = run.seats[KEEPER], list[Instant]()
     for _ in run.steps():
         if seat.frame is not None:
@@ -214,7 +218,7 @@ def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
             seat.answer(StepResult())
     if run.outcome is None or run.outcome.error:
         raise RunError(run.outcome.error if run.outcome else "the worlds ended without an outcome")
-    return instants, prepared[0].assets if prepared else {}
+    return instants, preparations[0].assets if preparations else {}
 
 
 def _planned(
@@ -238,28 +242,29 @@ def _planned(
     )
 
 
-def worlds_only(scenario: Scenario) -> Scenario:
+def worlds_only(prepared: PreparedScenario) -> PreparedScenario:
     """Reduce a scenario to one episode of its worlds and of the agents that need no channel.
 
     An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts. A service
     that keeps the scenes takes the place of all others.
     """
-    kept = services_kept(scenario)
+    scenario = prepared.scenario
+
+    def is_kept(name: str, spec: ServiceSpec) -> bool:
+        if spec.role != "agent" or spec.remote:
+            return spec.role == "world"
+        inputs = prepared.services[name].cls.inputs
+        return {given.topic for given in inputs if given.required} <= {"scene"}
+
+    kept = {name: spec for name, spec in scenario.services.items() if is_kept(name, spec)}
     budget_ms = 1e3  # never reached: nothing is late in an embedded run
     # It has the role of sensors, since these may take scenes without making anything of them.
     kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
-    return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="free"))
-
-
-def services_kept(scenario: Scenario) -> dict[str, ServiceSpec]:
-    """Select the services that make the scenes: worlds, and agents that need no channel."""
-
-    def is_kept(spec: ServiceSpec) -> bool:
-        if spec.role != "agent" or spec.remote:
-            return spec.role == "world"
-        return {given.topic for given in load("agent", spec.use).inputs if given.required} <= {"scene"}
-
-    return {name: spec for name, spec in scenario.services.items() if is_kept(spec)}
+    run = replace(scenario.run, episodes=1, record=(), pace="free")
+    return PreparedScenario(
+        replace(scenario, services=kept, run=run),
+        {name: service for name, service in prepared.services.items() if name in kept},
+    )
 
 
 class KeeperSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -282,12 +287,6 @@ class Keeper(Service[KeeperSettings]):
     def step(self, frame: Any) -> StepResult:
         """Never called: the seat answers."""
         raise RunError(f"{KEEPER} is answered by its seat")
-
-
-def _keeper(on_prepare: Callable[[Preparation], None]) -> type[Keeper]:
-    """Make the class of a keeper that passes on what it is prepared with."""
-    # A class and not an object: an embedded run makes its services itself, as any other run does.
-    return type("Keeper", (Keeper,), {"on_prepare": staticmethod(on_prepare)})
 
 
 def _spread(entries: Sequence[T], count: int) -> list[T]:
