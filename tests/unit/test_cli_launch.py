@@ -17,8 +17,7 @@ import msgspec
 import pytest
 
 from caviar_clients.cli import launch
-from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.processes import TAIL, Child
+from caviar_clients.cli.launch import TAIL, Child, Launcher
 from caviar_clients.session.prepared import implemented
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import remove_leftovers

@@ -19,8 +19,15 @@ from rich.console import Console
 
 from caviar_clients.cli import main as command
 from caviar_clients.cli import radio_map as radio_map_command
-from caviar_clients.cli.radio_map import ARRAYS, draw_radio_map, options_of
-from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, noise_of, surface_of
+from caviar_clients.cli.radio_map import (
+    ARRAYS,
+    Wanted,
+    channel_of,
+    draw_radio_map,
+    noise_of,
+    options_of,
+    surface_of,
+)
 from caviar_clients.plots.map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.session.plausibility import in_hertz
 from caviar_clients.session.scenes import scene_at

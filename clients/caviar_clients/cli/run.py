@@ -20,8 +20,7 @@ from rich.text import Text
 
 from caviar_broker.run_record import read_record
 from caviar_broker.security.access import check_bind
-from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.processes import Interruption
+from caviar_clients.cli.launch import Interruption, Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable

@@ -15,8 +15,7 @@ import gymnasium
 
 from caviar_clients.envs.arguments import checked_path
 from caviar_clients.envs.base import BeamSelectionEnv, Observation, SessionEnv
-from caviar_clients.envs.flight import MOTION
-from caviar_clients.envs.uav_path import UavPathEnv
+from caviar_clients.envs.uav_path import MOTION, UavPathEnv
 from caviar_clients.session.base import Session
 from caviar_clients.session.connected import open_session
 from caviar_clients.session.prepared import PreparedScenario, prepare

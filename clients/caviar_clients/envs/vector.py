@@ -12,8 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_members, checked_seeds, whole_numbers
-from caviar_clients.envs.base import BeamSelectionEnv, Observation
-from caviar_clients.envs.rewards import RewardKind, link_info
+from caviar_clients.envs.base import BeamSelectionEnv, Observation, RewardKind, link_info
 from caviar_clients.session.batch import REMEDY, BatchLink, BatchSession, MemberSeed, check_batch
 from caviar_protocol import observations
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, Payload
