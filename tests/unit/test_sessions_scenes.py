@@ -8,7 +8,8 @@ import pytest
 from recording_builders import frame, link, product, record, scene
 
 from caviar_clients.session.prepared import implemented
-from caviar_clients.session.scenes import KEEPER, scenes_of, worlds_only
+from caviar_clients.session.scenes import KEEPER, worlds_only
+from caviar_labs.tradeoff.scenes import scenes_of
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.scenario import load_scenario
 

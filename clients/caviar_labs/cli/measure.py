@@ -299,8 +299,8 @@ def _require_extras_of_ladder(source: Path, options: Options, with_pictures: boo
 def _compared(
     source: Path, prepared: PreparedScenario | None, frames: int, options: Options, console: Console
 ) -> Report:
-    from caviar_clients.session.scenes import scenes_of
     from caviar_labs.tradeoff.report import compare
+    from caviar_labs.tradeoff.scenes import scenes_of
     from caviar_services.recorder.base import machine
 
     with progress_bar(console, TimeElapsedColumn(), TextColumn("{task.fields[left]}")) as bar:
