@@ -169,17 +169,13 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             outcome = server.run(raise_priority)
     statistics = server.statistics
     takes_files = server.disk_answers and call_with_timeout(lambda: statistics.save(files.latencies), SAVE_S)
+    figures = statistics.figures()
     reporter.finished(
         disk="" if takes_files else f"the disk does not answer: {file_system_of(directory)}",
         error=outcome.error,
         culprit=outcome.culprit,
         digest=outcome.digest,
-        frames=statistics.frames + statistics.earlier,
-        frames_per_second=statistics.frames_per_second(),
-        warm_up_frames=statistics.warm_up_frames,
-        deadlines={"scheduling": scheduling} | msgspec.structs.asdict(statistics.deadlines()),
-        pace=msgspec.structs.asdict(statistics.pace()),
-        services={n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
+        **figures | {"deadlines": {"scheduling": scheduling} | figures["deadlines"]},
     )
     if outcome.error and not arguments.control:
         sys.stderr.write(f"caviar broker: {outcome.error}\n")

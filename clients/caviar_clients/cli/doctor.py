@@ -25,7 +25,6 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Column, Table
 
-from caviar_broker.core.events import Finished
 from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.cli.shared import print_line
 from caviar_clients.cli.summary import recorded_figures
@@ -168,7 +167,10 @@ def check_frames() -> Check:
     remedy = f"{sys.executable} -m pip install --upgrade --upgrade-strategy eager {DISTRIBUTION}"
     try:
         with PrivateFolder("doctor") as folder:
-            outcome, abs_y = _two_frames(folder.path)
+            smoke = prepare(shipped_scenarios()["smoke"], frames=2)
+            outcome = EmbeddedRun(smoke, folder.path).run()
+            figures = recorded_figures(folder.path)
+            abs_y = (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
     except Exception as error:  # anything: a dependency that does not fit raises what it likes
         text = str(error) if isinstance(error, CaviarError) else f"{type(error).__name__}: {error}"
         return Check("frames", False, text, remedy)
@@ -184,13 +186,6 @@ def check_frames() -> Check:
         return Check("frames", True, f"{found}; digests of this machine compare with each other only")
     found = f"two frames of smoke have mean |y| {abs_y:.6g}, expected {FRAME_ABS_Y:.6g}"
     return Check("frames", False, f"{found}; digest {outcome.digest:.12}…", remedy)
-
-
-def _two_frames(folder: Path) -> tuple[Finished, float]:
-    """How two embedded frames of `smoke` end, and their mean |y|."""
-    outcome = EmbeddedRun(prepare(shipped_scenarios()["smoke"], frames=2), folder).run()
-    figures = recorded_figures(folder)
-    return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 
 
 def check_extra(extra: str) -> Check:
@@ -316,7 +311,8 @@ def _check_requirements(name: str, extra: str) -> Check:
     found = ", ".join(versions)
     if unmet and extra and not outdated:
         return Check(name, False, found, install_command(extra), extra)
-    return _check(name, not unmet, found, _pip_install(unmet))
+    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in unmet)
+    return _check(name, not unmet, found, f"{sys.executable} -m pip install {wanted}")
 
 
 def _version(name: str) -> str | None:
@@ -324,11 +320,6 @@ def _version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _pip_install(requirements: list[Requirement]) -> str:
-    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in requirements)
-    return f"{sys.executable} -m pip install {wanted}"
 
 
 def _run(command: list[str], environment: Mapping[str, str]) -> tuple[bool, str]:

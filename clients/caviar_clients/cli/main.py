@@ -316,12 +316,13 @@ def radio_map(
     ] = None,
 ) -> None:
     """Map best server, path gain, received power and SINR over a plane or the ground."""
-    from caviar_clients.cli.radio_map import Wanted, draw_radio_map, options_of
+    from caviar_clients.cli.radio_map import MapOptions, beam_choice, draw_radio_map
 
-    cells = Wanted(height=height, cell=cell, surface=surface, area=area)
-    options = options_of(
-        metric, cells, beam, frame=frame, carrier=carrier, samples=samples, memory_gib=memory_gib
-    )
+    metrics = tuple(dict.fromkeys(metric or ("gain",)))
+    options = MapOptions(
+        metrics=metrics, height=height, cell=cell, surface=surface, area=area, frame=frame, carrier=carrier,
+        beam=beam_choice(beam), samples=samples, memory_gib=memory_gib,
+    )  # fmt: skip
     for file in draw_radio_map(source, out, options, _errors):
         typer.echo(file)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
 from caviar_clients.cli.shared import progress_bar
 from caviar_clients.files import file_in, make_folder_of, require_folder
@@ -93,12 +93,16 @@ def plot_run(
     files: list[Path] = []
     if "scene" in topics:
         files.append(folder / "map.png")
-        _map(recording, _frame(recording, frame, "channel", chosen), chosen, files[-1])
+        shown = _frame(recording, frame, "channel", chosen)
+        data = map_data(recording, shown, chosen, scenery(recording))
+        if data is None:
+            raise RecordingError(f"frame {shown.number} has no scene; choose another with --frame")
+        draw_map(data, files[-1])
     if chosen is not None:
         files += [folder / "beams-over-time.png", folder / "beams-over-angle.png"]
-        data, agent = series(recording, chosen), agent_names(recording)
-        draw_over_time(data, agent, files[-2])
-        draw_over_angle(data, agent, files[-1])
+        curves, agent = series(recording, chosen), agent_names(recording)
+        draw_over_time(curves, agent, files[-2])
+        draw_over_angle(curves, agent, files[-1])
     packets = packet_series(recording) if chosen is not None else None
     if packets is not None:
         files.append(folder / "traffic.png")
@@ -180,13 +184,6 @@ def map_data(
         user=user,
         title=f"{recording.metadata.name}: {moment(frame)}",
     )
-
-
-def _map(recording: Recording, frame: RecordedFrame, user: tuple[str, str, str] | None, file: Path) -> None:
-    data = map_data(recording, frame, user, scenery(recording))
-    if data is None:
-        raise RecordingError(f"frame {frame.number} has no scene; choose another with --frame")
-    draw_map(data, file)
 
 
 def _scan(frame: RecordedFrame, file: Path) -> None:
@@ -296,15 +293,15 @@ def _frame(
         return recording.frame(0, number)
     candidates = list(recording.frames())
     for wanted in ("scene", topic):
-        with_topic = [frame for frame in candidates if _has(frame, wanted)]
+        with_topic = [
+            frame
+            for frame in candidates
+            if any(entry.topic == wanted and entry.status in ("fresh", "held") for entry in frame.inputs)
+        ]
         candidates = with_topic or candidates
     ranks = [_worth(frame, user) for frame in candidates]
     candidates = [frame for frame, rank in zip(candidates, ranks, strict=True) if rank == max(ranks)]
     return candidates[len(candidates) // 2]  # not the first, in which users have hardly moved
-
-
-def _has(frame: RecordedFrame, topic: str) -> bool:
-    return any(entry.topic == topic and entry.status in ("fresh", "held") for entry in frame.inputs)
 
 
 def _frame_with_points(recording: Recording, frame: RecordedFrame) -> RecordedFrame:
@@ -404,18 +401,29 @@ def film_run(
     suffix = file.suffix.lower()
     rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
     chosen = choose_user(recording, user or "") if "link" in recording.topics else None
-    survey = _survey(recording, _indices(recording, frames), chosen, camera)
+    plan, indices = _survey(recording, _indices(recording, frames), chosen, camera)
     make_folder_of(file)
     # Frames pass one by one, twice: limits and scales of the first pass hold in all pictures of the second.
-    moving = MovingMap(survey.plan, pixels)
-    count = len(survey.indices)
+    moving = MovingMap(plan, pixels)
+
+    def pictures(steps: Iterable[int]) -> Iterator[UInt8Array]:
+        # Cameras may see every n-th frame: between two pictures the earlier one stands.
+        last = None
+        for step in steps:
+            frame = RecordedFrame(recording, indices[step])
+            data = map_data(recording, frame, chosen, None)
+            if plan.camera is not None:
+                last = _seen(frame).get(plan.camera, last)
+            if data is not None:
+                yield moving.draw(data, step, last)
+
+    count = len(indices)
     spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
-    samples = list(_pictures(recording, survey, moving, chosen, spread)) if suffix == ".gif" else []
-    samples = samples or list(_pictures(recording, survey, moving, chosen, spread[:1]))
+    samples = list(pictures(spread)) if suffix == ".gif" else []
+    samples = samples or list(pictures(spread[:1]))
     columns = (MofNCompleteColumn(), TimeRemainingColumn())
     with progress_bar(console or Console(quiet=True), *columns) as bar:
-        task = bar.add_task("drawing", total=count)
-        drawn = _counted(_pictures(recording, survey, moving, chosen, range(count)), bar, task)
+        drawn = bar.track(pictures(range(count)), total=count, description="drawing")
         WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
     speed = rate * recording.metadata.sampling_period_ns * 1e-9
     return Film(file, count, rate, speed, moving.size)
@@ -462,15 +470,10 @@ def _indices(recording: Recording, frames: str | None) -> list[int]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Survey:
-    """What a first look at the frames found."""
-
-    indices: list[int]
-    plan: Plan
-
-
-def _survey(recording: Recording, indices: Sequence[int], user: User | None, camera: str | None) -> _Survey:
+def _survey(
+    recording: Recording, indices: Sequence[int], user: User | None, camera: str | None
+) -> tuple[Plan, list[int]]:
+    """Plan of the film from a first look at its frames, and the places of those that have a scene."""
     ground, kept = scenery(recording), []
     views: list[View] = []
     gains: list[tuple[float, float]] = []
@@ -501,8 +504,10 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
     if not kept:
         raise RecordingError(f"{recording.path} holds no scene in these frames, so there is no map to draw")
     shown = choose_camera(aspects, camera, f"these frames of {recording.path} hold")
+    limits = np.array(views)
+    low, high = limits[..., 0].min(axis=0).tolist(), limits[..., 1].max(axis=0).tolist()
     plan = Plan(
-        view=_union(views),
+        view=((low[0], high[0]), (low[1], high[1])),
         gains_db=scale(np.array(gains).ravel()) if gains else None,
         has_ticks=has_ticks,
         has_beam=has_beam,
@@ -516,7 +521,7 @@ def _survey(recording: Recording, indices: Sequence[int], user: User | None, cam
         camera=shown,
         aspect=aspects.get(shown or "", 0.75),
     )
-    return _Survey(kept, plan)
+    return plan, kept
 
 
 def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
@@ -525,36 +530,9 @@ def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
     return {image.sensor: image.rgb for payload in payloads for image in payload.images}
 
 
-def _union(views: Sequence[View]) -> View:
-    limits = np.array(views)
-    low, high = limits[..., 0].min(axis=0).tolist(), limits[..., 1].max(axis=0).tolist()
-    return (low[0], high[0]), (low[1], high[1])
-
-
 def _cut(data: UserSeries, indices: list[int]) -> UserSeries:
     arrays = {
         name: getattr(data, name)[indices]
         for name in ("time", "present", "has_path", "los", "abs_y", "best", "baseline", "theta")
     }
     return UserSeries(data.tx, data.rx, data.carrier, **arrays)
-
-
-def _pictures(
-    recording: Recording, survey: _Survey, moving: MovingMap, user: User | None, steps: Sequence[int]
-) -> Iterator[UInt8Array]:
-    """Pictures of some steps of the survey; a camera that saw nothing in a frame keeps its last picture."""
-    # Cameras may see every n-th frame: between two pictures the earlier one stands.
-    last = None
-    for step in steps:
-        frame = RecordedFrame(recording, survey.indices[step])
-        data = map_data(recording, frame, user, None)
-        if survey.plan.camera is not None:
-            last = _seen(frame).get(survey.plan.camera, last)
-        if data is not None:
-            yield moving.draw(data, step, last)
-
-
-def _counted(pictures: Iterator[UInt8Array], bar: Progress, task: TaskID) -> Iterator[UInt8Array]:
-    for picture in pictures:
-        yield picture
-        bar.advance(task)

@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib import metadata as distribution
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,6 @@ from caviar_services.channel.radio_map.mapping import (
     FLOOR_DB,
     Area,
     BeamChoice,
-    Coverage,
     RadioMap,
     cell_counts,
     decibels,
@@ -67,20 +66,6 @@ _SHOWN_NAMES = 20
 
 # [m] between lowest and highest ground; beyond, a level plane is hardly meant.
 _RELIEF = 2.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """The cells that are wanted."""
-
-    height: float = 1.5
-    """[m] above the ground."""
-    cell: float = 5.0
-    """Side of a cell [m]."""
-    surface: str = "plane"
-    """``plane``, ``ground``, or the name of a piece of scenery that the cells follow."""
-    area: Area | None = None
-    """Lowest x and y, highest x and y [m]; None: all of the scenery."""
 
 
 def carrier_of(carriers: Sequence[Carrier], name: str | None) -> int:
@@ -195,7 +180,7 @@ def noise_of(services: Mapping[str, ServiceSpec], carrier: Carrier) -> tuple[flo
 
 
 def surface_of(
-    channel: SionnaChannel, scene: Scene, description: Path | None, wanted: Wanted
+    channel: SionnaChannel, scene: Scene, description: Path | None, wanted: MapOptions
 ) -> tuple[MeasurementSurface, str, tuple[str, ...]]:
     """Make the cells of a map.
 
@@ -257,7 +242,7 @@ def _beside(channel: SionnaChannel, area: Area) -> tuple[str, ...]:
 
 
 def _plane(
-    area: Area, wanted: Wanted, shapes: Sequence[SceneryShape]
+    area: Area, wanted: MapOptions, shapes: Sequence[SceneryShape]
 ) -> tuple[MeasurementSurface, tuple[str, ...]]:
     """A level surface above the lowest ground, and notes about ground that is above it."""
     pieces = ground((shape.file, shape.to_world) for shape in shapes)
@@ -403,7 +388,14 @@ class MapOptions:
 
     metrics: tuple[str, ...] = ("gain",)
     """Keys of `METRICS`."""
-    cells: Wanted = field(default_factory=Wanted)
+    height: float = 1.5
+    """[m] above the ground."""
+    cell: float = 5.0
+    """Side of a cell [m]."""
+    surface: str = "plane"
+    """``plane``, ``ground``, or the name of a piece of scenery that the cells follow."""
+    area: Area | None = None
+    """Lowest x and y, highest x and y [m]; None: all of the scenery."""
     frame: int = 0
     """Instant of the first episode."""
     carrier: str | None = None
@@ -414,47 +406,40 @@ class MapOptions:
     memory_gib: float = 2.0
     """Memory that the map may take [GiB]."""
 
+    def __post_init__(self) -> None:
+        """Refuse values that the command line cannot.
 
-def options_of(metrics: Sequence[str] | None, cells: Wanted, beam: str, **others: Any) -> MapOptions:
-    """Make options from those of the command line.
+        Raises:
+            RunError: A value is none of those that an option takes.
+        """
+        for metric in self.metrics:
+            require_known("--metric", metric, METRICS)
+        # Negated comparisons, which NaN does not pass either.
+        if not abs(self.height) <= _FARTHEST_M:
+            raise RunError(f"--height {self.height:g}: write a height in metres, at most {_FARTHEST_M:,.0f}")
+        if not 0 < self.cell <= _FARTHEST_M:
+            side = "write the side of a cell in metres, above 0, at most"
+            raise RunError(f"--cell {self.cell:g}: {side} {_FARTHEST_M:,.0f}")
+        if self.area is not None:
+            x0, y0, x1, y1 = self.area
+            if not (x0 < x1 and y0 < y1 and all(map(math.isfinite, self.area))):
+                given = " ".join(f"{value:g}" for value in self.area)
+                raise RunError(f"--area {given}: write lowest x and y, then highest x and y, in metres")
+        if not 0 < self.memory_gib <= _MOST_GIB:
+            limits = f"above 0 and at most {_MOST_GIB:,.0f}"
+            raise RunError(f"--memory-gib {self.memory_gib:g}: write GiB, {limits}")
 
-    Args:
-        metrics: Keys of `METRICS`; None: ``gain``.
-        cells: Which cells.
-        beam: ``best``, ``wide``, or the number of a beam.
-        others: Fields of `MapOptions`.
+
+def beam_choice(text: str) -> BeamChoice:
+    """Read the option ``--beam``: ``best``, ``wide``, or the number of a beam.
 
     Raises:
-        RunError: A value is none of those that an option takes.
+        RunError: It is none of these.
 
     Example:
-        >>> options_of(["rss", "rss"], Wanted(cell=2.0), "7", frame=3).metrics
-        ('rss',)
+        >>> beam_choice("best"), beam_choice("7")
+        ('best', 7)
     """
-    chosen = tuple(dict.fromkeys(metrics or ("gain",)))
-    for metric in chosen:
-        require_known("--metric", metric, METRICS)
-    # Negated comparisons, which NaN does not pass either.
-    if not abs(cells.height) <= _FARTHEST_M:
-        raise RunError(f"--height {cells.height:g}: write a height in metres, at most {_FARTHEST_M:,.0f}")
-    if not 0 < cells.cell <= _FARTHEST_M:
-        raise RunError(
-            f"--cell {cells.cell:g}: write the side of a cell in metres, above 0, at most {_FARTHEST_M:,.0f}"
-        )
-    if cells.area is not None:
-        x0, y0, x1, y1 = cells.area
-        if not (x0 < x1 and y0 < y1 and all(map(math.isfinite, cells.area))):
-            given = " ".join(f"{value:g}" for value in cells.area)
-            raise RunError(f"--area {given}: write lowest x and y, then highest x and y, in metres")
-    options = MapOptions(metrics=chosen, cells=cells, beam=_beam(beam), **others)
-    if not 0 < options.memory_gib <= _MOST_GIB:
-        raise RunError(
-            f"--memory-gib {options.memory_gib:g}: write GiB, above 0 and at most {_MOST_GIB:,.0f}"
-        )
-    return options
-
-
-def _beam(text: str) -> BeamChoice:
     if text == "best" or text == "wide":
         return "best" if text == "best" else "wide"
     if not (text.isdecimal() and len(text) < 10):
@@ -498,9 +483,27 @@ def draw_radio_map(source: Path, out: Path | None, options: MapOptions, console:
     with reserved(*pictures.values(), arrays):
         mapped = _mapped(source, prepared, options, console)
         save(mapped.found, mapped.metadata, arrays)
-        view = _view(mapped)
+        found, drawn = mapped.found, None
+        if mapped.scenery is not None:
+            shapes = read_scenery(mapped.scenery).shapes
+            drawn = footprints((shape.file, shape.to_world) for shape in shapes)
+        x, y = found.surface.x.tolist(), found.surface.y.tolist()
+        view = RadioMapView(
+            area=(x[0], y[0], x[-1], y[-1]),
+            transmitters=found.names,
+            positions=found.positions[:, :2],
+            scene=mapped.scene,
+            footprints=drawn,
+            title=mapped.title,
+        )
+        coverage = found.coverage
         for metric, file in pictures.items():
-            _draw(view, mapped.found.coverage, metric, file)
+            if metric == "best-server":
+                draw_servers(view, coverage.best_server, file)
+                continue
+            values = {"gain": coverage.gain, "rss": coverage.rss, "sinr": coverage.sinr}[metric]
+            served = decibels(coverage.of_server(values), 1e-3 if metric == "rss" else 1.0)
+            draw_values(view, served, METRICS[metric], file)
     for line in _summary(mapped):
         print_line(console, line)
     return [*pictures.values(), arrays]
@@ -534,7 +537,7 @@ def _mapped(
         preparation = Preparation(demand={}, assets=assets)
         channel.load_patterns(preparation)
         channel.load_scene(preparation)
-        surface, about, notes = surface_of(channel, instant.scene, find_scenery(assets), options.cells)
+        surface, about, notes = surface_of(channel, instant.scene, find_scenery(assets), options)
         # The rays of a transmitter are shot in parts that fit into the memory, and their powers are added.
         memory = int(options.memory_gib * 2**30)
         part = rays_at_once(surface, devices, options.beam, options.samples, memory)
@@ -553,7 +556,7 @@ def _mapped(
         "frequency_hz": carrier.frequency_hz,
         "bandwidth_hz": carrier.bandwidth_hz,
         "surface": about,
-        "cell_m": options.cells.cell,
+        "cell_m": options.cell,
         "beam": options.beam,
         "noise": noise,
         "noise_w": noise_w,
@@ -569,31 +572,6 @@ def _mapped(
         title=f"{scenes.name}: {at}\n{about}, {served}",
         scenery=find_scenery(assets),
     )
-
-
-def _view(mapped: _Mapped) -> RadioMapView:
-    found, drawn = mapped.found, None
-    if mapped.scenery is not None:
-        shapes = read_scenery(mapped.scenery).shapes
-        drawn = footprints((shape.file, shape.to_world) for shape in shapes)
-    x, y = found.surface.x.tolist(), found.surface.y.tolist()
-    return RadioMapView(
-        area=(x[0], y[0], x[-1], y[-1]),
-        transmitters=found.names,
-        positions=found.positions[:, :2],
-        scene=mapped.scene,
-        footprints=drawn,
-        title=mapped.title,
-    )
-
-
-def _draw(view: RadioMapView, coverage: Coverage, metric: str, file: Path) -> None:
-    if metric == "best-server":
-        draw_servers(view, coverage.best_server, file)
-        return
-    values = {"gain": coverage.gain, "rss": coverage.rss, "sinr": coverage.sinr}[metric]
-    reference = 1e-3 if metric == "rss" else 1.0
-    draw_values(view, decibels(coverage.of_server(values), reference), METRICS[metric], file)
 
 
 def _summary(mapped: _Mapped) -> Iterator[str]:

@@ -13,7 +13,6 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import msgspec
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.text import Text
@@ -93,12 +92,7 @@ class EmbeddedLauncher:
             "error": outcome.error,
             "culprit": outcome.culprit,
             "digest": outcome.digest,
-            "frames": statistics.frames,
-            "frames_per_second": statistics.frames_per_second(),
-            "warm_up_frames": statistics.warm_up_frames,
-            "deadlines": msgspec.structs.asdict(statistics.deadlines()),
-            "pace": msgspec.structs.asdict(statistics.pace()),
-            "services": {n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
+            **statistics.figures(),
         }
 
     def stop(self, reason: str) -> None:

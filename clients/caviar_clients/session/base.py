@@ -76,8 +76,10 @@ class Session(ABC):
         if self._frame is None:
             self._begin(chosen)
             self._frame = self._granted()
-            if _begins(self._frame, seed):
-                return self._frame
+            begun = self._frame
+            its_seed = seed is None or (begun.seed, begun.seed_episode) == (seed, 0)
+            if begun.number == 0 and not begun.final and its_seed:
+                return begun
             # An agent that had the place before left the run in the middle of an episode.
         if self._frame.final:
             self._answer_alike(StepResult(seed=chosen))
@@ -145,12 +147,6 @@ class Session(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _begins(frame: Frame, seed: int | None) -> bool:
-    """Whether a frame is the first one of an episode, of this seed where one is chosen."""
-    chosen = seed is None or (frame.seed, frame.seed_episode) == (seed, 0)
-    return frame.number == 0 and not frame.final and chosen
 
 
 PATIENCE_S = 600.0

@@ -89,7 +89,8 @@ class ConnectedSession(Session):
         """Leave the run; after the last frame of its last episode the run ends in order."""
         if self._frame is not None and self._frame.final and self._thread.is_alive():
             self._answer_alike(StepResult())
-            self._drained()
+            with suppress(Empty):  # until the run is over, or the next episode begins
+                self._grants.get(timeout=LEAVE_S)
         self._frame = None
         self.leave()
         for other in self._others.values():
@@ -143,11 +144,6 @@ class ConnectedSession(Session):
             if isinstance(grant, CaviarError):
                 raise grant
             return grant
-
-    def _drained(self) -> None:
-        """Wait until the run is over or the next episode begins."""
-        with suppress(Empty):
-            self._grants.get(timeout=LEAVE_S)
 
     # --- in the runner's thread --------------------------------------------------------------------
 

@@ -200,7 +200,10 @@ class EmbeddedRun:
 
         def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
             use, send = scenario.services[name].use, partial(self._take, name)
-            progress = partial(self._progressed, name)
+
+            def progress(phase: str, grace_s: float = 0.0) -> None:
+                self._watchdog.progress(name, phase)
+
             return kind(name, use, cls, send, store, progress=progress, check=check, encodes=self._encodes)
 
         def implementation(name: str) -> type[Service[Any]]:
@@ -213,14 +216,17 @@ class EmbeddedRun:
             name: self.seats.get(name) or session(ServiceSession, name, implementation(name))
             for name in scenario.services
         }
-        self._at_work: Work | None = None  # what a service handles just now
+        self.at_work: Work | None = None
+        """What a service handles just now, for the watchdog; None between services."""
         self._direct: DirectFrames | None = None
         classes = {name: session.cls for name, session in self._sessions.items()}
         # Which meshes there are in a frame is the clock's to say.
         settings = {name: spec.settings for name, spec in scenario.services.items()}
         if any(c.role == "world" and c.changes_geometry_with(settings[n]) for n, c in classes.items()):
             self._without_clock = False
-        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait, wait_again_s)
+        self._watchdog = Watchdog(
+            plan, classes, lambda: (self._direct or self).at_work, on_wait, wait_again_s
+        )
 
     def run(self) -> ev.Finished:
         """Run to the end.
@@ -294,7 +300,7 @@ class EmbeddedRun:
             self._reset = order.message
         # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
-        self._at_work = order.service, order.message
+        self.at_work = order.service, order.message
         try:
             session.handle(order.message, parts)
         except (SystemExit, KeyboardInterrupt) as error:
@@ -303,7 +309,7 @@ class EmbeddedRun:
             if isinstance(order.message, m.Grant):
                 phase, episode, frame = "step", order.message.episode, order.message.frame
             session.report(failure, phase, episode, frame)
-        self._at_work = None
+        self.at_work = None
         if self._encodes and type(order.message) is m.Grant:
             elapsed, plan = time.monotonic_ns() - began, self._services[order.service]
             grant = order.message
@@ -312,16 +318,9 @@ class EmbeddedRun:
             self.statistics.latency(order.service, elapsed, missed)
 
     def _close(self, session: ServiceSession) -> None:
-        self._direct, self._at_work = None, (session.name, None)
+        self._direct, self.at_work = None, (session.name, None)
         session.close()
-        self._at_work = None
-
-    def _present_work(self) -> Work | None:
-        direct = self._direct
-        return self._at_work if direct is None else direct.at_work
-
-    def _progressed(self, name: str, phase: str, grace_s: float = 0.0) -> None:
-        self._watchdog.progress(name, phase)
+        self.at_work = None
 
     def _play_directly(self) -> Generator[None, None, None]:
         """Play on without the clock, which granted the first frame of the first episode."""

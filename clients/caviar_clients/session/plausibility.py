@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -246,35 +246,25 @@ def _powers(scenario: Scenario) -> _Warnings:
             )
 
 
-class _Placed(NamedTuple):
-    """Something that stands at a place of its own in the world."""
-
-    key: str
-    name: str
-    position: Vector
-
-
 def _positions(prepared: PreparedScenario) -> _Warnings:
-    placed = [*_placed_devices(prepared.scenario), *_placed_objects(prepared)]
+    placed = [*_placed(prepared)]
     ground = _scenery_of(prepared.scenario) if placed else None
     if ground is None:
         return
     known: set[str] = set()
-    for thing in placed:
-        wrong = ground.implausible(np.array(thing.position)) if thing.name not in known else ""
+    for key, name, position in placed:
+        wrong = ground.implausible(np.array(position)) if name not in known else ""
         if wrong:
-            known.add(thing.name)
-            at = ", ".join(f"{number:g}" for number in thing.position)
-            yield thing.key, f"{thing.name!r} stands at ({at}) m, {wrong}"
+            known.add(name)
+            at = ", ".join(f"{number:g}" for number in position)
+            yield key, f"{name!r} stands at ({at}) m, {wrong}"
 
 
-def _placed_devices(scenario: Scenario) -> Iterator[_Placed]:
-    for index, device in enumerate(scenario.devices):
+def _placed(prepared: PreparedScenario) -> Iterator[tuple[str, str, Vector]]:
+    """Key, name and position [m] of what stands at a place of its own: devices, and objects of worlds."""
+    for index, device in enumerate(prepared.scenario.devices):
         if not device.on:
-            yield _Placed(f"devices[{index}].position_m", device.name, device.position_m)
-
-
-def _placed_objects(prepared: PreparedScenario) -> Iterator[_Placed]:
+            yield f"devices[{index}].position_m", device.name, device.position_m
     for world in prepared.of_role("world"):
         try:
             placements = list(world.cls.placements(world.settings)) if issubclass(world.cls, World) else []
@@ -282,7 +272,7 @@ def _placed_objects(prepared: PreparedScenario) -> Iterator[_Placed]:
             continue  # the world refuses it itself, with the remedy
         for key, thing, positions in placements:
             for position in positions[:: max(1, math.ceil(len(positions) / LOOKED_AT))]:
-                yield _Placed(f"{world.place.key}.{key}", thing, position)
+                yield f"{world.place.key}.{key}", thing, position
 
 
 class _Ground:
