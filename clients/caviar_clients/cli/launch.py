@@ -391,16 +391,13 @@ class Launcher:
         if self.resume:
             bind = ["--bind", self.bind] if self.bind else []
             return ["--resume", str(self.directory), *bind, *["--force"] * self.force]
-        arguments = [str(self.path), "--bind", self.bind, "--directory", str(self.directory)]
-        if self.frames is not None:
-            arguments += ["--frames", str(self.frames)]
-        if self.seed is not None:
-            arguments += ["--seed", str(self.seed)]
-        if self.pace is not None:
-            arguments += ["--pace", self.pace]
-        arguments += [f"--attach={text}" for text in self.attachments]
-        arguments += [f"--set={text}" for text in self.settings]
-        return arguments
+        given = {"--frames": self.frames, "--seed": self.seed, "--pace": self.pace}
+        return [
+            *(str(self.path), "--bind", self.bind, "--directory", str(self.directory)),
+            *(f"{option}={value}" for option, value in given.items() if value is not None),
+            *(f"--attach={text}" for text in self.attachments),
+            *(f"--set={text}" for text in self.settings),
+        ]
 
     def _start_broker(self) -> None:
         command = [*PYTHON, "-m", "caviar_broker", *self._broker_arguments()]

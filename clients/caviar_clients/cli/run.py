@@ -319,7 +319,8 @@ def _follow(
     outcome: Mapping[str, Any] = {}
     interrupted = Interruption(launcher.stop, in_process=isinstance(launcher, EmbeddedLauncher))
     try:
-        with launcher, interrupted, _bar(console) as bar:
+        columns = ("{task.fields[rate]}", TimeRemainingColumn(), "{task.fields[misses]}")
+        with launcher, interrupted, progress_bar(console, MofNCompleteColumn(), *columns) as bar:
             watcher = _Watcher(bar, console, scenario, keys)
             for event in launcher.events():
                 watcher.show(event)
@@ -408,7 +409,8 @@ class _Watcher:
         for name, spec in self._scenario.services.items():
             if spec.remote:
                 connect_s = self._scenario.timeouts.connect_s
-                self._tell(waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys), "bold")
+                text = waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys)
+                print_line(self._console, printable(text), "bold")
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
@@ -439,7 +441,7 @@ class _Watcher:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""
             who = f"{event['service']}{frame}: " if event["service"] or frame else ""
             text = f"{event['kind']}: {who}{event['text']}"
-            self._tell(text + self._remedy(event), "yellow")
+            print_line(self._console, printable(text + self._remedy(event)), "yellow")
 
     def _remedy(self, event: Mapping[str, Any]) -> str:
         """The command that brings a remote service back; empty for other events."""
@@ -448,14 +450,6 @@ class _Watcher:
             return ""
         command = start_command(event["service"], spec, self._endpoint)
         return f"; unless it comes back by itself, start it again as before (or, the example,  {command})"
-
-    def _tell(self, text: str, style: str) -> None:
-        print_line(self._console, printable(text), style)
-
-
-def _bar(console: Console) -> Progress:
-    columns = ("{task.fields[rate]}", TimeRemainingColumn(), "{task.fields[misses]}")
-    return progress_bar(console, MofNCompleteColumn(), *columns)
 
 
 def _show(console: Console, summary: Mapping[str, Any]) -> None:

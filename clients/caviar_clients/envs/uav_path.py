@@ -279,11 +279,17 @@ class UavPathEnv(FlightEnv):
         self._weights = _weights(weights or {})
         self._reach = _positive("reach_m", reach_m)
         self._efficiency = _positive("efficiency_bit_s_hz", efficiency_bit_s_hz)
-        self._outage_snr = _decibels("outage_snr_db", outage_snr_db)
+        if not (_is_number(outage_snr_db) and abs(outage_snr_db) <= GREATEST_DB):
+            limits = f"write a number from -{GREATEST_DB:g} to {GREATEST_DB:g} [dB]"
+            raise ScenarioError(f"outage_snr_db={outage_snr_db!r}; {limits}")
+        self._outage_snr = float(10 ** (outage_snr_db / 10))
         self._low, self._high = self._bounds()
         self._drawn_in = (self._low, self._high) if box_m is None else self._box(box_m)
         self._step_way = self._max_speed * self.scenario.run.sampling_period_ns / 1e9
-        self._count = _count(deliveries)
+        if type(deliveries) is not int or not 0 <= deliveries <= MOST_ADDRESSES:
+            limits = f"write a whole number from 0 to {MOST_ADDRESSES}"
+            raise ScenarioError(f"deliveries={deliveries!r}; {limits}")
+        self._count = deliveries
         self._no_fly = _boxes(no_fly_m)
         self._greatest_power = greatest_power(self._max_speed)
         self._distance = self._distances(distance_m)
@@ -314,13 +320,8 @@ class UavPathEnv(FlightEnv):
         return low, high
 
     def _box(self, box_m: tuple[Sequence[float], Sequence[float]]) -> tuple[Vector, Vector]:
-        corners = [point(corner) for corner in box_m] if isinstance(box_m, Sequence) else []
-        low, high = corners if len(corners) == 2 else (None, None)
-        if (
-            low is None
-            or high is None
-            or not all(a <= x <= y <= b for a, x, y, b in zip(self._low, low, high, self._high, strict=True))
-        ):
+        low, high = _corners(box_m) or (self._high, self._low)
+        if not all(a <= x <= y <= b for a, x, y, b in zip(self._low, low, high, self._high, strict=True)):
             raise ScenarioError(
                 f"box_m={box_m!r} is no box within {list(self._low)} and {list(self._high)}; write its "
                 "lowest and its highest corner, x, y, z [m] each"
@@ -488,16 +489,19 @@ class UavPathEnv(FlightEnv):
         own = {
             "position": 2 * (position - low) / size - 1,
             "velocity": moment.scene.velocity[index] / self._max_speed,
-            "goal": self._way(self._first_address(position), position) / size,
+            "goal": (np.asarray(self._first_address(position)) - position) / size,
         }
         deliveries = self._episode_deliveries
         if self._count:
             ways = [
-                np.zeros(3) if done else self._way(address, position) / size
+                np.zeros(3) if done else (np.asarray(address) - position) / size
                 for address, done in zip(deliveries.addresses, deliveries.delivered, strict=True)
             ]
             own["addresses"], own["delivered"] = np.array(ways), np.array(deliveries.delivered, np.float64)
-        found: Observation = {name: _clipped(values) for name, values in own.items()}
+        # Within ±1: rounding puts what is at a bound beyond it.
+        found: Observation = {
+            name: np.clip(values, -1.0, 1.0).astype(np.float32) for name, values in own.items()
+        }
         found["rate"], found["outage"] = (np.array([value], np.float32) for value in (efficiency, outage))
         return {**found, **super()._observation(moment)}
 
@@ -506,10 +510,6 @@ class UavPathEnv(FlightEnv):
         x, y, z = position.tolist()
         first = self._episode_deliveries.next_address((x, y, z))
         return self._episode_deliveries.addresses[-1] if first is None else first
-
-    def _way(self, address: Vector, position: Float64Array) -> Float64Array:
-        way: Float64Array = np.asarray(address) - position
-        return way
 
     def _info(self, moment: Moment) -> dict[str, Any]:
         known = super()._info(moment)
@@ -524,11 +524,6 @@ class UavPathEnv(FlightEnv):
         return known
 
 
-def _clipped(values: Float64Array) -> NDArray[np.float32]:
-    """Within ±1: rounding puts what is at a bound beyond it."""
-    return np.clip(values, -1.0, 1.0).astype(np.float32)
-
-
 def _is_number(value: object) -> bool:
     """Whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
@@ -540,30 +535,22 @@ def _positive(name: str, value: float) -> float:
     return float(value)
 
 
-def _count(deliveries: int) -> int:
-    if type(deliveries) is not int or not 0 <= deliveries <= MOST_ADDRESSES:
-        raise ScenarioError(f"deliveries={deliveries!r}; write a whole number from 0 to {MOST_ADDRESSES}")
-    return deliveries
+def _corners(given: object) -> tuple[Vector, Vector] | None:
+    """Read two points; None where it is something else."""
+    low, high = map(point, given) if isinstance(given, Sequence) and len(given) == 2 else (None, None)
+    return None if low is None or high is None else (low, high)
 
 
 def _boxes(no_fly_m: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[Box, ...]:
     found = []
     for given in no_fly_m:
-        corners = [point(corner) for corner in given] if isinstance(given, Sequence) else []
-        low, high = corners if len(corners) == 2 else (None, None)
-        if low is None or high is None or not all(a < b for a, b in zip(low, high, strict=True)):
+        corners = _corners(given)
+        if corners is None or not all(a < b for a, b in zip(*corners, strict=True)):
             raise ScenarioError(
                 f"no_fly_m has {given!r}; write the lowest and the highest corner of a box, x, y, z [m] each"
             )
-        found.append(Box(low, high))
+        found.append(Box(*corners))
     return tuple(found)
-
-
-def _decibels(name: str, value: float) -> float:
-    """A ratio that is given in dB, as a number."""
-    if not (_is_number(value) and abs(value) <= GREATEST_DB):
-        raise ScenarioError(f"{name}={value!r}; write a number from -{GREATEST_DB:g} to {GREATEST_DB:g} [dB]")
-    return float(10 ** (value / 10))
 
 
 def _weights(given: Mapping[str, float]) -> Weights:

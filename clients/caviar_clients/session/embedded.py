@@ -47,6 +47,13 @@ from caviar_services.session import ServiceSession
 
 S = TypeVar("S", bound=ServiceSession)
 
+_RECEIVED: Mapping[type[m.Message], Callable[[str, Any], ev.Event]] = {
+    m.GeometryDone: ev.GeometryDoneReceived,
+    m.ResetDone: ev.ResetDoneReceived,
+    m.Ready: ev.ReadyReceived,
+    m.Fault: ev.FaultReceived,
+}
+
 # Without a handler of the program, its warnings go to standard error.
 _log = logging.getLogger("caviar.session")
 
@@ -343,26 +350,18 @@ class EmbeddedRun:
         match message:
             case m.Done():
                 payloads = tuple(zip(parts[::2], parts[1::2], strict=True)) if self._encodes else tuple(parts)
-                event = ev.DoneReceived(name, message, payloads, self._refused(message))
-            case m.GeometryDone():
-                event = ev.GeometryDoneReceived(name, message)
-            case m.ResetDone():
-                event = ev.ResetDoneReceived(name, message)
+                new = message.geometry  # of a world that announces meshes
+                refused = None if new is None else self._meshes.refusals(new.assets)
+                event = ev.DoneReceived(name, message, payloads, refused)
+            case m.GeometryDone() | m.ResetDone() | m.Ready() | m.Fault():
+                event = _RECEIVED[type(message)](name, message)
             case m.AssetOffer():
                 event = ev.AssetsOffered(name, message.assets)
-            case m.Ready():
-                event = ev.ReadyReceived(name, message)
-            case m.Fault():
-                event = ev.FaultReceived(name, message)
             case m.Bye():
                 event = ev.ByeReceived(name, message.reason)
             case _:
                 raise RunError(f"{name!r} sent {message}, which a run in one process has no use for")
         self._events.append(event)
-
-    def _refused(self, message: m.Done) -> dict[str, str] | None:
-        """Why meshes that a world announces are none, by name; None where it announces none."""
-        return None if message.geometry is None else self._meshes.refusals(message.geometry.assets)
 
     def _skip_time(self) -> None:
         """No service has work left: move the clock to its next deadline."""
