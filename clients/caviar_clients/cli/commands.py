@@ -167,7 +167,7 @@ class _Alias(TyperOption):
 
     @property
     def help(self) -> str:  # type: ignore[override]
-        """What the attachment says of itself; its module is imported where that is shown."""
+        """First line of the attachment's docstring; its module is imported where that is shown."""
         from caviar_protocol.scenario.attachments import summary
 
         return summary(self.attachment)

@@ -282,7 +282,7 @@ def _remove(out: str) -> None:
 
 @dataclass
 class Pace:
-    """How fast episodes are played, and what time is left.
+    """Rate of episodes, and the time that is left.
 
     Example:
         >>> pace = Pace(episodes=6, began=100.0)

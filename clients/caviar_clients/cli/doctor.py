@@ -279,7 +279,7 @@ def _check(name: str, ok: bool, found: str, remedy: str) -> Check:
 
 
 def _requirements(extra: str) -> list[Requirement]:
-    """What an extra, or with ``""`` the base install, requires on this platform beside this distribution."""
+    """Requirements of an extra, or with ``""`` of the base install, on this platform."""
     try:
         lines = metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:
@@ -323,7 +323,7 @@ def _version(name: str) -> str | None:
 
 
 def _run(command: list[str], environment: Mapping[str, str]) -> tuple[bool, str]:
-    """Whether a command succeeded, and the first line that it printed, or why it failed."""
+    """Run a command: whether it succeeded, and the first line that it printed, or why it failed."""
     try:
         # Its own process: Dr.Jit with an LLVM that is too old aborts, and takes this one with it.
         done = subprocess.run(  # noqa: S603 - the commands are those above

@@ -384,7 +384,7 @@ class Launcher:
 
     @property
     def _log(self) -> Path:
-        """Where the broker prints."""
+        """File to which the broker prints."""
         return RunDirectory(self.directory).log("broker")
 
     def _broker_arguments(self) -> list[str]:
@@ -502,7 +502,7 @@ class Launcher:
     # --- another broker ----------------------------------------------------------------------------
 
     def _may_resume(self) -> bool:
-        """Whether a broker that died is followed by another: services may rejoin the run, the broker had
+        """Tell whether a broker that died is followed by another: services may rejoin the run, the broker had
         begun, and those before it finished frames."""
         waits = (self.scenario.timeouts.rejoin_s or 0.0) > 0.0
         return (

@@ -292,7 +292,7 @@ def _triangles(shapes: Sequence[SceneryShape]) -> Float64Array:
 
 
 def _area(channel: SionnaChannel, scene: Scene) -> Area:
-    """All of the scenery; without any, what is around devices and objects."""
+    """Area of the scenery; without any, that around devices and objects."""
     if channel.scene.has_scenery:
         low, high = channel.scene.low, channel.scene.high
     else:
@@ -384,7 +384,7 @@ _MOST_GIB = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """What is mapped, and how finely."""
+    """Subject of a map, and how fine it is."""
 
     metrics: tuple[str, ...] = ("gain",)
     """Keys of `METRICS`."""

@@ -174,7 +174,7 @@ def with_recording_checked(
 
 
 class RunOutcome(NamedTuple):
-    """How a run ended."""
+    """End of a run."""
 
     directory: Path
     status: int

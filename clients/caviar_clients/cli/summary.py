@@ -88,7 +88,7 @@ class OutageSummary(msgspec.Struct, kw_only=True):
 
 
 class SourceSummary(msgspec.Struct, kw_only=True):
-    """What became of one source's products of one topic."""
+    """Fate of one source's products of one topic."""
 
     topic: str
     source: str
@@ -100,7 +100,7 @@ class SourceSummary(msgspec.Struct, kw_only=True):
 
 
 class PacketSummary(msgspec.Struct, kw_only=True):
-    """What became of packets, over all frames and users."""
+    """Fate of packets, over all frames and users."""
 
     arrived: Annotated[int, quantity("bit", "came for users")]
     sent: Annotated[int, quantity("bit", "came through")]

@@ -35,15 +35,15 @@ from caviar_protocol.topics.link import Command
 
 
 class LinkResult(LinkFigures, Protocol):
-    """What environments say about a link: a `Link`, or one of many episodes."""
+    """Link that environments report: a `Link`, or one of many episodes."""
 
     @property
     def has_path(self) -> BoolArray:
-        """Whether each user has a path, Shape ``[..., U]`` as all below."""
+        """Mask of users with a path, Shape ``[..., U]`` as all below."""
 
     @property
     def los(self) -> BoolArray:
-        """Whether the line of sight is free."""
+        """Mask of users with a free line of sight."""
 
     @property
     def top_abs_y(self) -> Float64Array:
@@ -59,7 +59,7 @@ class LinkResult(LinkFigures, Protocol):
 
 
 def link_info(link: LinkResult) -> dict[str, NDArray[Any]]:
-    """What ``info`` has of a link, by name."""
+    """Collect the arrays of a link for ``info``, by name."""
     known = {
         "abs_y": link.abs_y,
         "best_abs_y": link.top_abs_y[..., 0],
@@ -193,7 +193,7 @@ Observation = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 
 class Moment(observations.Moment, frozen=True):
-    """What is known at a frame of a session."""
+    """Knowledge at a frame of a session."""
 
     frame: Frame
     link: Link | None
@@ -411,7 +411,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         return self._observation(now), reward, self._terminated(now), now.frame.final, info
 
     def _lateness(self, before: Frame, now: Frame) -> dict[str, Any]:
-        """Whether the decision for a frame came too late for it, and how many frames went on without any."""
+        """Lateness of the decision for a frame, and the number of frames that went on without any."""
         if self._broker is None:
             return {"late": False, "missed_frames": 0}  # the run waits
         missed = now.number - before.number - 1

@@ -110,7 +110,7 @@ class FlightEnv(SessionEnv[NDArray[np.float32]]):
         return sorted(choices, key=lambda choice: (choice.rx, choice.tx))
 
     def _position(self, moment: Moment) -> NDArray[np.float64]:
-        """Where the object is [m], Shape ``[3]``."""
+        """Position of the object [m], Shape ``[3]``."""
         position: NDArray[np.float64] = moment.scene.position[moment.scene.names.index(self.vehicle)]
         return position
 
@@ -148,7 +148,7 @@ _MARGIN = 0.01
 
 
 class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What each part of the reward counts, from 0 on."""
+    """Weights of the parts of the reward, from 0 on."""
 
     progress: float = 1.0
     radio: float = 1.0
@@ -525,7 +525,7 @@ class UavPathEnv(FlightEnv):
 
 
 def _is_number(value: object) -> bool:
-    """Whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
+    """Tell whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
 
 

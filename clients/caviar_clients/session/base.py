@@ -192,7 +192,7 @@ class OutsideAgent(Service[OutsideSettings]):
 
 
 def failure_of(error: SystemExit | KeyboardInterrupt) -> RuntimeError:
-    """What a service failed by, whose code would end the program of the run without a word.
+    """Make the failure of a service whose code would end the program of the run without a word.
 
     Args:
         error: That the service raised.

@@ -284,7 +284,7 @@ class _Ground:
         self._surfaces = Surfaces(triangles, lambda triangle, normal: True)
 
     def implausible(self, position: Float64Array) -> str:
-        """What is wrong with a position [m], Shape ``[3]``; empty: nothing."""
+        """Fault of a position [m], Shape ``[3]``; empty: none."""
         if (position[:2] < self._low[:2]).any() or (position[:2] > self._high[:2]).any():
             return f"outside the scenery, which reaches {_span(self._low, self._high)}"
         # Under the ground, and not under a roof or a bridge: something is above and nothing below.
@@ -316,7 +316,7 @@ def _span(low: Sequence[float] | Float64Array, high: Sequence[float] | Float64Ar
 
 
 def _meant(value_hz: float, low: float, high: float) -> str:
-    """What a frequency that is written in another unit may mean; empty where no unit makes it plausible."""
+    """Hint at a frequency that is written in another unit; empty where no unit makes it plausible."""
     for exponent, unit in ((9, "GHz"), (6, "MHz"), (3, "kHz")):
         if value_hz < _MOST_OF_A_UNIT and low <= value_hz * 10.0**exponent <= high:
             return f"; {value_hz:g} {unit} is written {value_hz:g}e{exponent}"

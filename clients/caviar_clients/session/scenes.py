@@ -107,7 +107,7 @@ def scene_at(path: Path, frame: int = 0, prepared: PreparedScenario | None = Non
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a run directory or a segment, and not a scenario."""
+    """Tell whether a path is a run directory or a segment, and not a scenario."""
     return path.is_dir() or path.suffix == ".mcap"
 
 
