@@ -525,7 +525,7 @@ class UavPathEnv(FlightEnv):
 
 
 def _is_number(value: object) -> bool:
-    """Tell whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
+    """Tell whether it is a finite number: NaN compares false with everything, and would pass a range."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
 
 

@@ -192,7 +192,7 @@ def module_folders(scenario: Scenario) -> tuple[Path, ...]:
 
 
 def names_class(spec: ServiceSpec) -> bool:
-    """Tell whether a service, or a rung of its settings, is named ``module:Class``: a run imports the module."""
+    """Tell whether a service, or a rung of its settings, is named ``module:Class``, which a run imports."""
     return any(":" in name for name in (spec.use, *_used_by(spec.settings)))
 
 
