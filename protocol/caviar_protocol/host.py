@@ -149,7 +149,7 @@ library, and a file ``signal.py`` there in its place."""
 
 @contextlib.contextmanager
 def loading() -> Iterator[None]:
-    """A block that loads libraries. Looking for garbage, which loading leaves none of, takes a tenth of it."""
+    """A block that loads libraries: looking for garbage, which that leaves none of, takes a tenth of it."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
