@@ -45,9 +45,15 @@ from caviar_services.channel.arrays.channel_matrices import (
     subarray_amplitudes,
     wideband_parts,
 )
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
+from caviar_services.channel.paths import (
+    Antenna,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_geometry,
+    stable_ids,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 
 Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 

@@ -24,8 +24,7 @@ from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
-from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.geometry import PathGeometry
+from caviar_services.channel.paths import Antenna, PathGeometry
 from caviar_services.channel.propagation.patterns import radiated_field
 
 Part = Literal["hf", "taps"]

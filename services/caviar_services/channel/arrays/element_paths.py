@@ -20,9 +20,9 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.clearance import CLEARANCE
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.image_method import image_points
+from caviar_space.obstacles import CLEARANCE
 
 
 class Bend(IntEnum):

@@ -21,11 +21,16 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, Interaction
 from caviar_services.channel.arrays.channel_matrices import Bins, Located
 from caviar_services.channel.arrays.element_visibility import elements
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.paths import (
+    Antenna,
+    Attenuation,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_geometry,
+    with_near_pairs,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 from caviar_services.channel.sionna.candidate_visibility import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table

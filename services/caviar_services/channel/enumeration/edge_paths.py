@@ -11,7 +11,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_paths import AT_END, OFF_SURFACE, in_front, reflection_points
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges
 from caviar_services.channel.sionna.candidate_visibility import Faces

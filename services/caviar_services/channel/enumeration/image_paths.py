@@ -17,8 +17,8 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.beam_ends import ChainPairs
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.fresnel import slab
-from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.sionna.candidate_visibility import Faces
 from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
 from caviar_services.channel.sionna.materials import DRAWN

@@ -27,8 +27,7 @@ from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Carrier, Scene
-from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.geometry import path_corners
+from caviar_services.channel.paths import Attenuation, path_corners
 from caviar_services.channel.sionna.materials import ObjectMaterials
 from caviar_space.meshes import Mesh, placed, unit_box
 from caviar_space.vectors import ranges

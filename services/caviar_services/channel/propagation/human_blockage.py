@@ -30,8 +30,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, UInt8Array, quantity
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.topics import Carrier, Interaction, Scene
-from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.geometry import path_corners
+from caviar_services.channel.paths import Attenuation, path_corners
 
 # A leg whose horizontal part is shorter [m] is vertical: no screen stands across it.
 _VERTICAL_M = 1e-9

@@ -41,8 +41,8 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.fresnel import Media, Wall
-from caviar_services.channel.propagation.geometry import Rows
 from caviar_space.vectors import unit
 
 IN_PLANE = 1e-8

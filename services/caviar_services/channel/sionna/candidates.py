@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidate_visibility import Planes
 from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, DrawnPoints, Scattered, scattered_of
 from caviar_services.channel.sionna.ray_launcher import (

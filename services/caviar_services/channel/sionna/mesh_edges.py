@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Rows
 from caviar_space.vectors import ranges
 
 # [rad]; faces that deviate less from one plane are one, as in `planes`.

@@ -11,9 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.propagation.clearance import spread_anew, with_direct
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Antenna, PathTable, Rows, spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.propagation.utd import (

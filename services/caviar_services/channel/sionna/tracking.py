@@ -18,7 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidates import (
     MANY_RAYS,
     Candidates,

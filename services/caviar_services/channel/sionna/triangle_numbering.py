@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
 from caviar_services.channel.sionna.scene_loading import Shape
 from caviar_space.meshes import Mesh
+from caviar_space.obstacles import Surfaces
 from caviar_space.planes import (
     PlaneTable,
     plane_numbers,

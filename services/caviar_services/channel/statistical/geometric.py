@@ -61,7 +61,6 @@ from caviar_services.channel.arrays.channel_matrices import (
 )
 from caviar_services.channel.base import ChannelModel, Modelled
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.clearance import Boxes
 from caviar_services.channel.statistical.batch import GeometricBatch
 from caviar_services.channel.statistical.waves import (
     BLOCK,
@@ -80,6 +79,7 @@ from caviar_services.channel.statistical.waves import (
     velocity,
 )
 from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_space.obstacles import Boxes
 
 KEPT = 4096
 """Pairs whose draws are kept at most."""
