@@ -33,7 +33,7 @@ from msgspec.structs import replace
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
-from caviar_services.channel.adaptive.settings import Rung
+from caviar_services.channel.adaptive.controller import Rung
 from caviar_services.channel.base import Modelled
 
 SHARE = 0.9

@@ -31,14 +31,19 @@ from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
 from caviar_services.channel.adaptive.controller import (
+    AdaptiveSettings,
     Choice,
     Controller,
     ControllerState,
     CostModel,
     CostState,
+    Rung,
     Workload,
+    built,
+    models,
+    naming,
+    rung_of,
 )
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, naming, rung_of
 from caviar_services.channel.assemble import outage_counts
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna.scene import shared_scenes

@@ -20,7 +20,7 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, Interaction
 from caviar_services.channel.arrays.channel_matrices import Bins, Located
-from caviar_services.channel.arrays.element_visibility import elements
+from caviar_services.channel.arrays.element_paths import elements
 from caviar_services.channel.paths import (
     Antenna,
     Attenuation,
@@ -31,7 +31,7 @@ from caviar_services.channel.paths import (
     with_near_pairs,
 )
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table
 from caviar_services.channel.sionna.scene import SionnaScene

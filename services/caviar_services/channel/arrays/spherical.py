@@ -23,8 +23,17 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier
 from caviar_services.channel.arrays.channel_matrices import Bins, Blocks, Located, joined
-from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
-from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
+from caviar_services.channel.arrays.element_paths import (
+    Bend,
+    ElementPaths,
+    Elements,
+    Lengths,
+    Look,
+    Surfaces,
+    Visibility,
+    elements,
+    visibility,
+)
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import (
     ElementPattern,

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.beam_ends import SceneryViews, shown_scenery
 from caviar_services.channel.enumeration.image_beams import (
     ImageBeams,
+    SceneryViews,
     Targets,
     by_scenery,
     columns,
@@ -40,6 +40,7 @@ from caviar_services.channel.enumeration.image_beams import (
     places,
     reflected_beams,
     scenery_beams,
+    shown_scenery,
 )
 from caviar_services.channel.enumeration.scene_faces import FaceRectangles
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.sionna.candidate_visibility import Faces
+from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.meshes import Mesh
 from caviar_space.planes import two_sided_planes

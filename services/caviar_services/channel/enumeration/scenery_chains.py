@@ -39,8 +39,7 @@ from caviar_services.channel.enumeration.scene_faces import (
     seen_planes,
     visible_pairs,
 )
-from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.candidates import chains_of
+from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed

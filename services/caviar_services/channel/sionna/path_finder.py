@@ -19,7 +19,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.arrays.element_visibility import outermost
+from caviar_services.channel.arrays.element_paths import outermost
 from caviar_services.channel.enumeration.enumerated_paths import EnumeratedTracer
 from caviar_services.channel.enumeration.scenery_chains import (
     ChainCache,
@@ -28,7 +28,7 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryLaunch,
 )
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
 from caviar_services.channel.sionna.diffuse_paths import Element
 from caviar_services.channel.sionna.path_solver import Tracer

@@ -20,15 +20,19 @@ from caviar_protocol.arrays import (
     Int64Array,
 )
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.arrays.element_visibility import Look
+from caviar_services.channel.arrays.element_paths import Look
 from caviar_services.channel.propagation.image_method import image_points, refined_points
-from caviar_services.channel.sionna.candidate_visibility import Corners, Faces, Planes, at_corners, reflected
 from caviar_services.channel.sionna.candidates import (
     MANY_RAYS,
     Candidates,
+    Corners,
+    Faces,
     Met,
     Offer,
+    Planes,
+    at_corners,
     met_by,
+    reflected,
     united,
 )
 from caviar_services.channel.sionna.diffracting_edges import edge_generator

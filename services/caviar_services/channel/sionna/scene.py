@@ -34,7 +34,7 @@ from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.fresnel import EPSILON_0, Media
-from caviar_services.channel.sionna.body_pool import BodyPool, own_materials
+from caviar_services.channel.sionna.coplanar_faces import closed_walls, coinciding_materials
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
@@ -49,6 +49,7 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.channel.sionna.scene_loading import (
+    BodyPool,
     ObjectMaterial,
     Shape,
     bounds,
@@ -61,12 +62,12 @@ from caviar_services.channel.sionna.scene_loading import (
     near_middle,
     new_scene,
     object_materials,
+    own_materials,
     set_materials,
     with_detail,
 )
-from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
-from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
-from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
+from caviar_space.meshes import Body, Mesh, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.

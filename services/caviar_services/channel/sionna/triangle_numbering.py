@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
 from caviar_services.channel.sionna.scene_loading import Shape
-from caviar_space.meshes import Mesh
+from caviar_space.meshes import Body, Mesh
 from caviar_space.obstacles import Surfaces
 from caviar_space.planes import (
     PlaneTable,
@@ -26,9 +26,6 @@ from caviar_space.planes import (
     shared_planes,
     two_sided_planes,
 )
-
-Body = tuple[str, int]
-"""Asset and slot of a body in the pool."""
 
 SurfaceNames = tuple[tuple[str, int], ...]
 """Objects, and planes of each, that surfaces of several objects are known by."""
