@@ -42,7 +42,7 @@ from caviar_services.channel.enumeration.image_beams import (
     scenery_beams,
     shown_scenery,
 )
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.vectors import ranges

@@ -20,15 +20,14 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_beams import ChainPairs
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.paths import Rows
-from caviar_services.channel.propagation.fresnel import slab
 from caviar_services.channel.propagation.image_method import keller_point
-from caviar_services.channel.propagation.utd import beyond_edges
+from caviar_services.channel.propagation.utd import beyond_edges, slab
 from caviar_services.channel.sionna.candidates import Faces
-from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
 from caviar_services.channel.sionna.materials import DRAWN
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_services.channel.sionna.triangle_numbering import COPLANAR, COPLANAR_RELATIVE
 from caviar_space.planes import PlaneTable
 
 OFF_SURFACE = 2e-4

@@ -25,8 +25,9 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, quantity
 from caviar_protocol.errors import AssetError, suggestion
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.space.scene import object_pose
-from caviar_protocol.topics import Carrier, Scene
+from caviar_protocol.topics import Carrier, Interaction, Scene
 from caviar_services.channel.paths import Attenuation, path_corners
 from caviar_services.channel.sionna.materials import ObjectMaterials
 from caviar_space.meshes import Mesh, placed, unit_box
@@ -459,3 +460,214 @@ def _on_carrier(settings: FoliageSettings, carrier: Carrier, place: Place) -> tu
     if carrier.name in settings.maximum_db:
         return gamma, settings.maximum_db[carrier.name], f"{_SOURCE}, {settings.source}"
     return gamma, most, _SOURCE
+
+
+# A leg whose horizontal part is shorter [m] is vertical: no screen stands across it.
+_VERTICAL_M = 1e-9
+
+
+class HumanBlockageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which objects are screens, and of what size.
+
+    Example:
+        >>> HumanBlockageSettings(width_m=0.3, height_m=1.7).classes  # the size of TR 38.901
+        ('pedestrian',)
+    """
+
+    classes: tuple[str, ...] = ("pedestrian",)
+    """Classes of objects that are screens; each has to stand in ``without_body``, too."""
+    width_m: Annotated[float, quantity("m", "of each screen", gt=0)] | None = None
+    """Absent: as wide as the object looks from the path. TR 38.901, table 7.6.4.2-5, has 0.3 m."""
+    height_m: Annotated[float, quantity("m", "of each screen, from the object's feet", gt=0)] | None = None
+    """Absent: that of the object. TR 38.901 has 1.7 m."""
+
+
+def check_screens(
+    settings: HumanBlockageSettings, others: Mapping[str, Collection[str]], without_body: Collection[str]
+) -> None:
+    """Refuse classes that would block twice, or in two ways.
+
+    Args:
+        settings: Of the screens.
+        others: Settings of the channel that say something else of objects, with their keys.
+        without_body: Classes through whose bodies waves pass.
+
+    Raises:
+        ValueError: Names the class and the remedy.
+    """
+    for name in settings.classes:
+        if name not in without_body:
+            raise ValueError(
+                f"human_blockage makes screens of the class {name!r}, whose traced bodies would block the "
+                f"same paths again; write without_body = [{name!r}], or leave human_blockage out"
+            )
+        for setting, keys in others.items():
+            if name in keys:
+                raise ValueError(
+                    f"{name!r} is a screen of human_blockage and stands in {setting}, too; leave it out of "
+                    "one of them"
+                )
+
+
+class HumanBlockage(Attenuation):
+    """What the people of a frame take from paths.
+
+    Args:
+        settings: Of the screens.
+        carriers: Of the run.
+
+    Example:
+        >>> model = HumanBlockage(HumanBlockageSettings(), (Carrier(name="c", frequency_hz=28e9),))
+        >>> model.put(np.array([[5.0, 0.0, 0.0]]), np.array([[0.3, 0.5, 1.7]]), np.array([0.0]))
+        >>> start, end = np.array([[0.0, 0.0, 1.5]]), np.array([[10.0, 0.0, 1.5]])
+        >>> factor = model.amplitude_factor(start, np.zeros((1, 0, 3)), end, np.zeros((1, 0), np.uint8))
+        >>> (-20 * np.log10(factor)).round(1).tolist()
+        [[9.9]]
+    """
+
+    def __init__(self, settings: HumanBlockageSettings, carriers: Sequence[Carrier]) -> None:
+        self._settings = settings
+        self._wavelengths = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in carriers])
+        self.put(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        size = " x ".join(
+            "as the object" if value is None else f"{value:g} m"
+            for value in (settings.width_m, settings.height_m)
+        )
+        self.briefs = tuple(f"{name}: screens of TR 38.901 model B, {size}" for name in settings.classes)
+        """What products state of it, class by class."""
+
+    def move(self, scene: Scene) -> None:
+        """Put the screens where the people of a scene are.
+
+        Args:
+            scene: Of the frame.
+        """
+        rows = [i for i, cls in enumerate(scene.classes) if cls in self._settings.classes]
+        size = scene.dimensions[rows].reshape(-1, 3)
+        feet = scene.position[rows].reshape(-1, 3) - np.array([0.0, 0.0, 0.5]) * size
+        axes = np.array([rotation_matrix(scene.orientation[i].tolist())[:, 0] for i in rows]).reshape(-1, 3)
+        self.put(feet, size, np.arctan2(axes[:, 1], axes[:, 0]))
+
+    def put(self, feet: Float64Array, size: Float64Array, yaw: Float64Array) -> None:
+        """Put K screens.
+
+        Args:
+            feet: Middle of the lower edge [m], Shape ``[K, 3]``.
+            size: Length, width and height of the people [m], Shape ``[K, 3]``.
+            yaw: Where they face [rad], Shape ``[K]``.
+        """
+        self._feet, self._size, self._yaw = feet, size, yaw
+
+    def amplitude_factor(
+        self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
+    ) -> Float64Array:
+        """Factors by screens, 10^(−L/20), Shape ``[C, P]``; see `Attenuation`."""
+        corners = path_corners(start, points, end, (types != 0).sum(1))
+        factor = np.ones((len(self._wavelengths), len(corners)))
+        if not len(self._feet) or not len(corners):
+            return factor
+        before, after = _unfolded(corners, types)
+        for leg in range(corners.shape[1] - 1):
+            ends = corners[:, leg], corners[:, leg + 1]
+            line = ends[1] - ends[0]
+            length = np.sqrt((line**2).sum(1))
+            # Unused legs have no length, vertical ones no side.
+            there = np.flatnonzero(np.hypot(line[:, 0], line[:, 1]) > _VERTICAL_M)
+            along = line[there] / length[there, None]
+            image = ends[0][there] - before[there, leg, None] * along
+            whole = before[there, leg] + length[there] + after[there, leg]
+            for screen in range(len(self._feet)):
+                reach = before[there, leg], before[there, leg] + length[there]
+                factor[:, there] *= self._leg_factor(screen, image, along, whole, reach)
+        return factor
+
+    def _leg_factor(
+        self,
+        screen: int,
+        start: Float64Array,
+        along: Float64Array,
+        whole: Float64Array,
+        reach: tuple[Float64Array, Float64Array],
+    ) -> Float64Array:
+        """Factors of one screen for straight waves, Shape ``[C, L]``.
+
+        Args:
+            screen: Its number.
+            start: Where each wave comes from [m], Shape ``[L, 3]``.
+            along: Unit vector of each, Shape ``[L, 3]``.
+            whole: Length of each [m], Shape ``[L]``.
+            reach: Lengths at which the leg begins and ends, on which a screen counts.
+        """
+        level = np.hypot(along[:, 0], along[:, 1])
+        side = along[:, :2] / level[:, None]
+        to = self._feet[screen] - start
+        # In the top view: how far along the wave the screen stands, and how far to its left.
+        at = to[:, 0] * side[:, 0] + to[:, 1] * side[:, 1]
+        left = to[:, 1] * side[:, 0] - to[:, 0] * side[:, 1]
+        counts = (at > reach[0] * level) & (at < reach[1] * level)
+        width, height = self._seen(screen, side)
+        far = whole * level
+        top = _edges((at, left - width / 2), (at, left + width / 2), (far, np.zeros_like(far)))
+        rise = whole * along[:, 2]
+        upright = _edges((at, to[:, 2]), (at, to[:, 2] + height), (far, rise))
+        k = np.pi / self._wavelengths[:, None]
+        passed: Float64Array = 1.0 - _knife(k, *upright) * _knife(k, *top)
+        return np.where(counts, passed, 1.0)
+
+    def _seen(self, screen: int, side: Float64Array) -> tuple[Float64Array | float, float]:
+        """Width, Shape ``[L]``, and height [m] of a screen across these horizontal directions."""
+        length, width, height = self._size[screen]
+        if self._settings.height_m is not None:
+            height = self._settings.height_m
+        if self._settings.width_m is not None:
+            return self._settings.width_m, height
+        c, s = np.cos(self._yaw[screen]), np.sin(self._yaw[screen])
+        forward, across = side[:, 0] * c + side[:, 1] * s, side[:, 1] * c - side[:, 0] * s
+        # The silhouette of an ellipse with these axes, seen along the direction.
+        return np.hypot(width * forward, length * across), height
+
+
+def _unfolded(corners: Float64Array, types: UInt8Array) -> tuple[Float64Array, Float64Array]:
+    """Lengths of the wave before and after each leg [m], Shape ``[P, D + 1]`` each: over reflections and
+    transmissions, up to where it is diffracted or scattered."""
+    lengths = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1))
+    passes = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
+    before, after = np.zeros_like(lengths), np.zeros_like(lengths)
+    for leg in range(1, lengths.shape[1]):
+        before[:, leg] = np.where(passes[:, leg - 1], before[:, leg - 1] + lengths[:, leg - 1], 0.0)
+    for leg in range(lengths.shape[1] - 2, -1, -1):
+        after[:, leg] = np.where(passes[:, leg], after[:, leg + 1] + lengths[:, leg + 1], 0.0)
+    return before, after
+
+
+_Point = tuple[Float64Array, Float64Array]
+
+
+def _edges(one: _Point, other: _Point, end: _Point) -> tuple[Float64Array, Float64Array]:
+    """Detours D1 + D2 − r [m] over two edges in a view, negative for an edge that counts as −.
+
+    Args:
+        one, other: Coordinates of the edges as seen from the start, one below the other.
+        end: That of the end.
+    """
+    r = np.hypot(*end)
+    detours = [np.hypot(*p) + np.hypot(end[0] - p[0], end[1] - p[1]) - r for p in (one, other)]
+    # Rounding: on the line itself the detour is 0.
+    first, second = (np.maximum(detour, 0.0) for detour in detours)
+    height = end[1] / end[0] * one[0]
+    blocks = (one[1] <= height) & (height <= other[1])
+    nearer = first <= second
+    return (
+        np.where(blocks | ~nearer, first, -first),
+        np.where(blocks | nearer, second, -second),
+    )
+
+
+def _knife(k: Float64Array, first: Float64Array, second: Float64Array) -> Float64Array:
+    """F of two edges, added; detours as of `_edges`, k = π/λ [1/m], Shape ``[C, 1]``."""
+    one, other = (
+        np.sign(detour) * np.arctan(np.pi / 2 * np.sqrt(k * np.abs(detour))) / np.pi
+        for detour in (first, second)
+    )
+    found: Float64Array = one + other
+    return found

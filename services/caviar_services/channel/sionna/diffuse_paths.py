@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.fresnel import EPSILON_0
 from caviar_services.channel.propagation.patterns import FormulaPattern
+from caviar_services.channel.propagation.utd import EPSILON_0
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,

@@ -16,7 +16,7 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_services.channel.propagation.fresnel import EPSILON_0
+from caviar_services.channel.propagation.utd import EPSILON_0
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""

@@ -33,8 +33,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.fresnel import EPSILON_0, Media
-from caviar_services.channel.sionna.coplanar_faces import closed_walls, coinciding_materials
+from caviar_services.channel.propagation.utd import EPSILON_0, Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
@@ -66,7 +65,11 @@ from caviar_services.channel.sionna.scene_loading import (
     set_materials,
     with_detail,
 )
-from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
+from caviar_services.channel.sionna.triangle_numbering import (
+    NumberedTriangles,
+    closed_walls,
+    coinciding_materials,
+)
 from caviar_space.meshes import Body, Mesh, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 

@@ -23,9 +23,8 @@ from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
-from caviar_services.channel.propagation.foliage import FoliageSettings
-from caviar_services.channel.propagation.fresnel import slab
-from caviar_services.channel.propagation.human_blockage import HumanBlockageSettings, check_screens
+from caviar_services.channel.propagation.foliage import FoliageSettings, HumanBlockageSettings, check_screens
+from caviar_services.channel.propagation.utd import slab
 from caviar_services.channel.sionna.materials import (
     DRAWN,
     OTHER_MATERIALS,
