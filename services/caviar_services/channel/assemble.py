@@ -15,12 +15,7 @@ from typing import Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Complex128Array,
-    Float64Array,
-    Int64Array,
-)
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, suggestion
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.space.scene import device_pose

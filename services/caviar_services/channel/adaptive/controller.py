@@ -74,8 +74,7 @@ class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     margin: Annotated[float, quantity("1", "of that which is spare before going up", ge=0, lt=1)] = 0.1
     patience: Annotated[int, quantity("frame", "that must have it in a row", ge=1)] = 10
     calibrate_every: Annotated[
-        int,
-        quantity("frame", "from one that the reference computes too to the next; 0: none", ge=0),
+        int, quantity("frame", "from one that the reference computes too to the next; 0: none", ge=0)
     ] = 0
     reference: LadderRung | None = None
     """The channel that counts as exact where errors are measured: more accurate than any rung, and too slow

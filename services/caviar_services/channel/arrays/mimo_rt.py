@@ -150,12 +150,7 @@ class ElementTracer:
         return table if self._los else table.take((table.types != 0).any(1))
 
     def _amplitudes(
-        self,
-        carrier: int,
-        wavelength: float,
-        table: PathTable,
-        source: Antenna,
-        targets: Sequence[Antenna],
+        self, carrier: int, wavelength: float, table: PathTable, source: Antenna, targets: Sequence[Antenna]
     ) -> tuple[Complex128Array, PathGeometry]:
         """Amplitudes with the phase of lengths in float64, Shape ``[P]``, and the geometry of the paths."""
         ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]

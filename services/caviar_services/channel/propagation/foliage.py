@@ -657,10 +657,7 @@ def _edges(one: _Point, other: _Point, end: _Point) -> tuple[Float64Array, Float
     height = end[1] / end[0] * one[0]
     blocks = (one[1] <= height) & (height <= other[1])
     nearer = first <= second
-    return (
-        np.where(blocks | ~nearer, first, -first),
-        np.where(blocks | nearer, second, -second),
-    )
+    return (np.where(blocks | ~nearer, first, -first), np.where(blocks | nearer, second, -second))
 
 
 def _knife(k: Float64Array, first: Float64Array, second: Float64Array) -> Float64Array:

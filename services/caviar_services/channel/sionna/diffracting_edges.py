@@ -320,12 +320,7 @@ def _runs(pieces: _Pieces, at: Float64Array, face_of_side: Int64Array) -> Int64A
 
 
 def _joined(
-    pieces: _Pieces,
-    run: Int64Array,
-    sides: _Sides,
-    at: Int64Array,
-    vertices: Float64Array,
-    faces: Int64Array,
+    pieces: _Pieces, run: Int64Array, sides: _Sides, at: Int64Array, vertices: Float64Array, faces: Int64Array
 ) -> MeshEdges:
     """Edges of pieces, in the order of their triangles."""
     count = int(run.max(initial=-1)) + 1

@@ -27,13 +27,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
 from caviar_services.channel.propagation.utd import EPSILON_0
-from caviar_services.channel.sionna.ray_launcher import (
-    REFLECTED,
-    REFRACTED,
-    SCATTERED,
-    Bounce,
-    Launch,
-)
+from caviar_services.channel.sionna.ray_launcher import REFLECTED, REFRACTED, SCATTERED, Bounce, Launch
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
 
 # What a factor of a weight is at least: factors leave out polarisation and the thickness of walls, and a

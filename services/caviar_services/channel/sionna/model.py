@@ -425,12 +425,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return split
 
     def _power(
-        self,
-        pair: Int64Array,
-        traced: Traced,
-        antennas: Ends,
-        pairs: int,
-        weight: Float64Array | float = 1.0,
+        self, pair: Int64Array, traced: Traced, antennas: Ends, pairs: int, weight: Float64Array | float = 1.0
     ) -> Float64Array:
         """Weighted power of paths between each pair, with what foliage and people leave of them."""
         transfer = traced.transfer

@@ -14,11 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Float64Array,
-    Int64Array,
-)
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Look
 from caviar_services.channel.propagation.image_method import image_points, refined_points
@@ -37,14 +33,7 @@ from caviar_services.channel.sionna.candidates import (
 )
 from caviar_services.channel.sionna.diffracting_edges import edge_generator
 from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, Element, Thinning
-from caviar_services.channel.sionna.path_table import (
-    Traced,
-    edge_numbers,
-    geometry,
-    joined,
-    nothing,
-    read,
-)
+from caviar_services.channel.sionna.path_table import Traced, edge_numbers, geometry, joined, nothing, read
 from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState

@@ -132,13 +132,7 @@ def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Ar
     )
 
 
-def read(
-    buffer: Any,
-    carriers: int,
-    transmitter: Float64Array,
-    receivers: Float64Array,
-    lost: int,
-) -> Traced:
+def read(buffer: Any, carriers: int, transmitter: Float64Array, receivers: Float64Array, lost: int) -> Traced:
     """Read the paths of a solver's buffer.
 
     Args:
@@ -331,11 +325,7 @@ def _diffract_anew(
 
 
 def _with_sights(
-    table: PathTable,
-    scene: SionnaScene,
-    sights: Mapping[int, Sight],
-    antennas: Ends,
-    traced_from: Ends,
+    table: PathTable, scene: SionnaScene, sights: Mapping[int, Sight], antennas: Ends, traced_from: Ends
 ) -> PathTable:
     """The table with those lines of sight that are lit, if nothing else is in their way, and no others."""
     dark = np.array([pair for pair, sight in sights.items() if not sight.lit], np.int64)

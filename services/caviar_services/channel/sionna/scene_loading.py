@@ -378,10 +378,7 @@ def with_detail(
     pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
     kept, effect = detailed(pieces, detail)
     if pieces and not kept:
-        raise ScenarioError(
-            f"{detail} leaves out all of the scenery; leave out less",
-            key=key,
-        )
+        raise ScenarioError(f"{detail} leaves out all of the scenery; leave out less", key=key)
     left = dict(kept)
     return [
         Shape(shape.id, shape.material, names, [left[name] for name in names])
