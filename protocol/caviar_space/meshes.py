@@ -180,7 +180,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def contains(mesh: Mesh, point: Float64Array) -> bool:
-    """Whether a point lies inside a closed mesh; undecided on its surface.
+    """Test whether a point lies inside a closed mesh; undecided on its surface.
 
     Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
     triangle", 1983): ±4π inside, 0 outside.

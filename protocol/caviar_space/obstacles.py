@@ -287,7 +287,7 @@ class Boxes:
         return cls(scene.names, scene.position, rotation, scene.dimensions / 2)
 
     def block(self, start: Float64Array, end: Float64Array) -> BoolArray:
-        """Whether each segment passes through each box; Shapes ``[Q, 3]``, ``[Q, 3]`` to ``[Q, N]``.
+        """Test whether each segment passes through each box; Shapes ``[Q, 3]``, ``[Q, 3]`` to ``[Q, N]``.
 
         A segment that only touches a face or an edge is not blocked. By slabs (Kay and Kajiya 1986).
 
@@ -372,7 +372,7 @@ class Surfaces:
         return position
 
     def between(self, start: Float64Array, end: Float64Array) -> bool:
-        """Whether a triangle stands on the segment between two points [m], its ends left out.
+        """Test whether a triangle stands on the segment between two points [m], its ends left out.
 
         Example:
             >>> wall = np.array([[[5.0, -9.0, 0.0], [5.0, 9.0, 0.0], [5.0, 0.0, 9.0]]])
@@ -410,7 +410,7 @@ class Surfaces:
             yield near[_met(self._triangles[near], position, direction)]
 
     def encloses(self, position: Float64Array) -> bool:
-        """Whether a point [m], Shape ``[3]``, is inside of closed surfaces, which may lack a floor.
+        """Test whether a point [m], Shape ``[3]``, is inside of closed surfaces, which may lack a floor.
 
         All rising rays but one cross them an odd number of times then.
         """
@@ -457,7 +457,7 @@ def _met(triangles: Float64Array, origin: Float64Array, direction: Float64Array)
 
 
 def _covers(corners: Float64Array, normal: Float64Array, foot: Float64Array) -> bool:
-    """Whether a point of its plane lies within a triangle."""
+    """Test whether a point of its plane lies within a triangle."""
     for i in range(3):
         edge = corners[(i + 1) % 3] - corners[i]
         length = float(np.linalg.norm(edge))

@@ -55,7 +55,7 @@ Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 
 @dataclass(frozen=True, kw_only=True)
 class Product:
-    """What a product says about itself beside its paths."""
+    """Header of a product: all that it says about itself beside its paths."""
 
     rung: str
     options: ChannelOptions
@@ -369,7 +369,7 @@ def restricted(
 
 
 class Surroundings(Protocol):
-    """What a channel model knows about places; in the state of the last frame."""
+    """Knowledge of a channel model about places, in the state of the last frame."""
 
     @property
     def extent(self) -> tuple[Float64Array, Float64Array] | None:
@@ -444,7 +444,7 @@ class _Ends:
         return {name: around for name, around in sorted(self._around.items()) if around}
 
     def cause(self, t: int, r: int) -> Cause:
-        """Why a pair has no path."""
+        """Cause for which a pair has no path."""
         channel = self._channel
         names = channel.tx[t], channel.rx[r]
         start, end = (self._position(name) for name in names)
@@ -469,7 +469,7 @@ class _Ends:
         return self._around[name]
 
     def _is_beside(self, position: Float64Array) -> bool:
-        """Whether a place is beside the scenery or below it; above it, the sky goes on."""
+        """Test whether a place is beside the scenery or below it; above it, the sky goes on."""
         if self._surroundings.extent is None:
             return False
         low, high = self._surroundings.extent

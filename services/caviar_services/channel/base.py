@@ -61,7 +61,7 @@ S = TypeVar("S", bound=ChannelSettings)
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What the `PathModel.paths` of a model found in a frame."""
+    """Paths of a frame, with counts, as `PathModel.paths` returns them."""
 
     table: PathTable
     """Paths of all pairs, in any order."""
@@ -78,7 +78,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class Modelled:
-    """What the `ChannelModel.model` of a model made of a frame."""
+    """Channel of a frame, with counts and durations, as `ChannelModel.model` returns it."""
 
     channel: Channel
     counts: dict[str, int] = field(default_factory=dict)
@@ -143,13 +143,13 @@ class ChannelModel(Service[S]):
 
     @property
     def needs_assets(self) -> bool:
-        """Whether files are read in `prepare`: scenery, meshes of objects, or pattern files of antennas."""
+        """True if files are read in `prepare`: scenery, meshes of objects, or pattern files of antennas."""
         arrays = [spec.array for spec in self.run.devices if spec.array is not None]
         return self.uses_scenery or any(array.pattern_file for array in arrays)
 
     @property
     def options(self) -> ChannelOptions:
-        """What the products model, beside absorption."""
+        """Options that the products model, beside absorption."""
         return ChannelOptions()
 
     @cached_property
@@ -179,7 +179,7 @@ class ChannelModel(Service[S]):
 
     @property
     def room(self) -> Mapping[str, int]:
-        """How many objects of each mesh a scene may have, by asset, ``""`` for those without one; known once
+        """Limit of objects of each mesh in a scene, by asset, ``""`` for those without one; known once
         `load` is through. Empty: objects are no obstacles to the model."""
         return {}
 
@@ -425,7 +425,7 @@ class SceneAt(NamedTuple):
 
 
 class MemberSeed(NamedTuple):
-    """What random numbers of a member's episode depend on (contract, clause 19)."""
+    """Seed and number of a member's episode, on which its random numbers depend (contract, clause 19)."""
 
     seed: int
     seed_episode: int
@@ -452,7 +452,7 @@ class ChannelBatch(ABC):
 
     @abstractmethod
     def reach(self, number: int) -> int:
-        """How many frames can be computed together from a frame on."""
+        """Number of frames that can be computed together from a frame on."""
 
     @abstractmethod
     def width(self, members: int) -> int:

@@ -274,7 +274,7 @@ def antenna_fields(
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """How K named objects turn."""
+    """Turning of K named objects."""
 
     centre: Float64Array
     """What they turn about [m], Shape ``[K, 3]``."""
@@ -282,7 +282,7 @@ class Turning:
     """In world axes [rad/s], Shape ``[K, 3]``."""
 
     def take(self, which: Sequence[int]) -> Turning:
-        """Those of some objects, in this order.
+        """Turning of some objects, in this order.
 
         Args:
             which: Numbers of objects.

@@ -138,7 +138,7 @@ _ALL_EDGES = "edges_within_m is left out: in maps all edges diffract"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadioMap:
-    """What T transmitters bring to a surface."""
+    """Radio map: power of T transmitters on a surface."""
 
     surface: MeasurementSurface
     names: tuple[str, ...]
@@ -527,7 +527,7 @@ class MeasurementSurface:
 
     @property
     def is_level(self) -> bool:
-        """Whether it is a horizontal plane without a gap."""
+        """True for a horizontal plane without a gap."""
         return bool((self.z == self.z[0, 0]).all())
 
     @property
@@ -565,7 +565,7 @@ PartDone = Callable[[int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Shooting:
-    """What rays do, and how many there are."""
+    """Options of a radio map's rays, and their number."""
 
     samples: int
     """Rays of a transmitter; rounded up to whole parts."""
@@ -770,7 +770,7 @@ def _solver(
             diffracted_paths: bool, solid_angle: Any = None, tx_positions: Any = None, wedges: Any = None,
             diff_point: Any = None, wedges_samples_cnt: Any = None, diffraction_angular_measure: Any = None,
         ) -> None:  # fmt: skip
-            """What `RadioMap.add_paths` does, for every beam."""
+            """Add up rays as `RadioMap.add_paths` does, for every beam."""
             # Width of the tube of a ray on the surface: of a diffracted one along the edge, else of its solid
             # angle.
             if diffracted_paths:
@@ -836,7 +836,7 @@ def _solver(
 
 @dataclass(frozen=True, kw_only=True)
 class _Geometry:
-    """How a surface is given to the ray tracer's solver."""
+    """Surface in the form that the ray tracer's solver takes."""
 
     map_class: Any
     """The `sionna.rt.RadioMap` of such surfaces."""

@@ -82,7 +82,7 @@ class AdaptiveSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the rungs, lowest first."""
+        """Labels of the rungs, lowest first."""
         return tuple(rung.label for rung in self.ladder)
 
 
@@ -125,7 +125,7 @@ def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
 
 
 def _places(settings: AdaptiveSettings, place: Place) -> list[Place]:
-    """Where each of the rungs, and the reference where it is none, stands."""
+    """Places of the rungs in the scenario, and of the reference where it is none."""
     places = [place.at("ladder").at(index) for index in range(len(settings.ladder))]
     return places if settings.reference is None else [*places, place.at("reference")]
 

@@ -35,7 +35,7 @@ from caviar_space.obstacles import CLEARANCE
 
 
 class Bend(IntEnum):
-    """What fixes the points of a path beside planes."""
+    """Kind of point that bends a path, beside planes."""
 
     NONE = 0
     EDGE = 1
@@ -44,7 +44,7 @@ class Bend(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Surfaces(Rows):
-    """What P paths of at most D interactions meet."""
+    """Surfaces that P paths of at most D interactions meet."""
 
     types: UInt8Array
     """`Interaction` at each point, Shape ``[P, D]``."""
@@ -66,7 +66,7 @@ class Surfaces(Rows):
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
-    """Of P paths between M receiving and N transmitting elements."""
+    """Lengths of P paths between M receiving and N transmitting elements."""
 
     length: Float64Array
     """[m], Shape ``[P, M, N]``."""
@@ -475,7 +475,7 @@ class _Test:
     look: Look
 
     def arrays(self, path: int) -> tuple[AntennaArray, AntennaArray]:
-        """Of the receiver and of the transmitter of a path."""
+        """Arrays of the receiver and of the transmitter of a path."""
         return self.receive.arrays[self.receiver[path]], self.transmit.arrays[self.transmitter[path]]
 
     def pairs(self, paths: Int64Array, receive: AntennaArray, transmit: AntennaArray) -> BoolArray:
@@ -507,14 +507,14 @@ class _Test:
         return found.reshape(len(paths), receive.size, transmit.size)
 
     def _at(self, paths: Int64Array, sizes: tuple[int, ...], index: list[Int64Array]) -> BoolArray:
-        """Whether paths exist for pairs by path, column and row at RX, and column and row at TX."""
+        """Mask of existing paths for pairs by path, column and row at RX, and column and row at TX."""
         path = paths[index[0]]
         taken = self.receive.first[self.receiver[path]] + index[1] * sizes[1] + index[2]
         sent = self.transmit.first[self.transmitter[path]] + index[3] * sizes[3] + index[4]
         return self.exists(path, self.transmit.positions[sent], self.receive.positions[taken])
 
     def exists(self, path: Int64Array, start: Float64Array, end: Float64Array) -> BoolArray:
-        """Whether the paths between single positions exist, Shape ``[Q]``."""
+        """Test whether the paths between single positions exist, Shape ``[Q]``."""
         good = np.zeros(len(path), bool)
         types = self.paths.surfaces.types
         # Chains of reflections are asked for as candidates of the tracer are, others by their segments.
@@ -549,7 +549,7 @@ class _Test:
         return good
 
     def _on_edge(self, path: Int64Array, points: Float64Array) -> BoolArray:
-        """Whether the point of a diffracted path lies on its edge; true of other paths."""
+        """Test whether the point of a diffracted path lies on its edge; true of other paths."""
         within = np.ones(len(path), bool)
         over = np.flatnonzero(self.paths.bend[path] == Bend.EDGE)
         if len(over):
@@ -570,7 +570,8 @@ def _sides(
     origin: Float64Array,
     normal: Float64Array,
 ) -> BoolArray:
-    """Whether paths stay on one side of what reflects them, and cross what they are transmitted through."""
+    """Test whether paths stay on one side of what reflects them, and cross what they are transmitted
+    through."""
     depth = types.shape[1]
     good = np.ones(len(types), bool)
     before = start

@@ -252,7 +252,7 @@ class _ElementPaths:
         return column
 
     def weighted(self, asked: Bins, pair: int, begin: int, end: int) -> Complex128Array:
-        """What `Bins` ask for at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
+        """Responses in `Bins` at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
         mine = slice(*np.searchsorted(self.target, [begin, end]).tolist())
         weights = asked.weights(pair, self.tau[mine], self.doppler[mine]) * self.a[mine]
         response = np.zeros((len(weights), end - begin), np.complex128)

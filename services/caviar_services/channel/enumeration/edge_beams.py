@@ -108,7 +108,8 @@ class EdgeTargets:
         return len(self.number)
 
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:
-        """Whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge, ``[N]``."""
+        """Test whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge,
+        ``[N]``."""
         towards = points - self.ends[edges, 0]
         outside: BoolArray = (np.einsum("nc,nfc->nf", towards, self.normals[edges]) > 0).any(1)
         return outside
@@ -357,7 +358,7 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeam
 
 
 def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Whether images are in front of at least one face of edges."""
+    """Test whether images are in front of at least one face of edges."""
     import drjit as dr
 
     back = gathered(beams.image, beam) - gathered(edges.a, edge)
@@ -366,7 +367,7 @@ def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any,
 
 
 def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Whether edges may be lit: no side of the beam has both ends beyond it."""
+    """Test whether edges may be lit: no side of the beam has both ends beyond it."""
     import drjit as dr
 
     image, a, b = gathered(beams.image, beam), gathered(edges.a, edge), gathered(edges.b, edge)

@@ -166,7 +166,7 @@ class EnumeratedTracer:
     def _transmitted(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
     ) -> Traced:
-        """Those of hidden paths that go through their obstacles."""
+        """Hidden paths that go through their obstacles."""
         count = (paths.chain >= 0).sum(1)
         found, through = crossings(self._scene, self._look, faces, paths, start, ends, self._depth - count)
         number = np.cumsum(through) - 1
@@ -301,8 +301,8 @@ class EnumeratedTracer:
         return launched.take(wanted & (launched.hidden | ~known))
 
     def _is_known_through(self, types: UInt8Array, surfaces: Int64Array, chains: Int64Array) -> BoolArray:
-        """Which paths are transmitted, and reflected only by enumerated chains: by way of bodies, known
-        chains of scenery, or none."""
+        """Mask of paths that are transmitted, and reflected only by enumerated chains: by way of bodies,
+        known chains of scenery, or none."""
         through, mirrors = types == Interaction.TRANSMISSION, types == Interaction.REFLECTION
         kind = through.any(1) & (through | mirrors | (types == 0)).all(1)
         kind &= mirrors.sum(1) <= chains.shape[1]
@@ -320,7 +320,7 @@ class EnumeratedTracer:
     def _is_known_bent(
         self, edges: SceneEdges, traced: Traced, surfaces: Int64Array, depth: int
     ) -> BoolArray:
-        """Which paths run over an edge with reflections that `edge_beams` enumerates."""
+        """Mask of paths over an edge with reflections that `edge_beams` enumerates."""
         bent, mirrors = (traced.types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
         used = traced.types != 0
         of_scenery = surfaces < self._scene.first_moving_plane
@@ -336,7 +336,7 @@ class EnumeratedTracer:
 
 
 def _only_reflected(traced: Traced) -> BoolArray:
-    """Which paths have no other interaction than reflections."""
+    """Mask of paths that have no other interaction than reflections."""
     only: BoolArray = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
     return only
 

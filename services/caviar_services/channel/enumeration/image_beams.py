@@ -70,7 +70,7 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
 
 
 def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Those of pairs of indices that pass a test, evaluated."""
+    """Pairs of indices that pass a test, evaluated."""
     import drjit as dr
 
     if not dr.width(numbers[0]):
@@ -132,7 +132,7 @@ _WIDE = 0.01
 
 
 class Targets:
-    """What beams of a frame may light: faces, and bodies by the spheres around them.
+    """Targets of a frame's beams: faces, and bodies by the spheres around them.
 
     Args:
         faces: Those of scenery first, then those of bodies, body after body.
@@ -185,7 +185,7 @@ class Targets:
         return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
 
     def height(self, point: Any, face: Any) -> Any:
-        """How far points are in front of the planes of faces [m]; negative behind."""
+        """Heights of points above the planes of faces [m]; negative behind."""
         import drjit as dr
 
         return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
@@ -237,7 +237,7 @@ class ImageBeams:
         return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
 
     def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
-        """Whether spheres reach into the cones of beams, on the lit side of their last planes.
+        """Test whether spheres reach into the cones of beams, on the lit side of their last planes.
 
         A cheap test before `light`: a cone is one dot product, a pyramid up to eight.
         """
@@ -254,7 +254,7 @@ class ImageBeams:
         return (across * cosine - along * sine <= reach) & (before > -reach)
 
     def light(self, beam: Any, centre: Any, reach: Any) -> Any:
-        """Whether spheres reach into all pyramids of beams."""
+        """Test whether spheres reach into all pyramids of beams."""
         import drjit as dr
         import mitsuba as mi
 
@@ -305,7 +305,7 @@ def next_beams(targets: Targets, beams: ImageBeams, scenery: Int64Array, known: 
 
 
 def scenery_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageBeams:
-    """Those of `next_beams` whose chains are of scenery alone."""
+    """Beams of `next_beams` whose chains are of scenery alone."""
     return longer_beams(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
@@ -428,7 +428,7 @@ def near_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
 
 
 def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> Any:
-    """Whether rectangles may be lit: no side of the beam has all four corners beyond it."""
+    """Test whether rectangles may be lit: no side of the beam has all four corners beyond it."""
     import drjit as dr
 
     corners, image = targets.corners(face), gathered(beams.image, beam)
@@ -442,7 +442,7 @@ def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> 
 
 
 def _some(corners: list[Any], normal: Any, offset: Any) -> Any:
-    """Whether one of the corners at least is beyond a plane."""
+    """Test whether one of the corners at least is beyond a plane."""
     import drjit as dr
 
     a, b, c, d = (dr.dot(normal, corner) for corner in corners)
@@ -619,7 +619,7 @@ def ends_by_scenery(
 def shown_scenery(
     targets: Targets, views: ImageBeams, scenery: SceneryViews
 ) -> tuple[Int64Array, Int64Array]:
-    """Which faces of scenery receivers see by a reflection in another one.
+    """Faces of scenery that receivers see by a reflection in another one.
 
     Args:
         targets: Faces.
@@ -656,7 +656,7 @@ def shown_scenery(
 
 
 def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
-    """Whether points see images in faces: from the side that reflects, and within the rectangle."""
+    """Test whether points see images in faces: from the side that reflects, and within the rectangle."""
     import drjit as dr
 
     there, here = targets.height(image, face), targets.height(point, face)

@@ -132,7 +132,7 @@ def unhidden(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> BoolArray:
-    """Which paths have no obstacle on their segments, Shape ``[P]``.
+    """Mask of paths without an obstacle on their segments, Shape ``[P]``.
 
     A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
     that does not stand in front of it: rays that end before would lose what grazes.
@@ -187,7 +187,7 @@ def unhidden(
 
 
 def in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
-    """Whether planes hide points of other planes that rays met right behind them.
+    """Test whether planes hide points of other planes that rays met right behind them.
 
     They do if both planes are parallel and farther apart than rounding.
 
@@ -331,7 +331,7 @@ class _Segments:
     def met(
         self, scene: SionnaScene, rows: Int64Array, triangle: Int64Array
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Where segments cross the planes of triangles: share of the segment, point [m], and unit normal
+        """Crossings of segments with planes of triangles: share of the segment, point [m], and unit normal
         towards the far side."""
         normal, origin = _plane(scene, triangle)
         first, line = self.first[rows], self.last[rows] - self.first[rows]
@@ -484,7 +484,8 @@ def unhidden_over_edges(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> BoolArray:
-    """Which paths have no obstacle on their segments, Shape ``[P]``; the arguments are those of `unhidden`.
+    """Mask of paths without an obstacle on their segments, Shape ``[P]``; the arguments are those of
+    `unhidden`.
 
     Both faces of an edge are no obstacle to a segment that ends there: what a ray meets of them is rounding.
     """
@@ -528,7 +529,7 @@ def unhidden_over_edges(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """What is at one end of each of N segments."""
+    """Face, edge or antenna at one end of each of N segments."""
 
     normals: Float64Array
     """Unit normals of faces, for edges between both faces, 0 at antennas, Shape ``[N, 3]``."""
@@ -549,7 +550,7 @@ class _Ends:
         rows: Int64Array,
         corner: int,
     ) -> _Ends:
-        """Those of a corner of paths by its index; 0 is the transmitter."""
+        """Ends at a corner of paths by its index; 0 is the transmitter."""
         count = len(rows)
         inner = (paths.count[rows] >= corner) & (corner > 0)
         d = min(max(corner - 1, 0), paths.chain.shape[1] - 1)

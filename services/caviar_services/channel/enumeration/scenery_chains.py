@@ -171,13 +171,13 @@ class FaceRectangles:
         return height
 
     def in_rectangle(self, points: Float64Array, faces: Int64Array) -> BoolArray:
-        """Whether points [m] of the planes of N faces lie in their rectangles; ``[N, 3]`` to ``[N]``."""
+        """Test whether points [m] of the planes of N faces lie in their rectangles; ``[N, 3]`` to ``[N]``."""
         flat = np.einsum("nc,nac->na", points - self.centre[faces], self.axes[faces])
         inside: BoolArray = (np.abs(flat) <= self.half[faces] + _RECTANGLE_SLACK).all(1)
         return inside
 
     def in_triangles(self, points: Float64Array, faces: Int64Array) -> BoolArray:
-        """Whether points [m] of the planes of N faces lie in one of their triangles; ``[N, 3]`` to
+        """Test whether points [m] of the planes of N faces lie in one of their triangles; ``[N, 3]`` to
         ``[N]``."""
         flat = np.einsum("nc,nac->na", points - self.centre[faces], self.axes[faces])
         sizes = self.sizes[faces]
@@ -514,7 +514,8 @@ class ChainTree:
         return np.concatenate(found)
 
     def _in_front(self, image: Float64Array, last: Int64Array, target: Float64Array) -> BoolArray:
-        """Whether rectangles reach to the lit side of the planes of last faces, which images are behind."""
+        """Test whether rectangles reach to the lit side of the planes of last faces, which images are
+        behind."""
         away = np.where(self._faces.height(image, last) > 0, -1.0, 1.0)[:, None]
         height = np.einsum("nkc,nc->nk", target, self._faces.normal[last]) - self._faces.offset[last, None]
         in_front: BoolArray = (away * height > _IN_FRONT).any(1)
@@ -527,7 +528,7 @@ class ChainTree:
 
 
 def _beyond(apex: Float64Array, corners: Float64Array, target: Float64Array) -> BoolArray:
-    """Whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
+    """Test whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
     edges = corners - apex[:, None]
     normal = np.cross(edges, np.roll(edges, -1, axis=1))
     length = np.sqrt(np.einsum("nsc,nsc->ns", normal, normal))

@@ -120,7 +120,7 @@ class MeshVolumes:
     def crossings(
         self, start: Float64Array, direction: Float64Array
     ) -> Iterator[tuple[Int64Array, Int64Array, Float64Array, Int64Array]]:
-        """Where lines enter and leave volumes.
+        """Crossings of lines into and out of volumes.
 
         Args:
             start: A point of each of Q lines [m], Shape ``[Q, 3]``.
@@ -215,7 +215,7 @@ def _meets(
     boxes: Int64Array,
     between: tuple[float, float],
 ) -> BoolArray:
-    """Whether lines touch boxes between two multiples of their directions, pair by pair, Shape ``[N]``.
+    """Test whether lines touch boxes between two multiples of their directions, pair by pair, Shape ``[N]``.
 
     By slabs (T. L. Kay and J. T. Kajiya, "Ray tracing complex scenes", SIGGRAPH 1986).
 
@@ -238,7 +238,7 @@ def _meets(
 def _crossed(
     origin: Float64Array, direction: Float64Array, triangles: Float64Array
 ) -> tuple[Int64Array, Float64Array, Int64Array]:
-    """Which of N triangles, Shape ``[N, 3, 3]``, lines meet, at what multiple of the direction, and whether
+    """Triangles of N, Shape ``[N, 3, 3]``, that lines meet, at what multiple of the direction, and whether
     they enter there, 1, or leave, −1.
 
     In axes in which the line is the third one (S. Woop, C. Benthin and I. Wald, "Watertight ray/triangle
@@ -285,7 +285,7 @@ _REMEDY = (
 
 
 class FoliageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How much one kind of foliage attenuates."""
+    """Attenuation by one kind of foliage."""
 
     attenuation_db_per_m: dict[
         str, Annotated[float, quantity("dB/m", "specific attenuation γ on a carrier", ge=0)]
@@ -467,7 +467,7 @@ _VERTICAL_M = 1e-9
 
 
 class HumanBlockageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which objects are screens, and of what size.
+    """Objects that are screens, and their size.
 
     Example:
         >>> HumanBlockageSettings(width_m=0.3, height_m=1.7).classes  # the size of TR 38.901
@@ -510,7 +510,7 @@ def check_screens(
 
 
 class HumanBlockage(Attenuation):
-    """What the people of a frame take from paths.
+    """Attenuation of paths by the people of a frame.
 
     Args:
         settings: Of the screens.

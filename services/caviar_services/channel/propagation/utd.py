@@ -312,7 +312,7 @@ class Bends:
 
     @classmethod
     def of(cls, corners: Float64Array, types: UInt8Array, faces: Wedges) -> Bends:
-        """Those of paths; the arguments are those of `edge_fields`."""
+        """Bends of paths; the arguments are those of `edge_fields`."""
         steps = np.diff(corners, axis=1)
         lengths = np.sqrt((steps**2).sum(-1))
         bent = types == Interaction.DIFFRACTION
@@ -333,8 +333,9 @@ class Bends:
 
     @property
     def margins(self) -> Float64Array:
-        """How far [rad] the outgoing ray is within the wave that passes the edge, and within those that the
-        faces reflect, first and second as they were given; negative where these have ended; ``[P, 3]``."""
+        """Angles [rad] by which the outgoing ray is within the wave that passes the edge, and within those
+        that the faces reflect, first and second as they were given; negative where these have ended; ``[P,
+        3]``."""
         angle_in, angle_out = self.angles
         # The reflections of both faces end at φ + φ' = π and at φ + φ' = 2nπ − π.
         both = angle_in + angle_out
@@ -552,7 +553,7 @@ class Sight:
 def waves_beside(
     bends: Bends, faces: Int64Array, bent: Int64Array, chains: Chains
 ) -> tuple[Int64Array, dict[int, Sight]]:
-    """Whether the waves exist that end near diffracted paths.
+    """Test whether the waves exist that end near diffracted paths.
 
     Args:
         bends: Of B diffracted paths.
@@ -589,7 +590,7 @@ def waves_beside(
 
 
 def _steep(bends: Bends) -> BoolArray:
-    """Which faces, as given, rays meet steeper than `_GRAZING`, Shape ``[B, 2]``."""
+    """Mask of faces, as given, that rays meet steeper than `_GRAZING`, Shape ``[B, 2]``."""
     met = np.abs((bends.faces.normals * bends.k[:, None]).sum(-1)) > _GRAZING
     steep: BoolArray = np.where(bends.swapped[:, None], met[:, ::-1], met)
     return steep

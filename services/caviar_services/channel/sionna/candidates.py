@@ -89,7 +89,7 @@ def _chain_keys(planes: Int32Array | Int64Array, depth: Int64Array) -> UInt64Arr
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """What rays met, as far as paths may come of it."""
+    """Chains and scattering points that rays met, of which paths may come."""
 
     launch: Launch
     """The rays that went along a chain first, or were scattered; of a launch in one part all of them."""
@@ -234,7 +234,7 @@ def _columns(bounce: Bounce, rays: Int64Array) -> Int64Array:
 
 
 def _gathered(columns: Sequence[Any], rays: Int64Array) -> Int64Array:
-    """What C columns of the ray tracer's have for N rays, Shape ``[C, N]``."""
+    """Values of C columns of the ray tracer for N rays, Shape ``[C, N]``."""
     import drjit as dr
     import mitsuba as mi
 
@@ -262,7 +262,7 @@ def _tokens(
 
 
 def _signature(launch: Launch, chains: Chains, scene: SionnaScene) -> Int64Array:
-    """What tells each interaction of chains apart, −1 past the last, Shape ``[C, D]``."""
+    """Numbers that tell interactions of chains apart, −1 past the last, Shape ``[C, D]``."""
     signature = np.full(chains.planes.shape, -1, np.int64)
     for d in range(len(launch.bounces)):
         used = chains.depth > d
@@ -311,7 +311,7 @@ class Candidates(Rows):
 
 
 class Offer:
-    """What a launch offers to every receiver.
+    """Candidates of a launch, offered to every receiver.
 
     Args:
         scene: Where the rays went.
@@ -407,7 +407,7 @@ class Offer:
 
 
 def first_of_each(receiver: Int64Array, count: int) -> BoolArray:
-    """Which candidates are among the first of their receiver, Shape ``[P]``.
+    """Mask of candidates that are among the first of their receiver, Shape ``[P]``.
 
     Args:
         receiver: Of each candidate, Shape ``[P]``.
@@ -534,7 +534,7 @@ class Planes:
         return origin, dr.gather(mi.Vector3f, self._normal, number - 1, used)
 
     def _met(self, here: Any, image: Any, number: Any) -> tuple[Any, Any, Any]:
-        """Where the line to an image meets a plane; whether it does so at too small an angle to tell;
+        """Point where the line to an image meets a plane; whether it does so at too small an angle to tell;
         whether that may be a point of a path."""
         import drjit as dr
         import mitsuba as mi
@@ -554,7 +554,7 @@ class Planes:
 
 
 class Faces:
-    """What rays meet first in a scene: how far away, and which of the surfaces of its objects' faces.
+    """First hits of rays in a scene: how far away, and on which of the surfaces of its objects' faces.
 
     Args:
         scene: Its bodies are where they were placed last.
@@ -595,7 +595,7 @@ class Faces:
         return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
 
     def _met(self, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any]:
-        """How much farther than a segment's end [m] the first triangle along it is, its number, and whether
+        """Distance [m] from a segment's end to the first triangle along it, its number, and whether
         there is one."""
         import drjit as dr
         import mitsuba as mi
@@ -664,7 +664,7 @@ class Corners:
         return Corners(self.transmitter - centre, self.receivers - centre)
 
     def take(self, which: slice) -> Corners:
-        """Those of some receivers.
+        """Corners of some receivers.
 
         Args:
             which: Of the receivers.
@@ -714,7 +714,7 @@ def reached(
     sources: Float64Array,
     targets: Float64Array,
 ) -> BoolArray:
-    """Whether chains of reflections are paths, Shape ``[P, L, K]``.
+    """Test whether chains of reflections are paths, Shape ``[P, L, K]``.
 
     Args:
         chains: Plane at each interaction, −1 past the last, Shape ``[P, D]``.
@@ -749,7 +749,7 @@ def reached(
 def reflected(
     faces: Faces, planes: Planes, chains: Int64Array, start: Float64Array, end: Float64Array
 ) -> BoolArray:
-    """Whether chains of reflections are paths between positions, Shape ``[Q]``.
+    """Test whether chains of reflections are paths between positions, Shape ``[Q]``.
 
     Args:
         faces, planes: Of the scene.

@@ -59,7 +59,7 @@ class MeshEdges:
 
     @property
     def is_free(self) -> BoolArray:
-        """Which edges are of one face, Shape ``[E]``."""
+        """Mask of edges of one face, Shape ``[E]``."""
         free: BoolArray = self.triangles[:, 0] == self.triangles[:, 1]
         return free
 
@@ -87,7 +87,7 @@ class MeshEdges:
 
     @classmethod
     def joined(cls, parts: Sequence[MeshEdges]) -> MeshEdges:
-        """All of these, part by part.
+        """Edges of all parts, part by part.
 
         Args:
             parts: One at least; each has higher numbers of triangles than the one before.
@@ -529,7 +529,7 @@ class DeviceEdges:
         self._normals = mi.Normal3f(*columns[7:10]), mi.Normal3f(*columns[10:])
 
     def drawn(self, hit: Any, came_from: Any, sample: Any, active: Any) -> tuple[Any, Any, Any]:
-        """One of the edges of the triangles that rays hit, where rays came from outside of its wedge.
+        """Edge drawn among those of the triangles that rays hit, where rays came from outside of its wedge.
 
         Args:
             hit: `mitsuba.SurfaceInteraction3f`.
@@ -604,7 +604,7 @@ def edge_generator(edges: SceneEdges) -> Any:
 
 
 class EdgeRange:
-    """Which edges of a scene, as it stands, are within a distance of one end of a path at least.
+    """Edges of a scene, as it stands, that are within a distance of one end of a path at least.
 
     Args:
         edges: Of the scene; None: it has none.
@@ -615,7 +615,7 @@ class EdgeRange:
         self._edges, self._within = edges, within_m
 
     def reaches(self, places: Float64Array) -> bool:
-        """Whether any edge is in range of any of these places.
+        """Test whether any edge is in range of any of these places.
 
         Args:
             places: [m], Shape ``[N, 3]``.
@@ -634,7 +634,7 @@ class EdgeRange:
         return False
 
     def within(self, table: PathTable, start: Float64Array, end: Float64Array) -> BoolArray:
-        """Which paths have no edge out of range of both ends, Shape ``[P]``.
+        """Mask of paths with no edge out of range of both ends, Shape ``[P]``.
 
         Args:
             table: The paths.

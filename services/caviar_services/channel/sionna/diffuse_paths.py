@@ -129,7 +129,7 @@ class DrawnPoints:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """How an antenna's elements send."""
+    """Gain of an antenna's elements."""
 
     antenna: Antenna
 
@@ -256,7 +256,7 @@ class _Met:
 
     @classmethod
     def of(cls, bounce: Bounce, source: Float64Array) -> _Met:
-        """Where rays from ``source``, Shape ``[N, 3]`` or ``[1, 3]``, have met something."""
+        """Hits of rays from ``source``, Shape ``[N, 3]`` or ``[1, 3]``."""
         point, normal = (
             np.stack([axis.numpy() for axis in vector], axis=-1).astype(np.float64)
             for vector in (bounce.point, bounce.normal)
@@ -275,7 +275,7 @@ def _at_normal(material: Any) -> float:
 
 
 def _turned(depth: Int64Array) -> UInt64Array:
-    """Where the sequence begins at each depth: anywhere else."""
+    """Offset of the sequence at each depth: anywhere else."""
     return depth.astype(np.uint64) * np.uint64(0x85EBCA6B)
 
 
@@ -318,8 +318,8 @@ class ChosenPoints:
         return point, receiver, probability[point, receiver]
 
     def _weights(self, targets: Any) -> Float64Array:
-        """What each point is expected to bring each receiver, in any unit; 0 on the side that is not lit;
-        Shape ``[P, R]``."""
+        """Power that each point is expected to bring each receiver, in any unit; 0 on the side that is not
+        lit; Shape ``[P, R]``."""
         import drjit as dr
         import mitsuba as mi
 
@@ -337,7 +337,7 @@ class ChosenPoints:
         return found
 
     def _free(self, point: Int64Array, receiver: Int64Array, targets: Any) -> BoolArray:
-        """Whether nothing stands between these points and receivers."""
+        """Test whether nothing stands between these points and receivers."""
         import drjit as dr
         import mitsuba as mi
 

@@ -139,7 +139,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @property
     def _losses(self) -> tuple[Attenuation, ...]:
-        """What paths lose in beside what they meet."""
+        """Losses of paths beside interactions."""
         found: list[Attenuation] = []
         if self.foliage is not None:
             found.append(self.foliage)
@@ -158,12 +158,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @property
     def scene(self) -> SionnaScene:
-        """What waves meet; after `load_scene`."""
+        """Scene that waves meet; after `load_scene`."""
         return self._scene
 
     @property
     def launch_seed(self) -> int:
-        """Of all rays."""
+        """Seed of all rays."""
         return self._asked.seed
 
     # --- before the first frame ----------------------------------------------------------------------
@@ -437,7 +437,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return np.bincount(pair, weights=power, minlength=pairs).astype(np.float64)
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
-        """How the rung makes H; `PlaneWaves` where it has no way of its own."""
+        """Maker of the rung's H; `PlaneWaves` where it has no way of its own."""
         finder, memory = self._finder, int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)

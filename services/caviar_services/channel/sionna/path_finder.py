@@ -1,4 +1,4 @@
-"""How the ray-traced channel finds the paths of a frame: by launches, by enumeration, or by both.
+"""Finder of the paths of a frame in the ray-traced channel: by launches, by enumeration, or by both.
 
 Reflections are launched in every frame, followed from frame to frame (`tracking`), or enumerated
 (`enumeration.enumerated_paths`); paths of other kinds are launched. Diffuse paths may have a launch of their
@@ -338,5 +338,5 @@ class PathFinder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Of the last frame, for the report."""
+        """Counts of the last frame, for the report."""
         return {} if self._edge_range is None else {"no_edge_in_range": self._without_edge}

@@ -51,7 +51,7 @@ LANE_BYTES = 40
 
 @dataclass(frozen=True, eq=False)
 class _Last:
-    """What was traced last from a position."""
+    """Last trace from a position."""
 
     version: int
     """Of the scene."""
@@ -105,7 +105,7 @@ class Tracer:
         self._last.clear()
 
     def offers(self) -> tuple[tuple[bytes, TableState], ...]:
-        """What followed transmitters have on offer as long as nothing moves, and where they are."""
+        """Offers of followed transmitters, which hold as long as nothing moves, and their positions."""
         return tuple(
             (position, last.offer.state)
             for position, last in self._last.items()
@@ -148,7 +148,7 @@ class Tracer:
 
     @property
     def look(self) -> Look:
-        """What can be asked about the scene as it is, in world coordinates."""
+        """Questions that the scene as it is answers, in world coordinates."""
         table, centre = self._scene.plane_table, self._scene.centre
         return Look(
             nearest=lambda start, end: self._faces.nearest(start - centre, end - centre),
@@ -220,7 +220,7 @@ class Tracer:
         self._last = {key: last for key, last in self._last.items() if last.version == version}
 
     def _launched(self, transmitter: Float64Array, element: Element | None) -> Offer:
-        """What a launch of all rays offers."""
+        """Offer of a launch of all rays."""
         source = positions(transmitter[None])
 
         def look(_: Int64Array, launch: Launch) -> Met:
@@ -446,7 +446,7 @@ class Tracer:
 
 
 def _first_of_equals(ends: Float64Array, points: Float64Array) -> BoolArray:
-    """Of paths with the same points to 1 mm, the first: planes of two objects may be one."""
+    """Mask of the first of paths with the same points to 1 mm: planes of two objects may be one."""
     places = np.round(np.concatenate([ends[:, None], points], axis=1).reshape(len(ends), -1), 3)
     first = np.zeros(len(ends), np.bool_)
     first[np.unique(places, axis=0, return_index=True)[1]] = True

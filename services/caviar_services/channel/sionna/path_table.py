@@ -98,7 +98,7 @@ def nothing(carriers: int, depth: int, lost: int) -> Traced:
 
 
 def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
-    """All of these paths, part by part.
+    """Paths of all parts, part by part.
 
     Args:
         parts: Of one transmitter; none at all are no paths.
@@ -223,7 +223,7 @@ def path_table(
     antennas: Ends,
     traced_from: Ends,
 ) -> PathTable:
-    """What launches found between antennas.
+    """Table of all paths that launches found between antennas.
 
     Args:
         scene: Where they were.

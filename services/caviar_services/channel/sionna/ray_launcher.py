@@ -34,7 +34,7 @@ _INTERACTION_BYTES = 250
 
 
 def rays_within(memory_gib: float, max_depth: int) -> int:
-    """How many rays may be traced together: at least 10,000, and at most `RAYS_AT_ONCE`.
+    """Number of rays that may be traced together: at least 10,000, and at most `RAYS_AT_ONCE`.
 
     Args:
         memory_gib: Memory for them [GiB].
@@ -50,7 +50,7 @@ def rays_within(memory_gib: float, max_depth: int) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class LaunchOptions:
-    """What is traced, and with how many rays."""
+    """Options of a launch: what is traced, and with how many rays."""
 
     max_depth: int
     samples: int
@@ -108,7 +108,7 @@ class Bounce:
     """`mitsuba.Float`: that this kind of interaction was drawn."""
 
     def take(self, rays: Any) -> Bounce:
-        """Those of some rays.
+        """Interactions of some rays.
 
         Args:
             rays: Their numbers, a `mitsuba.UInt`.
@@ -121,7 +121,7 @@ class Bounce:
 
 @dataclass(frozen=True, eq=False)
 class Launch:
-    """What the rays from one transmitter met."""
+    """Interactions of the rays from one transmitter."""
 
     bounces: tuple[Bounce, ...]
     """First, second, … interaction."""
@@ -131,7 +131,7 @@ class Launch:
 
     @property
     def rays(self) -> int:
-        """How many."""
+        """Number of rays."""
         import drjit as dr
 
         return int(dr.width(self.bounces[0].kind)) if self.bounces else 0
@@ -204,7 +204,7 @@ class PartedLauncher:
 
     @property
     def in_parts(self) -> bool:
-        """Whether a launch has more than one part."""
+        """True if a launch has more than one part."""
         return len(self._parts) > 1
 
     def each(

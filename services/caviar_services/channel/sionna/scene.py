@@ -88,7 +88,7 @@ _OTHER_SKIN = "choose another body_material"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """What a scene is made with, beside its files; equal ones share a scene within `shared_scenes`."""
+    """Settings of a scene, beside its files; equal ones share a scene within `shared_scenes`."""
 
     frequencies_hz: tuple[float, ...]
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
@@ -258,7 +258,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
-        """Of the carriers [m]."""
+        """Wavelengths of the carriers [m]."""
         return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
 
     def tune(self, carrier: int) -> None:
@@ -273,7 +273,7 @@ class SionnaScene(NumberedTriangles):
         self._scene.frequency = frequency
 
     def used_surfaces(self) -> UsedSurfaces:
-        """What waves can meet, at rest and moving."""
+        """Surfaces that waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
         # Bodies that stand for nothing count: which objects will come is not known.
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _NOTHING]
@@ -301,7 +301,7 @@ class SionnaScene(NumberedTriangles):
 
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
-        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        """Permittivity and conductivity [S/m] of each shape on each carrier, Shape ``[2, C, S]``, and
         thickness [m] and scattering coefficient, Shape ``[2, S]``."""
         constants = []
         # The ray tracer has the constants of one carrier at a time; here are those of all, once for the run.
@@ -316,7 +316,7 @@ class SionnaScene(NumberedTriangles):
         return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
 
     def media(self, shapes: Int64Array) -> Media:
-        """What process-local shapes are made of; anything for no shape.
+        """Materials of process-local shapes; anything for no shape.
 
         Args:
             shapes: Of any Shape.
@@ -327,7 +327,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
-        """Of the kinds of bodies that there are (`body_kind`)."""
+        """Unit meshes of the kinds of bodies that there are (`body_kind`)."""
         return self._pool.unit_meshes
 
     @property
@@ -480,7 +480,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def has_scenery(self) -> bool:
-        """Whether anything stands still; `low` and `high` are its corners."""
+        """True if anything stands still; `low` and `high` are its corners."""
         return bool(self._scenery)
 
     def enclosing(self, position: Float64Array) -> int:
@@ -548,7 +548,7 @@ class SionnaScene(NumberedTriangles):
 
 
 def _material_name(shape: Shape) -> str:
-    """Of a shape, as a scenario has it."""
+    """Name of a shape's material, as a scenario has it."""
     name: str = shape.material.name
     return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
 

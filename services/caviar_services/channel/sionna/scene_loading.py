@@ -555,7 +555,7 @@ class BodyPool:
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
-        """Of the kinds of bodies that there are."""
+        """Unit meshes of the kinds of bodies that there are."""
         return {kind: mesh for kind, mesh in self._now.meshes.items() if self._now.counts[kind]}
 
     def named_materials(self) -> set[str]:
@@ -623,11 +623,11 @@ class BodyPool:
 
     @property
     def awaits_meshes(self) -> bool:
-        """Whether meshes came for which bodies are not made yet."""
+        """True if meshes came for which bodies are not made yet."""
         return self._later.changed
 
     def kind(self, scene: Scene, i: int) -> str:
-        """Which bodies may stand for an object.
+        """Kind of the bodies that may stand for an object.
 
         Args:
             scene: The scene of a frame.

@@ -55,7 +55,7 @@ BodyCount = Annotated[int, quantity("1", "bodies of one mesh for moving objects,
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
-    """What is modelled, and how finely.
+    """Settings of the channel ``sionna-rt``: what is modelled, and how finely.
 
     Example:
         >>> SionnaSettings(max_depth=2, ray_spacing_deg=1.0).launched_samples()
@@ -203,7 +203,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
     def enumerates(self, moving: bool) -> bool:
-        """Whether reflected paths are enumerated.
+        """Test whether reflected paths are enumerated.
 
         Args:
             moving: Whether objects move in the run.
@@ -261,7 +261,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
 
     def launch_options(self, seed: int) -> LaunchOptions:
-        """What a launch traces in each frame.
+        """Options of a launch in each frame.
 
         Args:
             seed: Of the rays, where there is no ``launch_seed``.
@@ -279,7 +279,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         )
 
     def pool_sizes(self, assets: Iterable[str], place: Place) -> dict[str, int]:
-        """How many bodies there are of each mesh, by asset: those of the run, and the box, ``""``.
+        """Number of bodies of each mesh, by asset: those of the run, and the box, ``""``.
 
         Args:
             assets: Names of the run's files.
@@ -348,7 +348,7 @@ def contributing(
 
 
 def transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
-    """Whether a ray can be sent through a surface on any carrier at any incidence.
+    """Test whether a ray can be sent through a surface on any carrier at any incidence.
 
     Args:
         material: Of the surface.

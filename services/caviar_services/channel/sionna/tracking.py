@@ -218,7 +218,7 @@ class FollowedOffer(Offer):
     def again(
         cls, state: TableState, transmitter: Float64Array, scene: SionnaScene, options: LaunchOptions
     ) -> FollowedOffer:
-        """What was on offer from a position when the scene was as it is now.
+        """Offer from a position when the scene was as it is now.
 
         Args:
             state: The chains.
@@ -229,7 +229,7 @@ class FollowedOffer(Offer):
 
     @property
     def state(self) -> TableState:
-        """What is on offer."""
+        """Chains on offer."""
         return TableState.of(self._table)
 
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
@@ -277,7 +277,7 @@ class FollowedOffer(Offer):
 
 
 def _on_object(launch: Launch, scene: SionnaScene, rays: int) -> BoolArray:
-    """Which of so many rays met a moving object, in any pass."""
+    """Mask of so many rays that met a moving object, in any pass."""
     met = np.zeros(rays, np.bool_)
     for bounce in launch.bounces:
         on_body = (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
@@ -306,7 +306,7 @@ def _planes(table: _Table, scene: SionnaScene) -> Int64Array:
 
 
 def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
-    """What tells chains apart, as one number each: the kinds of their interactions and reflecting planes."""
+    """Keys that tell chains apart, one number each: the kinds of their interactions and reflecting planes."""
     keys = np.zeros(len(table.depth), np.uint64)
     for kind, plane in zip(table.kind.T, _planes(table, scene).T, strict=True):
         keys ^= (kind + 16 * (plane + 1)).astype(np.uint64)
@@ -318,7 +318,7 @@ def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
 
 
 class FollowingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is followed; nothing where each frame stands on its own."""
+    """State of all that is followed; empty where each frame stands on its own."""
 
     followed: dict[str, FollowedState] = {}
     """By transmitter."""

@@ -1,4 +1,4 @@
-"""Which triangle of the ray tracer's shapes is whose: numbers, pieces and planes of triangles, in float64.
+"""Numbers, pieces and planes of the triangles of the ray tracer's shapes, in float64.
 
 A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape and a triangle within it; here
 triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
@@ -176,7 +176,7 @@ class CoplanarFaces:
         return projected
 
     def _touched(self, body: Int64Array, still: Int64Array) -> Int64Array:
-        """Of pairs of planes, the first triangle of scenery whose box the body's face touches; −1: none."""
+        """First triangle of scenery, for pairs of planes, whose box the body's face touches; −1: none."""
         triangles, sizes = self._table.triangles_of(still)
         own = np.repeat(np.arange(len(still)), sizes)
         corners = self._table.corners_of(triangles)
@@ -190,7 +190,7 @@ class CoplanarFaces:
         return np.where(found < np.iinfo(np.int64).max, found, -1)
 
     def _coplanar(self, one: Int64Array, other: Int64Array) -> BoolArray:
-        """Of pairs of planes, whether all corners of the one are in the other."""
+        """Mask of pairs of planes of which all corners of the one are in the other."""
         if not len(one):
             return np.zeros(0, np.bool_)
         table = self._table
@@ -270,8 +270,8 @@ def coinciding_materials(shapes: Sequence[Shape], plane: Int64Array) -> tuple[st
 
 
 def _overlaps(triangle: Float64Array, others: Float64Array) -> BoolArray:
-    """Whether triangles overlap one by more than `_NEAR`: none of their edges parts them (the separating axis
-    theorem). Shapes ``[3, 2]`` and ``[N, 3, 2]`` [m]."""
+    """Test whether triangles overlap one by more than `_NEAR`: none of their edges parts them (the separating
+    axis theorem). Shapes ``[3, 2]`` and ``[N, 3, 2]`` [m]."""
     both = np.concatenate([np.broadcast_to(triangle, others.shape), others], axis=1)
     edges = np.concatenate([np.roll(part, -1, axis=1) - part for part in np.split(both, 2, axis=1)], axis=1)
     axes = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
@@ -509,7 +509,7 @@ class NumberedTriangles:
 
     @property
     def scenery_digest(self) -> bytes:
-        """Of all triangles at rest and of their planes."""
+        """Digest of all triangles at rest and of their planes."""
         digest = hashlib.blake2b(digest_size=20)
         faces = self._faces[: self._first_moving]
         still = self._corners[: len(self._corners) - len(self._vertices)]
@@ -652,7 +652,7 @@ class NumberedTriangles:
         return np.where(moved[piece] >= 0, start, -1)
 
     def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
-        """Whether shapes are of moving bodies.
+        """Test whether shapes are of moving bodies.
 
         Args:
             shapes: Process-local shapes, of any Shape.
@@ -720,7 +720,7 @@ class NumberedTriangles:
         that are one surface with it."""
 
     def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
-        """Whether a triangle's normal points away from its piece, or up from one that lies.
+        """Test whether a triangle's normal points away from its piece, or up from one that lies.
 
         Scenery has faces of either sense, so their order of corners says nothing.
         """

@@ -248,7 +248,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     @property
     def draws_last(self) -> bool:
-        """Whether draws last an episode, whose only block has one row."""
+        """True if draws last an episode, whose only block has one row."""
         return self.settings.redraw == "episode"
 
     def draws(self, seed: int, seed_episode: int, pair: tuple[str, str], block: int) -> Draws:
@@ -430,7 +430,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
 
 class _Drawn(NamedTuple):
-    """Of a pair, for a block of frames."""
+    """Draws of a pair, for a block of frames."""
 
     draws: Draws
     tables: dict[bool, Float64Array]
@@ -447,7 +447,7 @@ class _Ends(NamedTuple):
 
     @classmethod
     def of(cls, transmitters: Sequence[AntennaDevice], receivers: Sequence[AntennaDevice]) -> _Ends:
-        """Of some antennas. Raises `PayloadError` for arrays that waves have no polarization for."""
+        """Ends of some antennas. Raises `PayloadError` for arrays that waves have no polarization for."""
         for device in (*transmitters, *receivers):
             if not device.array.is_uniform:
                 raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
@@ -479,7 +479,8 @@ class _Constant(NamedTuple):
         ids: Mapping[bool, Sequence[int]],
         shape: tuple[int, int],
     ) -> _Constant:
-        """Of pairs by whether their lines are free, and their ends too near to each other for a path."""
+        """Constants of pairs by whether their lines are free, and their ends too near to each other for a
+        path."""
         of_pairs = [[] if close else ids[los] for los, close in zip(free, near, strict=True)]
         offsets = [0, *accumulate(map(len, of_pairs))]
         paths = offsets[-1]
