@@ -1,5 +1,16 @@
-"""The radio map of a scene: surfaces over its ground, and received power, SINR and best server of their
-cells."""
+"""Radio maps: what transmitters bring to every cell of a surface over a scene's ground, by shooting rays
+through it, and received power, SINR and best server of the cells.
+
+Sionna RT's `RadioMapSolver` shoots rays from a transmitter and adds up the power of those that pass through
+each cell (A. Aoudia et al., "Sionna RT: Technical Report", 2025, section 4). It knows one precoding vector
+and one polarisation model, so that a codebook of 64 beams would be shot 64 times. Here the field that leaves
+is that of the channel engine's own element pattern (`Antenna.radiated`), and each ray that passes through a
+cell is counted once for every beam (`cell_gains`), with the beam's gain in the direction in which it left: a
+single-polarised array in the far field is the element times its array factor.
+
+A surface is a grid of cells, level or draped over the ground. The solver intersects rays with a level one by
+formula; of another one a mesh with two triangles for each cell stands in the scene while rays are shot.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,6 @@ from caviar_services.channel.arrays.channel_matrices import Bins, Located
 from caviar_services.channel.arrays.element_paths import elements
 from caviar_services.channel.paths import (
     Antenna,
-    Attenuation,
     PathGeometry,
     PathTable,
     antenna_fields,
@@ -31,6 +30,7 @@ from caviar_services.channel.paths import (
     with_near_pairs,
 )
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
+from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table

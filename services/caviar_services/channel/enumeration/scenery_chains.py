@@ -1,4 +1,9 @@
-"""Chains of planes of scenery that waves from a place go along: launched, or enumerated where faces are few.
+"""Faces of a scene, and chains of planes of scenery that waves from a place go along: launched, or enumerated
+where faces are few.
+
+A reflection happens at a point of a plane that lies in one of its triangles. The rectangle around the
+triangles bounds where that can be (`FaceRectangles`): searches test against it first, and against the
+triangles last. Faces of scenery are made once, those of moving bodies as they stand in a frame.
 
 One launch misses what its rays pass by: of 84 chains of the street canyon it finds 77, whether with 1e5
 rays or with 1e7, and the others only where the rays point elsewhere. So several launches, each turned a

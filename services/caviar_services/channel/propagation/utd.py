@@ -1,4 +1,5 @@
-"""Diffraction coefficients of edges by the uniform theory of diffraction (UTD), in float64.
+"""Fields at surfaces and edges, in float64: Fresnel's coefficients of slabs (ITU-R P.2040-3), and diffraction
+coefficients of edges by the uniform theory of diffraction (UTD).
 
 Sionna RT's own diffracted fields are not used. They change by 10 dB and more with the place of a scene,
 since

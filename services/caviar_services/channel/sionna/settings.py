@@ -23,7 +23,11 @@ from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
 from caviar_services.channel.mesh_detail import DetailSettings
-from caviar_services.channel.propagation.foliage import FoliageSettings, HumanBlockageSettings, check_screens
+from caviar_services.channel.propagation.attenuation import (
+    FoliageSettings,
+    HumanBlockageSettings,
+    check_screens,
+)
 from caviar_services.channel.propagation.utd import slab
 from caviar_services.channel.sionna.materials import (
     DRAWN,

@@ -3,6 +3,17 @@
 A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape and a triangle within it; here
 triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
 in a plane of it.
+
+Coplanar faces of bodies that touch or overlap one another or scenery are one surface (`CoplanarFaces`). Two
+lorries side by side with flush walls, or a kiosk flush with a façade, reflect as one wall does. Taken for two
+planes, a wave would be reflected by each where both overlap, and by the one or the other, at random, where a
+ray meets what coincides. So in each frame such faces are joined: they have one number, by which chains of
+planes go, and one id.
+
+The geometry of scenery may give other fields than its author expects, which is warned of once, before the
+run. Of faces of two materials in one plane (`coinciding_materials`) waves meet one. Of a closed thin wall
+(`closed_walls`) the ray tracer takes each face as a slab of its material's thickness, so that a wave crosses
+such a wall twice.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Foliage as lossy volumes: Recommendation ITU-R P.833-10, attenuation in vegetation.
+"""Attenuation of paths beside free space and interactions: by foliage (Recommendation ITU-R P.833-10) and by
+people as screens (model B of 3GPP TR 38.901).
 
 Waves pass through foliage on straight lines and lose A = A_m·(1 − exp(−γ·d/A_m)) [dB] (section 2.1, eq. 1),
 with the length d within it [m], the specific attenuation γ [dB/m] for very short paths, and the maximum
@@ -10,12 +11,30 @@ where the surfaces around it wind about it: a line that enters as often as it le
 number, here of the crossings before a point). So surfaces may overlap and enclose cavities. A line through an
 edge or a corner crosses what a line infinitesimally beside it crosses (H. Edelsbrunner and E. P. Mücke,
 "Simulation of simplicity", ACM Trans. Graph. 9(1), 1990).
+
+A person is a vertical rectangular screen (TR 38.901, section 7.6.4.2). A path that it stands in, or near, is
+diffracted at its four edges and loses
+
+    L = −20·log10(1 − (F_h1 + F_h2)·(F_w1 + F_w2)) [dB],
+    F = ±1/π · arctan(π/2 · sqrt(π/λ · (D1 + D2 − r))).
+
+for the upper and lower edge (h1, h2), in the top view for the others (w1, w2). All signs are + in a view in
+which the screen is in the way; where it is not, the edge of the shorter way D1 + D2 has −, so that L tends
+to 0 away from the screen. Losses [dB] of several screens are added.
+
+What the report leaves open is fixed so: a screen stands across the path, as in the model of METIS (D1.4,
+"METIS channel models", 2015, section 6) that the report took over, and is as wide as the person looks from
+there, whose outline seen from above is an ellipse. A path with reflections is unfolded: each of its legs has
+its ends at the images of TX and RX, so that the form of the direct path holds for all of them (the report has
+no geometry beyond the receiver's side, and lets D2 − r fall away). Diffraction and scattering begin a new
+wave. Only screens between the ends of a leg itself count for it.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -28,10 +47,53 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Carrier, Interaction, Scene
-from caviar_services.channel.paths import Attenuation, path_corners
+from caviar_services.channel.paths import PathTable, path_corners
 from caviar_services.channel.sionna.materials import ObjectMaterials
 from caviar_space.meshes import Mesh, placed, unit_box
 from caviar_space.vectors import ranges
+
+
+class Attenuation(ABC):
+    """Takes power from paths by where their legs run; delays, directions and phases stay."""
+
+    @abstractmethod
+    def move(self, scene: Scene) -> None:
+        """Put what attenuates, as far as it moves, where the objects of a scene are.
+
+        Args:
+            scene: Of the frame.
+        """
+
+    @abstractmethod
+    def amplitude_factor(
+        self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
+    ) -> Float64Array:
+        """Factors of amplitudes, 0 to 1 or a little above.
+
+        Args:
+            start: Position of TX of each path [m], Shape ``[P, 3]``.
+            points: Where it interacts [m], as in `PathTable`, Shape ``[P, D, 3]``.
+            end: Position of RX of each path [m], Shape ``[P, 3]``.
+            types: Of the interactions, Shape ``[P, D]``.
+
+        Returns:
+            Factors of Shape ``[C, P]``, one for each carrier.
+        """
+
+    def attenuated(self, table: PathTable, start: Float64Array, end: Float64Array) -> PathTable:
+        """Weaken paths.
+
+        Args:
+            table: The paths.
+            start: Position of TX of each path [m], Shape ``[P, 3]``.
+            end: Position of RX of each path [m], Shape ``[P, 3]``.
+
+        Returns:
+            The same paths, with what they have lost in their ``transfer``.
+        """
+        factor = self.amplitude_factor(start, table.points, end, table.types)
+        return replace(table, transfer=table.transfer * factor[..., None, None])
+
 
 # Boxes in a box of the next level, and triangles in one of the first.
 _BRANCHES = 8
