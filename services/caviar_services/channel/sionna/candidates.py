@@ -24,15 +24,18 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
 from caviar_services.channel.paths import Rows
-from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, DrawnPoints, Scattered, scattered_of
 from caviar_services.channel.sionna.ray_launcher import (
     DIFFRACTED,
     REFLECTED,
     REFRACTED,
     SCATTERED,
     Bounce,
+    ChosenPoints,
+    DrawnPoints,
     Launch,
     LaunchOptions,
+    Scattered,
+    scattered_of,
 )
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several

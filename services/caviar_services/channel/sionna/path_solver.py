@@ -32,9 +32,16 @@ from caviar_services.channel.sionna.candidates import (
     united,
 )
 from caviar_services.channel.sionna.diffracting_edges import edge_generator
-from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, Element, Thinning
 from caviar_services.channel.sionna.path_table import Traced, edge_numbers, geometry, joined, nothing, read
-from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
+from caviar_services.channel.sionna.ray_launcher import (
+    SCATTERED,
+    ChosenPoints,
+    Element,
+    Launch,
+    LaunchOptions,
+    PartedLauncher,
+    Thinning,
+)
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several

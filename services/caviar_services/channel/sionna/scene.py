@@ -31,7 +31,6 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import EPSILON_0, Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
@@ -70,6 +69,7 @@ from caviar_services.channel.sionna.triangle_numbering import (
     closed_walls,
     coinciding_materials,
 )
+from caviar_space.mesh_detail import DetailSettings
 from caviar_space.meshes import Body, Mesh, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 

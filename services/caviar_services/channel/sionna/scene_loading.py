@@ -27,7 +27,6 @@ from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Scene
-from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
@@ -40,6 +39,7 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.drjit_setup import aligned_columns
+from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_space.meshes import Body, Mesh, assign_bodies, unit_box
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
 

@@ -22,7 +22,6 @@ from caviar_protocol.errors import suggestion
 from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
-from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.propagation.attenuation import (
     FoliageSettings,
     HumanBlockageSettings,
@@ -38,6 +37,7 @@ from caviar_services.channel.sionna.materials import (
     UsedSurfaces,
 )
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
+from caviar_space.mesh_detail import DetailSettings
 from caviar_space.mitsuba_xml import ITU_MATERIALS
 
 # Half of the smallest float32 above 0.

@@ -20,7 +20,6 @@ from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidates import MANY_RAYS, Candidates, Chains, Met, Offer, chains_of
-from caviar_services.channel.sionna.diffuse_paths import scattered_of
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,
@@ -28,6 +27,7 @@ from caviar_services.channel.sionna.ray_launcher import (
     Launch,
     LaunchOptions,
     PartedLauncher,
+    scattered_of,
 )
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
