@@ -30,6 +30,7 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import spherical_basis
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -663,9 +664,6 @@ def beam_gains(antenna: Antenna, beams: range, directions: Any) -> Any:
     Returns:
         Of each beam the gains in all directions, one beam after the other, width ``len(beams)·R``.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     array, count = antenna.array, dr.width(directions)
     index = dr.arange(mi.UInt, len(beams) * count)
     beam = dr.opaque(mi.UInt, beams.start) + index // dr.opaque(mi.UInt, count)
@@ -683,9 +681,6 @@ def beam_gains(antenna: Antenna, beams: range, directions: Any) -> Any:
 
 def _kernel_power(x: Any, size: int) -> Any:
     """``|Σ_n exp(j2πnx)|² / size`` over ``size`` elements."""
-    import drjit as dr
-    import mitsuba as mi
-
     # The kernel has period 1; near 0 both sines vanish and the quotient is the number of elements.
     turned, count = x - dr.round(x), dr.opaque(mi.Float, size)
     sine = dr.sin(dr.pi * turned)
@@ -698,7 +693,6 @@ def _one_element(antenna: Antenna) -> Any:
 
     The device itself stands unturned in the ray tracer: angles are those of the world.
     """
-    import mitsuba as mi
     from sionna.rt import AntennaArray, AntennaPattern
 
     def pattern(theta: Any, phi: Any) -> tuple[Any, Any]:
@@ -725,8 +719,6 @@ def _launched(directions: Any) -> Iterator[None]:
     Sionna RT's solver takes all points of a lattice at once, and the same ones in every call, so that parts
     would repeat each other. The function that it calls is replaced in its module and put back.
     """
-    import drjit as dr
-    import mitsuba as mi
     from sionna.rt.radio_map_solvers import radio_map_solver as module
 
     def spawn(_lattice: object, samples: int, sources: Any) -> Any:
@@ -750,8 +742,6 @@ def _solver(
     Its ``shoot(samples, shooting, seed)`` returns sums, Shape ``[B + 1, cells]``, the element first, and how
     many rays passed through each cell.
     """
-    import drjit as dr
-    import mitsuba as mi
     from sionna.rt import RadioMapSolver
 
     cells = surface.shape[0] * surface.shape[1]
@@ -862,7 +852,6 @@ class _Geometry:
 
 def _level(surface: MeasurementSurface, centre: Float64Array) -> _Geometry:
     """A rectangle, which rays are intersected with by formula."""
-    import mitsuba as mi
     from sionna.rt.radio_map_solvers.planar_radio_map import PlanarRadioMap
 
     low, high = np.array([surface.x[0], surface.y[0]]), np.array([surface.x[-1], surface.y[-1]])
@@ -886,8 +875,6 @@ def _level(surface: MeasurementSurface, centre: Float64Array) -> _Geometry:
 
 def _draped(rt_scene: Any, surface: MeasurementSurface, centre: Float64Array) -> _Geometry:
     """A mesh in the scene, with two triangles for each cell."""
-    import drjit as dr
-    import mitsuba as mi
     from sionna.rt.radio_map_solvers.mesh_radio_map import MeshRadioMap
     from sionna.rt.scene_utils import extend_scene_with_mesh
 

@@ -43,6 +43,7 @@ from caviar_services.channel.enumeration.image_beams import (
     shown_scenery,
 )
 from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.vectors import ranges
@@ -72,8 +73,6 @@ class EdgeTargets:
     """
 
     def __init__(self, scene: SionnaScene, edges: SceneEdges, faces: FaceRectangles) -> None:
-        import mitsuba as mi
-
         # Bodies that no object of the frame uses are in the scene, too, but do not stand in it.
         number, piece = edges.of_bodies
         standing = np.array(scene.standing_bodies, np.int64) + scene.first_body_piece
@@ -310,8 +309,6 @@ def _source_beams(points: Float64Array) -> ImageBeams:
 
 def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeams, owner: Int64Array) -> _Lit:
     """Edges that beams may light, except for edges of the face that reflected the beam last."""
-    import drjit as dr
-
     none = np.zeros(0, np.int64)
     if not (len(beams) and groups.pieces):
         return _Lit(beams, owner, none, none)
@@ -359,8 +356,6 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeam
 
 def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
     """Test whether images are in front of at least one face of edges."""
-    import drjit as dr
-
     back = gathered(beams.image, beam) - gathered(edges.a, edge)
     one, other = dr.dot(back, gathered(edges.one, edge)), dr.dot(back, gathered(edges.other, edge))
     return dr.maximum(one, other) > -targets.slack
@@ -368,8 +363,6 @@ def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any,
 
 def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
     """Test whether edges may be lit: no side of the beam has both ends beyond it."""
-    import drjit as dr
-
     image, a, b = gathered(beams.image, beam), gathered(edges.a, edge), gathered(edges.b, edge)
     normal = gathered(beams.lit, beam)
     lit = dr.maximum(dr.dot(normal, a), dr.dot(normal, b)) > gathered(beams.lit_from, beam) - targets.slack
@@ -418,8 +411,6 @@ def _kept(
     edge: Any,
 ) -> Int64Array:
     """Indices of the pairs of beams that meet at their edge, at the point of Keller's law."""
-    import drjit as dr
-
     origin, along = gathered(edges.a, edge), gathered(edges.along, edge)
     (s, from_source), (t, from_target) = (
         _unfolded(gathered(beams.image, beam) - origin, along) for beams, beam in (one, other)
@@ -436,7 +427,5 @@ def _kept(
 
 def _unfolded(point: Any, along: Any) -> tuple[Any, Any]:
     """Coordinate of points along lines through the origin, and their distance from these lines."""
-    import drjit as dr
-
     s = dr.dot(point, along)
     return s, dr.norm(point - s * along)

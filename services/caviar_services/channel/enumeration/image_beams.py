@@ -30,6 +30,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
 from caviar_space.vectors import ranges
 
@@ -48,9 +49,6 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
     Returns:
         First and second index of each pair, as `mitsuba.UInt`.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     parts = []
     at_once = max(1, _LANES // max(second, 1))
     # Opaque: as a literal, each size would be another kernel to compile, and sizes change in every frame.
@@ -71,8 +69,6 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
 
 def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
     """Pairs of indices that pass a test, evaluated."""
-    import drjit as dr
-
     if not dr.width(numbers[0]):
         return numbers
     kept = dr.compress(test(*numbers))
@@ -83,22 +79,16 @@ def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple
 
 def gathered(column: Any, index: Any) -> Any:
     """Elements of a column of the ray tracer, by index."""
-    import drjit as dr
-
     return dr.gather(type(column), column, index)
 
 
 def indices(values: Int64Array | BoolArray) -> Any:
     """Indices, Shape ``[N]``, as `mitsuba.UInt`, a single one twice (`several`)."""
-    import mitsuba as mi
-
     return mi.UInt(aligned_indices(values[several(len(values))]))
 
 
 def columns(rows: Float64Array) -> list[Any]:
     """Rows, Shape ``[R, N]``, as one `mitsuba.Float` each, of a single number twice (`several`)."""
-    import mitsuba as mi
-
     return [mi.Float(column) for column in aligned_columns(rows[:, several(rows.shape[1])])]
 
 
@@ -109,9 +99,6 @@ def places(points: Float64Array) -> Any:
 
 def opaque(number: int) -> Any:
     """A number that a kernel reads from memory: as a literal, each number would be another kernel."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.opaque(mi.UInt, number)
 
 
@@ -140,9 +127,6 @@ class Targets:
     """
 
     def __init__(self, faces: FaceRectangles, sizes: Int64Array) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.faces = faces
         self.first_body = len(faces) - int(sizes.sum())
         """Number of the first face of a body."""
@@ -186,8 +170,6 @@ class Targets:
 
     def height(self, point: Any, face: Any) -> Any:
         """Heights of points above the planes of faces [m]; negative behind."""
-        import drjit as dr
-
         return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
 
 
@@ -241,8 +223,6 @@ class ImageBeams:
 
         A cheap test before `light`: a cone is one dot product, a pyramid up to eight.
         """
-        import drjit as dr
-
         axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
         towards = centre - gathered(self.image, beam)
         along = dr.dot(axis, towards)
@@ -255,9 +235,6 @@ class ImageBeams:
 
     def light(self, beam: Any, centre: Any, reach: Any) -> Any:
         """Test whether spheres reach into all pyramids of beams."""
-        import drjit as dr
-        import mitsuba as mi
-
         towards = centre - gathered(self.image, beam)
         lit = mi.Bool(True)
         for side in self.sides:
@@ -317,8 +294,6 @@ def longer_beams(targets: Targets, beams: ImageBeams, parent: Int64Array, chain:
 
 def by_scenery(targets: Targets, beams: ImageBeams, scenery: Int64Array) -> tuple[Any, Any]:
     """Pairs of a beam by way of a body and a face of scenery that it lights, as `mitsuba.UInt`."""
-    import drjit as dr
-
     faces = indices(scenery)
     # Only beams by way of a body: which chains of scenery alone exist is known (`scenery_chains`).
     begin = beams.first_by_body
@@ -343,8 +318,6 @@ def by_scenery(targets: Targets, beams: ImageBeams, scenery: Int64Array) -> tupl
 
 def lit_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
     """Pairs of a beam and a face of a body whose sphere it lights, as `mitsuba.UInt`."""
-    import drjit as dr
-
     slack = targets.slack
     beam, body = near_bodies(targets, beams)
 
@@ -381,8 +354,6 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
         image: Image of the source before that reflection.
         before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
     """
-    import drjit as dr
-
     if not len(chain):  # kernels of no lanes do not exist
         return ImageBeams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
     last = indices(chain[:, -1])
@@ -429,8 +400,6 @@ def near_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
 
 def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> Any:
     """Test whether rectangles may be lit: no side of the beam has all four corners beyond it."""
-    import drjit as dr
-
     corners, image = targets.corners(face), gathered(beams.image, beam)
     # Separating planes of a convex pyramid and a convex rectangle: conservative, as only the pyramid's are
     # tried.
@@ -443,16 +412,12 @@ def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> 
 
 def _some(corners: list[Any], normal: Any, offset: Any) -> Any:
     """Test whether one of the corners at least is beyond a plane."""
-    import drjit as dr
-
     a, b, c, d = (dr.dot(normal, corner) for corner in corners)
     return dr.maximum(dr.maximum(a, b), dr.maximum(c, d)) > offset
 
 
 def _sides(image: Any, corners: list[Any]) -> list[Any]:
     """Unit normals, inwards, of the sides of the pyramid from a point around corners in turn."""
-    import drjit as dr
-
     edges = [corner - image for corner in corners]
     middle = edges[0] + edges[2]
     sides = []
@@ -467,8 +432,6 @@ def _sides(image: Any, corners: list[Any]) -> list[Any]:
 
 def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
     """Axis of a cone from a point around corners, and the cosine of its half angle."""
-    import drjit as dr
-
     edges = [dr.normalize(corner - image) for corner in corners]
     axis = dr.normalize(edges[0] + edges[1] + edges[2] + edges[3])
     a, b, c, d = (dr.dot(edge, axis) for edge in edges)
@@ -532,8 +495,6 @@ def ends_by_bodies(
         beams: Beams before the last reflection.
         receivers: Positions [m], Shape ``[R, 3]``.
     """
-    import drjit as dr
-
     beam, face = lit_bodies(targets, beams)
     place = places(receivers)
 
@@ -629,9 +590,6 @@ def shown_scenery(
     Returns:
         View and face of each pair, by index into ``views`` and into ``scenery.faces``.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     sizes = np.bincount(scenery.sights[:, 0], minlength=len(scenery.faces))
     own, rows = ranges((np.cumsum(sizes) - sizes)[scenery.place], sizes[scenery.place])
     other = scenery.sights[rows, 1]
@@ -657,8 +615,6 @@ def shown_scenery(
 
 def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
     """Test whether points see images in faces: from the side that reflects, and within the rectangle."""
-    import drjit as dr
-
     there, here = targets.height(image, face), targets.height(point, face)
     crosses = (there * here > 0.0) & ((here > 0.0) | gathered(targets.two_sided, face))
     # The line from the point to the image meets the plane at the share here / (there + here) of its length.
@@ -671,8 +627,6 @@ def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
 
 def _either(used: Any, index: Any) -> Any:
     """An index where it is used, else 0, which can be gathered without reading beyond an array."""
-    import drjit as dr
-
     return dr.select(used, index, 0)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
 from caviar_services.channel.paths import Rows
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.ray_launcher import (
     DIFFRACTED,
     REFLECTED,
@@ -205,9 +206,6 @@ def _runs(launch: Launch) -> Iterator[Int64Array]:
     Neighbouring rays mostly meet the same, so that only the first of each run is looked at. Runs are found
     where the rays are: on a GPU, or on all cores. A ray that has ended stays so: its kind is 0 from there on.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if not launch.rays:
         return
     lane = dr.arange(mi.UInt, launch.rays)
@@ -226,8 +224,6 @@ def _runs(launch: Launch) -> Iterator[Int64Array]:
 
 
 def _differs(column: Any, previous: Any) -> Any:
-    import drjit as dr
-
     return column != dr.gather(type(column), column, previous)
 
 
@@ -238,9 +234,6 @@ def _columns(bounce: Bounce, rays: Int64Array) -> Int64Array:
 
 def _gathered(columns: Sequence[Any], rays: Int64Array) -> Int64Array:
     """Values of C columns of the ray tracer for N rays, Shape ``[C, N]``."""
-    import drjit as dr
-    import mitsuba as mi
-
     # Two more, since to Dr.Jit an array of one element is another kernel.
     index = mi.UInt(aligned_indices(np.append(rays, (0, 0))))
     found = [dr.gather(type(column), column, index) for column in columns]
@@ -371,8 +364,6 @@ class Offer:
             The candidates, the launch that their rays are of, and how many more there are than ``max_paths``
             of each receiver.
         """
-        import drjit as dr
-
         chains, scattered = self._chains, self._scattered
         direct = self._seen(targets) if not self._options.only_scattered else np.zeros(0, np.int64)
         seen = np.ones(len(direct), np.bool_)
@@ -398,7 +389,6 @@ class Offer:
 
     def _seen(self, targets: Any) -> Int64Array:
         """Receivers that the transmitter sees."""
-        import drjit as dr
         from sionna.rt.constants import MIN_SEGMENT_LENGTH
         from sionna.rt.utils import spawn_ray_to
 
@@ -453,8 +443,6 @@ class Planes:
     """
 
     def __init__(self, table: PlaneTable) -> None:
-        import mitsuba as mi
-
         rows = np.concatenate([table.origin, table.normal, table.low, table.high], axis=1).T
         reach = float(np.abs(rows).max(initial=0.0))
         columns = [mi.Float(column) for column in aligned_columns(rows)]
@@ -481,9 +469,6 @@ class Planes:
         Returns:
             Indices of chains and of targets.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         count, receivers = len(chains), dr.width(targets)
         if not count * receivers:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -514,8 +499,6 @@ class Planes:
             source: A `mitsuba.Point3f`.
             numbers: Of the planes, from 1; 0 is none. Each a `mitsuba.UInt`.
         """
-        import drjit as dr
-
         images = [source]
         for number in numbers:
             origin, normal = self.plane(number)
@@ -529,9 +512,6 @@ class Planes:
         Args:
             number: Counted from 1, 0 is none, a `mitsuba.UInt`.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         used = number > 0
         origin = dr.gather(mi.Point3f, self._origin, number - 1, used)
         return origin, dr.gather(mi.Vector3f, self._normal, number - 1, used)
@@ -539,9 +519,6 @@ class Planes:
     def _met(self, here: Any, image: Any, number: Any) -> tuple[Any, Any, Any]:
         """Point where the line to an image meets a plane; whether it does so at too small an angle to tell;
         whether that may be a point of a path."""
-        import drjit as dr
-        import mitsuba as mi
-
         used = number > 0
         origin, normal = self.plane(number)
         line = image - here
@@ -564,8 +541,6 @@ class Faces:
     """
 
     def __init__(self, scene: SionnaScene) -> None:
-        import mitsuba as mi
-
         self._scene = scene
         self._offset = mi.UInt(aligned_indices(scene.offset_by_shape))
         self._surface_of = scene.surface_of
@@ -573,8 +548,6 @@ class Faces:
 
     def _follow_scene(self) -> None:
         """Know which faces are one surface now."""
-        import mitsuba as mi
-
         # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
         if self._surface_of is not self._scene.surface_of:
             self._surface_of = self._scene.surface_of
@@ -590,9 +563,6 @@ class Faces:
         Returns:
             How much farther than a segment's end [m] the first surface along it is, and its number.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         self._follow_scene()
         behind, triangle, hit = self._met(start, end, active)
         return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
@@ -600,9 +570,6 @@ class Faces:
     def _met(self, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any]:
         """Distance [m] from a segment's end to the first triangle along it, its number, and whether
         there is one."""
-        import drjit as dr
-        import mitsuba as mi
-
         line = end - start
         length = dr.norm(line)
         active &= length > 0.0
@@ -636,9 +603,6 @@ class Faces:
 def _looked(
     look: Callable[[Any, Any, Any], tuple[Any, ...]], start: Float64Array, end: Float64Array
 ) -> tuple[Float64Array, Int64Array]:
-    import drjit as dr
-    import mitsuba as mi
-
     # One lane alone would be another kernel to Dr.Jit.
     lanes = several(len(start))
     behind, number, *_ = look(
@@ -725,9 +689,6 @@ def reached(
         sources: Corners of the transmitter's array [m], Shape ``[K, 3]``.
         targets: Corners of the receivers' arrays [m], Shape ``[R, L, 3]``.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     lanes = several(len(chains))
     shape = (len(chains), targets.shape[1], len(sources))
     chains, receiver = chains[lanes], receiver[lanes]
@@ -759,8 +720,6 @@ def reflected(
         chains: Plane at each interaction, −1 past the last, Shape ``[Q, D]``.
         start, end: [m], Shape ``[Q, 3]``.
     """
-    import mitsuba as mi
-
     lanes = several(len(chains))
     number = [mi.UInt(aligned_indices(column + 1)) for column in chains[lanes].T]
     found: BoolArray = _exists(faces, planes, number, positions(start[lanes]), positions(end[lanes])).numpy()
@@ -769,9 +728,6 @@ def reflected(
 
 def _exists(faces: Faces, planes: Planes, number: list[Any], start: Any, end: Any) -> Any:
     """The same on the ray tracer's side; planes are numbered from 1, 0 is none."""
-    import drjit as dr
-    import mitsuba as mi
-
     here = end
     images = planes.images(start, number)
     # From the receiver back to the transmitter: each image is seen through the plane that made it.

@@ -26,6 +26,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Arr
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.paths import PathTable, Rows
 from caviar_services.channel.propagation.utd import Wedges, wedges_of
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
 from caviar_space.meshes import Mesh
@@ -497,8 +498,6 @@ class DeviceEdges:
     """
 
     def __init__(self, edges: MeshEdges, rows: Float64Array, scene: NumberedTriangles) -> None:
-        import mitsuba as mi
-
         triangle, edge = edges.sides
         bounds = np.searchsorted(triangle, np.arange(len(scene.triangle_vertices) + 1))
         self._shape = mi.UInt(aligned_indices(scene.offset_by_shape))
@@ -521,8 +520,6 @@ class DeviceEdges:
         self._take_rows()
 
     def _take_rows(self) -> None:
-        import mitsuba as mi
-
         columns = [mi.Float(column) for column in aligned_columns(self._rows)]
         self._origin, self._along = mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:6])
         self._length = columns[6]
@@ -542,8 +539,6 @@ class DeviceEdges:
         Whether there is one; the ray tracer's `WedgeGeometry`, its first face that which is lit more
         steeply; and its point nearest to where the ray hit.
         """
-        import drjit as dr
-        import mitsuba as mi
         from sionna.rt.constants import EPSILON_FLOAT
         from sionna.rt.utils import WedgeGeometry
 
@@ -578,7 +573,6 @@ def edge_generator(edges: SceneEdges) -> Any:
     Args:
         edges: Of the scene.
     """
-    import drjit as dr
     from sionna.rt.constants import InteractionType
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 

@@ -29,6 +29,7 @@ from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.paths import Antenna, PathTable, with_near_pairs
 from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
@@ -302,8 +303,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _activate(self) -> None:
         """The variant of Mitsuba is the process's, and others may have set theirs."""
-        import mitsuba as mi
-
         if mi.variant() != self._variant:
             mi.set_variant(self._variant)
 
@@ -359,8 +358,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def release_memory(self) -> None:
         """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
-        import drjit as dr
-
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:

@@ -18,6 +18,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Look
 from caviar_services.channel.propagation.image_method import image_points, refined_points
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.candidates import (
     MANY_RAYS,
     Candidates,
@@ -85,8 +86,6 @@ class Tracer:
     """
 
     def __init__(self, scene: SionnaScene, wavelengths: Sequence[float], options: LaunchOptions) -> None:
-        import drjit as dr
-        import mitsuba as mi
         from sionna.rt.antenna_pattern import antenna_pattern_registry
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
         from sionna.rt.path_solvers.image_method import ImageMethod
@@ -290,8 +289,6 @@ class Tracer:
         receivers: Float64Array,
         corners: Corners | None,
     ) -> Traced:
-        import mitsuba as mi
-
         source, targets = positions(transmitter[None]), positions(receivers[several(len(receivers))])
         candidates, launch, lost = offer.candidates(targets, len(receivers))
         if not len(candidates.ray):
@@ -323,8 +320,6 @@ class Tracer:
 
     def _buffer(self, launch: Launch, candidates: Candidates) -> Any:
         """The solver's buffer with these candidates."""
-        import drjit as dr
-        import mitsuba as mi
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
         from sionna.rt.utils import WedgeGeometry
 
@@ -374,8 +369,6 @@ class Tracer:
         was met, and specular points are where the planes say. Mark paths that met other planes than
         those of their chain: they belong to another chain.
         """
-        import mitsuba as mi
-
         types, shapes, primitives, points = geometry(buffer)
         wanted = candidates.planes
         triangles = self._scene.triangle_numbers(shapes, primitives)
@@ -420,9 +413,6 @@ class Tracer:
 
     def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
         """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""
-        import drjit as dr
-        import mitsuba as mi
-
         # Isotropic patterns at both ends: arrays and orientations are applied afterwards.
         upright = positions(np.zeros((1, 3))), positions(np.zeros((dr.width(targets), 3)))
         geometric, carried = dr.copy(buffer.valid), mi.Bool(False)

@@ -22,6 +22,7 @@ from caviar_services.channel.propagation.utd import (
     edge_fields,
     waves_beside,
 )
+from caviar_services.channel.sionna import dr
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 
@@ -117,8 +118,6 @@ def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Ar
     Args:
         buffer: A `PathsBuffer` of Sionna RT.
     """
-    import drjit as dr
-
     depth = buffer.max_depth
     vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
     # One evaluation for all: each `numpy()` alone would run a kernel.
@@ -142,8 +141,6 @@ def read(buffer: Any, carriers: int, transmitter: Float64Array, receivers: Float
         receivers: As the ray tracer has them [m], Shape ``[R, 3]``.
         lost: How many candidates were lost.
     """
-    import drjit as dr
-
     dr.eval(buffer.a, buffer.valid)
     receiver = buffer.target_indices.numpy().astype(np.int64)
     types, shapes, primitives, points = geometry(buffer)

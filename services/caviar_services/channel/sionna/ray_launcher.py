@@ -38,6 +38,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
 from caviar_services.channel.propagation.utd import EPSILON_0
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
 
 T = TypeVar("T")
@@ -132,8 +133,6 @@ class Bounce:
         Args:
             rays: Their numbers, a `mitsuba.UInt`.
         """
-        import drjit as dr
-
         columns = [getattr(self, field.name) for field in fields(self)]
         return Bounce(*(dr.gather(type(column), column, rays) for column in columns))
 
@@ -151,8 +150,6 @@ class Launch:
     @property
     def rays(self) -> int:
         """Number of rays."""
-        import drjit as dr
-
         return int(dr.width(self.bounces[0].kind)) if self.bounces else 0
 
     def take(self, rays: Int64Array) -> Launch:
@@ -161,9 +158,6 @@ class Launch:
         Args:
             rays: Their numbers.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         index = mi.UInt(aligned_indices(rays))
         bounces = tuple(bounce.take(index) for bounce in self.bounces)
         wedges = None if self.wedges is None else dr.gather(type(self.wedges), self.wedges, index)
@@ -190,9 +184,6 @@ class Launch:
 
 def _concatenated(parts: Sequence[Any]) -> Any:
     """Arrays of Dr.Jit, or structures of them, one after the other."""
-    import drjit as dr
-    import mitsuba as mi
-
     whole = dr.zeros(type(parts[0]), sum(dr.width(part) for part in parts))
     begin = 0
     for part in parts:
@@ -297,9 +288,6 @@ class Launcher:
         From launch to launch, by its ``number``, other things are drawn where a ray may go on in several
         ways, and all rays are turned by less than what lies between two of them; at 0 by nothing.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         passes = self._options.passes
         if not passes:
             return Launch((), None)
@@ -344,9 +332,6 @@ class Launcher:
 
     def _bounce(self, origin: Any, direction: Any, active: Any, enabled: Any, wedges: Any) -> tuple[Any, ...]:
         """Next interaction of all rays, and how they go on. Rules of what may follow what are Sionna RT's."""
-        import drjit as dr
-        import mitsuba as mi
-
         ray = mi.Ray3f(origin, direction)
         # Coherent: lanes are in the order of the curve, so neighbours walk the tree together.
         hit = self._mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
@@ -387,9 +372,6 @@ def spread_directions(count: int, part: int, parts: int) -> Any:
 
 def _lattice(count: int, first: int, end: int, step: int = 1) -> Any:
     """Points ``first`` to ``end`` of `sionna.rt.utils.fibonacci_lattice`, each ``step``-th."""
-    import drjit as dr
-    import mitsuba as mi
-
     points = -(-(end - first) // step)
     # In float64: float32 cannot count to the 1e8 rays that a launch may have.
     number = dr.opaque(mi.Float64, first) + dr.opaque(mi.Float64, step) * dr.arange(mi.Float64, points)
@@ -399,9 +381,6 @@ def _lattice(count: int, first: int, end: int, step: int = 1) -> Any:
 
 def _along_curve(lattice: Any) -> Any:
     """Directions of a lattice on the unit square, ordered along a space-filling curve."""
-    import drjit as dr
-    import mitsuba as mi
-
     order = morton_order(np.array(lattice.x, np.float64), np.array(lattice.y, np.float64))
     # Gathered, not made from NumPy: where NumPy's memory happens to lie would be part of the kernel.
     directions = mi.warp.square_to_uniform_sphere(
@@ -468,8 +447,6 @@ def scattered_of(launch: Launch) -> Scattered:
     Args:
         launch: The rays.
     """
-    import drjit as dr
-
     # Looked for where the rays are: on a GPU few of them come back.
     found: list[Any] = [dr.compress(bounce.kind == SCATTERED) for bounce in launch.bounces]
     rays = [numbers.numpy().astype(np.int64) for numbers in found]
@@ -498,9 +475,6 @@ class DrawnPoints:
         Returns:
             Points and receivers of the pairs, and 0 as probability: that of what was drawn.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         ray, depth = self._found.ray, self._found.depth
         if not len(ray):
             return ray, ray, np.zeros(0)
@@ -563,9 +537,6 @@ class Thinning:
     """
 
     def __init__(self, mi_scene: Any, wanted: int, seed: int) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.mi_scene = mi_scene
         self._wanted = wanted
         self._offset = np.uint64(2 * derive_seed(seed, 0, "diffuse paths"))  # of 31 bits
@@ -689,8 +660,6 @@ class ChosenPoints:
     """
 
     def __init__(self, thinning: Thinning, found: Scattered) -> None:
-        import mitsuba as mi
-
         self._ray, self._depth, rows = found.ray, found.depth, found.rows
         self._thinning = thinning
         self._brings = rows[6]
@@ -721,9 +690,6 @@ class ChosenPoints:
     def _weights(self, targets: Any) -> Float64Array:
         """Power that each point is expected to bring each receiver, in any unit; 0 on the side that is not
         lit; Shape ``[P, R]``."""
-        import drjit as dr
-        import mitsuba as mi
-
         receivers = dr.width(targets)
         per_point = dr.opaque(mi.UInt, receivers)
         lane = dr.arange(mi.UInt, len(self._all) * receivers)
@@ -739,9 +705,6 @@ class ChosenPoints:
 
     def _free(self, point: Int64Array, receiver: Int64Array, targets: Any) -> BoolArray:
         """Test whether nothing stands between these points and receivers."""
-        import drjit as dr
-        import mitsuba as mi
-
         some = several(len(point))
         of_point, of_receiver = (
             mi.UInt(aligned_indices(point[some])),

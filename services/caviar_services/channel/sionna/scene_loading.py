@@ -27,6 +27,7 @@ from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Scene
+from caviar_services.channel.sionna import mi
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
@@ -97,8 +98,6 @@ def file_pieces(description: Path | None) -> tuple[dict[str, Piece], tuple[str, 
 
 def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
     """The ray tracer's material of a shape, of which those that are ``made`` are each made once."""
-    import mitsuba as mi
-
     if shape.radio is None:
         named = f"material {shape.material!r} of type {shape.material_type!r}"
         raise AssetError(
@@ -145,8 +144,6 @@ def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
         shape: In world coordinates.
         centre: What the ray tracer counts from [m], Shape ``[3]``.
     """
-    import mitsuba as mi
-
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
     # Faces of each piece refer to its own vertices.
     before = np.cumsum(counts) - counts
@@ -169,8 +166,6 @@ def floats(vertices: Float64Array) -> Any:
     Args:
         vertices: [m], Shape ``[V, 3]``.
     """
-    import mitsuba as mi
-
     (column,) = aligned_columns(vertices.reshape(1, -1))
     return mi.Float(column)
 

@@ -19,6 +19,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Ar
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Rows
+from caviar_services.channel.sionna import mi
 from caviar_services.channel.sionna.candidates import MANY_RAYS, Candidates, Chains, Met, Offer, chains_of
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
@@ -252,8 +253,6 @@ class FollowedOffer(Offer):
 
     def _launch_of(self, chains: Int64Array) -> Launch:
         """Rays that met what these of the chains on offer meet."""
-        import mitsuba as mi
-
         if not len(self._table.depth):
             return Launch((), None)
         table = self._table.take(chains)
