@@ -25,7 +25,7 @@ from caviar_clients.session.scenes import is_recording, scene_at
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import DISTRIBUTION
 from caviar_protocol.topics import Scene
-from caviar_services.channel.radio_map.mapping import (
+from caviar_services.channel.radio_map import (
     FLOOR_DB,
     BeamChoice,
     Coverage,

@@ -21,10 +21,9 @@ from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import topics_of
-from caviar_services.channel.propagation.clearance import Surfaces
 from caviar_services.registry import find_modules_in, load, registered, registered_names
 from caviar_services.service import Service
-from caviar_space.obstacles import Obstacles
+from caviar_space.obstacles import Obstacles, Surfaces
 from caviar_space.scenery import scenery_triangles
 
 
