@@ -33,7 +33,7 @@ from caviar_clients.session.scenes import scene_at
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
-from caviar_services.channel.radio_map.mapping import transmitters_of
+from caviar_services.channel.radio_map import transmitters_of
 from caviar_space.meshes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow

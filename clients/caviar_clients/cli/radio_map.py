@@ -30,12 +30,12 @@ from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Carrier, Scene
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.radio_map.cell_gains import MeasurementSurface
-from caviar_services.channel.radio_map.mapping import (
+from caviar_services.channel.adaptive.controller import AdaptiveSettings, models
+from caviar_services.channel.radio_map import (
     FLOOR_DB,
     Area,
     BeamChoice,
+    MeasurementSurface,
     RadioMap,
     cell_counts,
     decibels,

@@ -17,9 +17,8 @@ from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import scenario_error
 from caviar_protocol.topics import Action
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.batch import MemberSeed as MemberSeed
-from caviar_services.channel.batch import SceneAt
+from caviar_services.channel.base import ChannelModel, SceneAt
+from caviar_services.channel.base import MemberSeed as MemberSeed
 from caviar_services.link.base import BatchLink as BatchLink
 from caviar_services.link.base import LinkBatch, LinkModel
 

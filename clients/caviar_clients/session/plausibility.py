@@ -17,10 +17,10 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import scenario_error
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import Panel
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.propagation.clearance import Surfaces
+from caviar_services.channel.adaptive.controller import AdaptiveSettings, models
 from caviar_services.world.base import World
 from caviar_space.mitsuba_xml import read_scenery
+from caviar_space.obstacles import Surfaces
 from caviar_space.scenery import scenery_assets, scenery_file, scenery_triangles
 
 if TYPE_CHECKING:
