@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.space.coordinates import Vector
-from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_space.obstacles import Obstacles
+from caviar_space.obstacles import Obstacles, Surfaces
 from caviar_space.scenery import scenery_triangles
 
 TRIES = 10_000
