@@ -64,13 +64,8 @@ def require_extras(scenario: Scenario | PreparedScenario) -> None:
 
 def list_scenarios(console: Console) -> None:
     """Print the scenarios that ship, each with a line and the extras that it needs."""
-    table = Table(
-        Column("name", no_wrap=True),
-        Column("what it is", overflow="fold"),
-        Column("needs", overflow="fold"),
-        box=None,
-        pad_edge=False,
-    )
+    columns = (Column(name, overflow="fold") for name in ("what it is", "needs"))
+    table = Table(Column("name", no_wrap=True), *columns, box=None, pad_edge=False)
     lacking: set[str] = set()
     for name, path in shipped_scenarios().items():
         extras = extras_of(load_scenario(path))
