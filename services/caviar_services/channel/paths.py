@@ -37,7 +37,7 @@ from caviar_space.vectors import cross
 class Rows:
     """Base of frozen dataclasses whose arrays have a row for each path, candidate or chain.
 
-    Fields that are no arrays are the same for all rows, and stay.
+    Fields that are neither arrays nor rows are the same for all rows, and stay.
 
     Example:
         >>> @dataclass(frozen=True, eq=False)
@@ -65,6 +65,8 @@ class Rows:
         for name, value in self.__dict__.items():
             if isinstance(value, np.ndarray) and name not in self.shared:
                 value = value[:, which] if name in self.by_carrier else value[which]
+            elif isinstance(value, Rows):
+                value = value.take(which)
             taken.__dict__[name] = value
         return taken
 
@@ -85,7 +87,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class PathGeometry:
+class PathGeometry(Rows):
     """Delays, directions and Doppler shifts of P paths."""
 
     tau: Float64Array
@@ -466,9 +468,8 @@ def with_near_pairs(
     Returns:
         The paths, and the number of pairs that are too close for a direct one.
     """
-    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
-    end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
-    distance = np.sqrt(((end - start) ** 2).sum(-1)).reshape(-1)
+    start, end = path_ends(np.arange(len(los)), transmitters, receivers)
+    distance = np.sqrt(((end - start) ** 2).sum(-1))
     near = np.flatnonzero(distance < max(NEAR_PAIR, wavelengths.max()))
     tx, rx = np.divmod(near, max(len(receivers), 1))
     other = [transmitters[t].name != receivers[r].name for t, r in zip(tx.tolist(), rx.tolist(), strict=True)]
@@ -517,3 +518,21 @@ def with_direct(
         traced=None if table.traced is None else np.concatenate([table.traced, np.full(len(pairs), -1)]),
         faces=None if table.faces is None else np.concatenate([table.faces, empty.astype(np.int32)]),
     )
+
+
+def path_ends(
+    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna], field: str = "position"
+) -> tuple[Float64Array, Float64Array]:
+    """Positions [m] of TX and RX of paths, or another vector of theirs, each of Shape ``[P, 3]``.
+
+    Args:
+        pair: Pair of each path, Shape ``[P]``.
+        transmitters, receivers: Antennas.
+        field: Name of the vector in `Antenna`.
+    """
+    tx, rx = np.divmod(pair, max(len(receivers), 1))
+    start, end = (
+        np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
+        for antennas in (transmitters, receivers)
+    )
+    return start[tx], end[rx]

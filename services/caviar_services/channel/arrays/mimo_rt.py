@@ -26,6 +26,7 @@ from caviar_services.channel.paths import (
     PathGeometry,
     PathTable,
     antenna_fields,
+    path_ends,
     path_geometry,
     with_near_pairs,
 )
@@ -33,7 +34,7 @@ from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.attenuation import Attenuation
 from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import path_ends, path_table
+from caviar_services.channel.sionna.path_table import path_table
 from caviar_services.channel.sionna.scene import SionnaScene
 
 

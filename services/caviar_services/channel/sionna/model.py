@@ -27,13 +27,13 @@ from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
-from caviar_services.channel.paths import Antenna, PathTable, with_near_pairs
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, with_near_pairs
 from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
+from caviar_services.channel.sionna.path_table import Ends, Traced, path_table, traced_surfaces
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, scene_of
 from caviar_services.channel.sionna.settings import SionnaSettings, contributing, transmits
 from caviar_services.channel.sionna.tracking import FollowingState

@@ -27,11 +27,11 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryChains,
     SceneryLaunch,
 )
-from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.paths import Antenna, PathTable, path_ends
 from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends
+from caviar_services.channel.sionna.path_table import Ends, Traced
 from caviar_services.channel.sionna.ray_launcher import Element, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.settings import SionnaSettings
