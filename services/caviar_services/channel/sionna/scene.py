@@ -57,7 +57,6 @@ from caviar_services.channel.sionna.scene_loading import (
     floats,
     itu_materials,
     mi_mesh,
-    near_middle,
     new_scene,
     object_materials,
     own_materials,
@@ -70,7 +69,7 @@ from caviar_services.channel.sionna.triangle_numbering import (
     coinciding_materials,
 )
 from caviar_space.mesh_detail import DetailSettings
-from caviar_space.meshes import Body, Mesh, placed, unit_box
+from caviar_space.meshes import Body, Mesh, coarse_centre, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
@@ -473,7 +472,7 @@ class SionnaScene(NumberedTriangles):
     def _count_from_objects(self, positions: Float64Array) -> None:
         """Let the ray tracer count from the middle of the objects [m], Shape ``[N, 3]``: nothing else says
         where a world without scenery is, and far from the origin its float32 is coarse."""
-        centre = near_middle(positions.min(0), positions.max(0))
+        centre = coarse_centre((positions.min(0) + positions.max(0)) / 2)
         if (centre != self.centre).any():
             self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
             self.count_from(centre)
