@@ -31,7 +31,7 @@ from caviar_labs.stability.lab import (
 )
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Interaction, Scene
-from caviar_services.channel.sionna.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
+from caviar_space.materials import OTHER_MATERIALS, ObjectMaterials, body_kind
 
 pytestmark = pytest.mark.channel
 

@@ -25,9 +25,9 @@ from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
 from caviar_services.channel.sionna.candidates import Faces
-from caviar_services.channel.sionna.materials import DRAWN
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.triangle_numbering import COPLANAR, COPLANAR_RELATIVE
+from caviar_space.materials import DRAWN
 from caviar_space.planes import PlaneTable
 
 OFF_SURFACE = 2e-4

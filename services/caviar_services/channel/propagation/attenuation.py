@@ -48,7 +48,7 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Carrier, Interaction, Scene
 from caviar_services.channel.paths import PathTable, path_corners
-from caviar_services.channel.sionna.materials import ObjectMaterials
+from caviar_space.materials import ObjectMaterials
 from caviar_space.meshes import Mesh, placed, unit_box
 from caviar_space.vectors import ranges
 

@@ -44,10 +44,8 @@ from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.paths import Rows
+from caviar_space.materials import EPSILON_0
 from caviar_space.vectors import cross, unit
-
-# Permittivity of vacuum [F/m] (CODATA 2018).
-EPSILON_0 = 8.8541878128e-12
 
 # Sine of the angle between two directions below which they are one.
 _ALONG = 1e-9

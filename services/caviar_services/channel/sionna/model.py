@@ -30,7 +30,6 @@ from caviar_services.channel.base import Found, PathModel
 from caviar_services.channel.paths import Antenna, PathTable, path_ends, with_near_pairs
 from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
 from caviar_services.channel.sionna import dr, mi
-from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
 from caviar_services.channel.sionna.path_table import Ends, Traced, path_table, traced_surfaces
@@ -40,6 +39,7 @@ from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_space.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 
 
 class SionnaChannel(PathModel[SionnaSettings]):

@@ -37,9 +37,9 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Ar
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
-from caviar_services.channel.propagation.utd import EPSILON_0
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
+from caviar_space.materials import EPSILON_0
 
 T = TypeVar("T")
 

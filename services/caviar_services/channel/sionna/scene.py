@@ -32,20 +32,8 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.utd import EPSILON_0, Media
+from caviar_services.channel.propagation.utd import Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
-from caviar_services.channel.sionna.materials import (
-    BODY_THICKNESS,
-    OBJECT_MATERIAL,
-    Constants,
-    ItuMaterial,
-    MaterialPolicy,
-    ObjectMaterials,
-    OutsideUse,
-    SurfaceMaterial,
-    UsedSurfaces,
-    itu_material,
-)
 from caviar_services.channel.sionna.scene_loading import (
     BodyPool,
     ObjectMaterial,
@@ -67,6 +55,19 @@ from caviar_services.channel.sionna.triangle_numbering import (
     NumberedTriangles,
     closed_walls,
     coinciding_materials,
+)
+from caviar_space.materials import (
+    BODY_THICKNESS,
+    EPSILON_0,
+    OBJECT_MATERIAL,
+    Constants,
+    ItuMaterial,
+    MaterialPolicy,
+    ObjectMaterials,
+    OutsideUse,
+    SurfaceMaterial,
+    UsedSurfaces,
+    itu_material,
 )
 from caviar_space.mesh_detail import DetailSettings
 from caviar_space.meshes import Body, Mesh, coarse_centre, placed, unit_box

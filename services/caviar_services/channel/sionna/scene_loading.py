@@ -27,7 +27,8 @@ from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna import mi
-from caviar_services.channel.sionna.materials import (
+from caviar_services.drjit_setup import aligned_columns
+from caviar_space.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
@@ -38,7 +39,6 @@ from caviar_services.channel.sionna.materials import (
     body_kind,
     itu_material,
 )
-from caviar_services.drjit_setup import aligned_columns
 from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_space.meshes import Body, Mesh, assign_bodies, coarse_centre, object_meshes, shown_asset
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh

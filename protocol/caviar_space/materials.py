@@ -16,7 +16,9 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_services.channel.propagation.utd import EPSILON_0
+
+EPSILON_0 = 8.8541878128e-12
+"""Permittivity of vacuum [F/m] (CODATA 2018)."""
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
