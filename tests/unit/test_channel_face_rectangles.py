@@ -71,7 +71,7 @@ def test_images_are_as_far_behind_as_points_are_in_front() -> None:
 
 def test_faces_that_are_taken_keep_their_triangles() -> None:
     made, _, _ = faces()
-    other = made.take(np.array([1])).and_those(made.take(np.array([0])))
+    other = FaceRectangles.joined([made.take(np.array([1])), made.take(np.array([0]))])
     assert other.plane.tolist() == [7, 3]
     assert other.sizes.tolist() == [4, 1]
     assert np.array_equal(other.triangles, np.concatenate([made.triangles[1:], made.triangles[:1]]))

@@ -404,29 +404,15 @@ def edge_paths(
         one surface, the first one.
     """
     parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
-    parts.append(_no_paths(depth))
-    found = EdgePaths(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("chain", "bend", "count", "edge", "receiver", "points")
-        )
-    )
-    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
-    keys = np.column_stack(
-        [found.receiver, found.count, edges.number[found.edge], found.bend, _surfaces(edges, found.chain)]
-    )
-    return found.take(np.unique(keys, axis=0, return_index=True)[1])
-
-
-def _no_paths(depth: int) -> EdgePaths:
     none = np.zeros(0, np.int64)
-    return EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3)))
-
-
-def _surfaces(edges: EdgeTargets, chain: Int64Array) -> Int64Array:
-    surfaces = np.full(chain.shape, -1)
-    surfaces[chain >= 0] = edges.surface_of_face[chain[chain >= 0]]
-    return surfaces
+    parts.append(EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3))))
+    found = EdgePaths.joined(parts)
+    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
+    surfaces = np.full(found.chain.shape, -1)
+    surfaces[found.chain >= 0] = edges.surface_of_face[found.chain[found.chain >= 0]]
+    number = edges.number[found.edge]
+    keys = np.column_stack([found.receiver, found.count, number, found.bend, surfaces])
+    return found.take(np.unique(keys, axis=0, return_index=True)[1])
 
 
 def _with_points(
@@ -439,7 +425,11 @@ def _with_points(
 ) -> EdgePaths:
     start = np.broadcast_to(transmitter, (len(chains.edge), 3))
     ends = receivers[chains.receiver]
-    source, target = _image(faces, chains.before, start), _image(faces, chains.behind, ends)
+    source, target = start, ends
+    for column in chains.before.T:
+        source = faces.mirrored(source, column)
+    for column in chains.behind.T:
+        target = faces.mirrored(target, column)
     wedge = edges.ends[chains.edge]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
         place = keller_point(source, target, wedge)
@@ -466,13 +456,6 @@ def _with_points(
         chains.receiver[rows],
         points,
     )
-
-
-def _image(faces: FaceRectangles, chain: Int64Array, points: Float64Array) -> Float64Array:
-    """Images of points [m] in all faces of chains of one length, Shape ``[N, 3]``."""
-    for column in chain.T:
-        points = faces.mirrored(points, column)
-    return points
 
 
 def unhidden_over_edges(

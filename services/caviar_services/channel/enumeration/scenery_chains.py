@@ -27,7 +27,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache, reduce
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +39,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
+from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -56,7 +57,7 @@ _RECTANGLE_SLACK = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class FaceRectangles:
+class FaceRectangles(Rows):
     """F plane faces; coordinates in metres, relative to one origin.
 
     The triangles of all faces stand one face after the other.
@@ -108,8 +109,6 @@ class FaceRectangles:
             two_sided: See ``plane``.
         """
         count = len(plane)
-        if not count:
-            return cls.none()
         origin = triangles[along // 3, along % 3]
         side = triangles[along // 3, (along + 1) % 3] - origin
         # Corners lie in the plane to rounding only; the axes have to lie in it exactly.
@@ -133,38 +132,13 @@ class FaceRectangles:
             sizes=sizes,
         )
 
-    @classmethod
-    def none(cls) -> FaceRectangles:
-        """No faces."""
-        return cls(
-            plane=np.zeros(0, np.int64),
-            normal=np.zeros((0, 3)),
-            offset=np.zeros(0),
-            centre=np.zeros((0, 3)),
-            axes=np.zeros((0, 2, 3)),
-            half=np.zeros((0, 2)),
-            two_sided=np.zeros(0, np.bool_),
-            triangles=np.zeros((0, 3, 2)),
-            sizes=np.zeros(0, np.int64),
-        )
-
     def __len__(self) -> int:
         return len(self.plane)
 
-    def and_those(self, other: FaceRectangles) -> FaceRectangles:
-        """These faces followed by others."""
-        names = [field.name for field in fields(self)]
-        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
-        return FaceRectangles(**both)
-
-    def take(self, faces: Int64Array) -> FaceRectangles:
+    def take(self, faces: Int64Array | BoolArray) -> FaceRectangles:
         """These faces, in this order."""
         rows = ranges(np.cumsum(self.sizes)[faces] - self.sizes[faces], self.sizes[faces])[1]
-        columns = {
-            field.name: getattr(self, field.name)[rows if field.name == "triangles" else faces]
-            for field in fields(self)
-        }
-        return FaceRectangles(**columns)
+        return replace(super().take(faces), triangles=self.triangles[rows])
 
     def mirrored(self, points: Float64Array, faces: Int64Array) -> Float64Array:
         """Images of points [m] in the planes of faces, both of N, Shape ``[N, 3]``."""

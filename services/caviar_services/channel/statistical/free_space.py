@@ -34,7 +34,7 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
 
     def batch(self) -> SameChannels:
         """Make the channels of many episodes at once, which are the same in all of them."""
-        return SameChannels(self, self.run.name)
+        return SameChannels(self)
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
         start, end = path_ends(np.arange(len(transmitters) * len(receivers)), transmitters, receivers)
