@@ -554,7 +554,8 @@ def ends_by_scenery(
     def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
         there = gathered(columns[1], block) + number
         within = there < gathered(columns[2], block)
-        return gathered(by_group, _either(within, there)), within
+        # Index 0 can be gathered without reading beyond an array.
+        return gathered(by_group, dr.select(within, there, 0)), within
 
     def near(block: Any, number: Any) -> Any:
         beam, within = beam_of(block, number)
@@ -623,11 +624,6 @@ def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
         square = dr.squared_norm(side)
         crosses &= dr.abs(dr.dot(beside, side)) <= square + targets.slack * dr.sqrt(square)
     return crosses
-
-
-def _either(used: Any, index: Any) -> Any:
-    """An index where it is used, else 0, which can be gathered without reading beyond an array."""
-    return dr.select(used, index, 0)
 
 
 @dataclass(frozen=True, eq=False)

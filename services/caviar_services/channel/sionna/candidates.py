@@ -546,13 +546,6 @@ class Faces:
         self._surface_of = scene.surface_of
         self._surface = mi.UInt(aligned_indices(scene.surface_of))
 
-    def _follow_scene(self) -> None:
-        """Know which faces are one surface now."""
-        # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
-        if self._surface_of is not self._scene.surface_of:
-            self._surface_of = self._scene.surface_of
-            self._surface = mi.UInt(aligned_indices(self._surface_of))
-
     def along(self, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
         """Look along segments, in a kernel.
 
@@ -563,7 +556,10 @@ class Faces:
         Returns:
             How much farther than a segment's end [m] the first surface along it is, and its number.
         """
-        self._follow_scene()
+        # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
+        if self._surface_of is not self._scene.surface_of:
+            self._surface_of = self._scene.surface_of
+            self._surface = mi.UInt(aligned_indices(self._surface_of))
         behind, triangle, hit = self._met(start, end, active)
         return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
 

@@ -394,26 +394,24 @@ class NumberedTriangles:
         self._number_shapes(shapes, ids, moving)
         corners = np.array([len(mesh.vertices) for mesh in meshes])
         before = self._first_vertices = np.cumsum(corners) - corners
-        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
-        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
+        self.vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        """All vertices as they stand [m], Shape ``[V, 3]``."""
+        faces = [mesh.faces + begin for mesh, begin in zip(meshes, before, strict=True)]
+        self.triangle_vertices = np.concatenate(faces)
+        """Vertices of each triangle, Shape ``[F, 3]``."""
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
         # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
-        self._relative = self._corners - centre
+        self._relative = self.vertices - centre
         self.joined: JoinedFaces
         """Which faces are one surface."""
         material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])
         self._number_planes(meshes, material, unit_meshes)
         last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
-        self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
-        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
-        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        self._vertices = self.vertices[len(self.vertices) - sum(len(mesh.vertices) for mesh in last) :]
+        self._first_moving = len(self.triangle_vertices) - sum(len(mesh.faces) for mesh in last)
+        self.surfaces = Surfaces(self.vertices[self.triangle_vertices], self._points_outside)
         """All triangles, in world coordinates."""
-
-    @property
-    def moving_vertices(self) -> Float64Array:
-        """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
-        return self._vertices.copy()
 
     def count_from(self, centre: Float64Array) -> None:
         """Move everything to stand about another centre as it stood about the last.
@@ -421,10 +419,10 @@ class NumberedTriangles:
         Args:
             centre: [m], Shape ``[3]``.
         """
-        self._corners += centre - self.centre
+        self.vertices += centre - self.centre
         self.centre = centre
         self.version += 1
-        self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
+        self.surfaces.move(np.arange(len(self.triangle_vertices)), self.vertices[self.triangle_vertices])
 
     def move(self, vertices: Float64Array) -> bool:
         """Move the bodies.
@@ -440,25 +438,21 @@ class NumberedTriangles:
             return False
         self._vertices[:] = vertices
         self.version += 1
-        first = len(self._corners) - len(vertices)
+        first = len(self.vertices) - len(vertices)
         self._relative[first:][changed] = vertices[changed] - self.centre
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
-        moved = changed[self._faces[self._first_moving :] - first].any(1)
+        moved = changed[self.triangle_vertices[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
         # Boxes of joined surfaces are around all of their planes: they are made anew.
         joined = np.array([group[0] for group in self.joined.groups], np.int64)
         self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
-        self._join()
-        self.surfaces.move(triangles, self._corners[self._faces[triangles]])
-        return True
-
-    def _join(self) -> None:
-        """Find the faces that are one surface now."""
-        before, now = self.joined, self._coplanar.find()
-        self.joined = now
-        self.plane_table.join(now.groups)
-        if before.groups or now.groups:
+        # Find the faces that are one surface now.
+        before, self.joined = self.joined, self._coplanar.find()
+        self.plane_table.join(self.joined.groups)
+        if before.groups or self.joined.groups:
             self.surface_of = self.joined.label[self.plane_of]
+        self.surfaces.move(triangles, self.vertices[self.triangle_vertices[triangles]])
+        return True
 
     def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
         """Name surfaces so that paths by way of them are known in other frames.
@@ -490,16 +484,6 @@ class NumberedTriangles:
             numbers[its] = -len(known)
         return numbers, tuple(known)
 
-    @property
-    def vertices(self) -> Float64Array:
-        """All vertices as they stand [m], Shape ``[V, 3]``."""
-        return self._corners
-
-    @property
-    def triangle_vertices(self) -> Int32Array:
-        """Vertices of each triangle, Shape ``[F, 3]``."""
-        return self._faces
-
     def begin_of(self, piece: int) -> tuple[int, int]:
         """Numbers of the first vertex and the first triangle of a piece.
 
@@ -507,11 +491,6 @@ class NumberedTriangles:
             piece: Its number.
         """
         return int(self._first_vertices[piece]), int(self._first_triangles[piece])
-
-    @property
-    def first_moving_plane(self) -> int:
-        """Number of the first plane of a body; those of scenery come before."""
-        return int(self._moving_plane)
 
     @property
     def first_body_piece(self) -> int:
@@ -522,8 +501,8 @@ class NumberedTriangles:
     def scenery_digest(self) -> bytes:
         """Digest of all triangles at rest and of their planes."""
         digest = hashlib.blake2b(digest_size=20)
-        faces = self._faces[: self._first_moving]
-        still = self._corners[: len(self._corners) - len(self._vertices)]
+        faces = self.triangle_vertices[: self._first_moving]
+        still = self.vertices[: len(self.vertices) - len(self._vertices)]
         for part in (still - self.centre, faces, self.plane_of[: self._first_moving]):
             digest.update(np.ascontiguousarray(part).tobytes())
         return digest.digest()
@@ -543,7 +522,7 @@ class NumberedTriangles:
             asset: It has one body at least.
         """
         piece = self.first_body_piece + int(self.bodies_of(asset)[0])
-        ends = np.append(self._first_triangles, len(self._faces))
+        ends = np.append(self._first_triangles, len(self.triangle_vertices))
         return self._face_of[ends[piece] : ends[piece + 1]]
 
     def piece_of(self, triangles: Int64Array) -> Int64Array:
@@ -613,7 +592,7 @@ class NumberedTriangles:
         """
         number = self._offsets[self._where(shapes)] + primitives
         # The number of no shape is beyond all others and must not lead out of the table.
-        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        clipped: Int64Array = np.clip(number, 0, len(self.triangle_vertices) - 1)
         return clipped
 
     def corners(self, triangles: Int64Array) -> Float64Array:
@@ -622,7 +601,7 @@ class NumberedTriangles:
         Args:
             triangles: Numbers, of any Shape.
         """
-        corners: Float64Array = self._corners[self._faces[triangles]]
+        corners: Float64Array = self.vertices[self.triangle_vertices[triangles]]
         return corners
 
     def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
@@ -709,7 +688,7 @@ class NumberedTriangles:
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
         before = np.cumsum(counts) - counts
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
-        faces = self._faces.astype(np.int64)
+        faces = self.triangle_vertices.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
         apart.update(self._relative)
         self.part_of = parts.astype(np.int64)
@@ -717,13 +696,14 @@ class NumberedTriangles:
         shared = shared_planes(apart, np.repeat(material[:still], counts[:still]))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
-        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.first_moving_plane = int(len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum()))
+        """Number of the first plane of a body; those of scenery come before."""
         self.plane_table = PlaneTable(self.plane_of, faces)
         self.plane_table.update(self._relative)
         two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
         sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
         self._coplanar = CoplanarFaces(
-            self.plane_table, int(self._moving_plane), counts[still:], np.concatenate(sides)
+            self.plane_table, self.first_moving_plane, counts[still:], np.concatenate(sides)
         )
         self.joined = self._coplanar.none
         self.surface_of = self.plane_of
@@ -735,13 +715,13 @@ class NumberedTriangles:
 
         Scenery has faces of either sense, so their order of corners says nothing.
         """
-        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        piece = int(self.piece_of(np.array(triangle)))
         if triangle < self._first_moving and abs(normal[2]) > _LYING:
             return bool(normal[2] > 0)
-        ends = [*self._first_triangles.tolist(), len(self._faces)]
-        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        ends = [*self._first_triangles.tolist(), len(self.triangle_vertices)]
+        corners = self.vertices[self.triangle_vertices[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
         middle = (corners.min(0) + corners.max(0)) / 2
-        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+        return bool((self.vertices[self.triangle_vertices[triangle, 0]] - middle) @ normal >= 0)
 
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
