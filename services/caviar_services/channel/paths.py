@@ -212,7 +212,7 @@ class Antenna:
             np.array(pose.position),
             rotation_matrix(pose.orientation),
             device_velocity(scene, device),
-            None if patterns is None else patterns.of(device.array),
+            None if patterns is None else patterns.element(device.array),
         )
 
     @cached_property
@@ -255,7 +255,7 @@ def antenna_fields(
         arrival: Whether the antennas receive.
 
     Example:
-        >>> element = Patterns().of(AntennaArray())
+        >>> element = Patterns().element(AntennaArray())
         >>> mast = Antenna("bs", AntennaArray(), np.zeros(3), np.eye(3), np.zeros(3), element)
         >>> antenna_fields([mast], np.array([0]), np.array([[1.0, 0.0, 0.0]])).tolist()
         [[0.0, 0.0, -1.0]]

@@ -326,7 +326,7 @@ class Elements:
     positions: Float64Array
     """[m], Shape ``[elements of all antennas, 3]``."""
 
-    def of(self, antenna: int) -> Float64Array:
+    def positions_of(self, antenna: int) -> Float64Array:
         """Positions of one antenna's elements [m], Shape ``[N, 3]``."""
         begin = int(self.first[antenna])
         return self.positions[begin : begin + self.arrays[antenna].size]

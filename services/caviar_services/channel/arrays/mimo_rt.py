@@ -75,7 +75,7 @@ class ElementTracer:
         return [
             _Element(replace(part, position=at), replace(part, position=self.scene.surfaces.cleared(at)))
             for index, part in enumerate(parts)
-            for at in placed.of(index)
+            for at in placed.positions_of(index)
         ]
 
     def column(

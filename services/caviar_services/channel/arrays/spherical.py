@@ -91,7 +91,7 @@ class ElementGains:
             # Nodes are odd in number along each side, so the middle one is the array's centre.
             self._parts[arrays] = (sent, taken - taken[:, [taken.shape[1] // 2]])
 
-    def of(
+    def amplitudes(
         self, rows: slice, transmit: AntennaArray, receive: AntennaArray
     ) -> tuple[Complex128Array, Complex128Array]:
         """Two parts whose sums are the amplitudes of paths between these arrays.
@@ -410,7 +410,7 @@ class _Field:
         np.sin(turns, out=waves.imag)
         if len(tx):
             arrays = self.transmit.arrays[tx[0]], self.receive.arrays[rx[0]]
-            sent, taken = self.gains.of(rows, *arrays)
+            sent, taken = self.gains.amplitudes(rows, *arrays)
             waves *= taken[:, :, None] + sent[:, None]
         waves *= between.spreading
         for path in np.flatnonzero(~self.seen.every[rows]).tolist():
@@ -430,7 +430,7 @@ def _far_enough(
     every, some = seen.every.copy(), dict(seen.some)
     transmit, receive = ends
     for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
-        sent, taken = transmit.of(antennas[0][path]), receive.of(antennas[1][path])
+        sent, taken = transmit.positions_of(antennas[0][path]), receive.positions_of(antennas[1][path])
         # Bounding boxes first: only arrays that nearly touch need all distances.
         low = np.maximum(sent.min(0), taken.min(0))
         high = np.minimum(sent.max(0), taken.max(0))

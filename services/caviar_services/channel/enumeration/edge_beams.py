@@ -374,7 +374,6 @@ def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any,
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
     """Pairs of a beam from each side that meet at an edge within both beams."""
-
     order = np.argsort(other.edge, kind="stable")
     sizes = np.bincount(other.edge, minlength=len(edges))
     begin, sizes = (np.cumsum(sizes) - sizes)[one.edge], sizes[one.edge]

@@ -442,7 +442,7 @@ class Foliage(Attenuation):
         surfaces = []
         for name, mesh in pieces.items():
             try:
-                surfaces.append((outward(mesh), self._number[self.keys.of(name)]))
+                surfaces.append((outward(mesh), self._number[self.keys.material_for(name)]))
             except ValueError as error:
                 raise AssetError(
                     f"piece of scenery {name!r} is foliage and has no inside: {error}; give it a closed "
@@ -455,7 +455,7 @@ class Foliage(Attenuation):
         boxes = [
             (placed(self._box, scene.dimensions[i], object_pose(scene, i))[self._box.faces], kind)
             for i, (name, cls) in enumerate(zip(scene.names, scene.classes, strict=True))
-            if (kind := self._number.get(self.keys.of(name, cls))) is not None
+            if (kind := self._number.get(self.keys.material_for(name, cls))) is not None
         ]
         self._moving = MeshVolumes.of(boxes)
 

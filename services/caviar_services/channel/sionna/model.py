@@ -463,7 +463,7 @@ def _refuse_buried(scene: Scene, without_body: Sequence[str], foliage: Foliage |
     for device in scene.devices:
         if isinstance(device, AntennaDevice) and device.parent and device.position == (0.0, 0.0, 0.0):
             cls = scene.classes[scene.names.index(device.parent)]
-            is_foliage = foliage is not None and foliage.keys.of(device.parent, cls)
+            is_foliage = foliage is not None and foliage.keys.material_for(device.parent, cls)
             if cls not in without_body and not is_foliage:
                 raise PayloadError(
                     f"antenna {device.name!r} stands in the middle of the body of {device.parent!r}, where "

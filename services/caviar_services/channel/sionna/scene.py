@@ -138,13 +138,13 @@ class SionnaScene(NumberedTriangles):
         """Warnings for the user about the scenery."""
         self._scene = new_scene(piece.material for piece in pieces.values())
         self._objects, self._foliage = settings.objects, settings.foliage
-        leaves = [name for name in pieces if self._foliage.of(name)]
+        leaves = [name for name in pieces if self._foliage.material_for(name)]
         self.foliage_meshes = {name: pieces.pop(name).mesh for name in leaves}
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(pieces)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         made = self._made = self._with_materials_of_meshes(made, set(own.values()))
-        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
+        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.material_for(name))}
         full = by_material(pieces, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
@@ -418,7 +418,7 @@ class SionnaScene(NumberedTriangles):
         return [
             i
             for i, cls in enumerate(scene.classes)
-            if cls not in without_body and not self._foliage.of(scene.names[i], cls)
+            if cls not in without_body and not self._foliage.material_for(scene.names[i], cls)
         ]
 
     def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:

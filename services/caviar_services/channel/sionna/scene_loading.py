@@ -219,7 +219,7 @@ def object_materials(
 
     made = {}
     for name in objects.names:
-        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        change, key = policy.changes_of(name), Place("object_materials").at(objects.key_of(name)).key
         remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
         itu: tuple[ItuMaterial, ...] = ()
         if not change.is_electric:
@@ -262,7 +262,7 @@ def set_materials(
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
             material.relative_permittivity, material.conductivity = itu.constants
-        _checked_change(material, name, policy.of(name), policy)
+        _checked_change(material, name, policy.changes_of(name), policy)
     scene.frequency = frequency_hz
 
 
@@ -283,13 +283,13 @@ def itu_materials(
     for name, material in scene.radio_materials.items():
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
-            found.append((material, itu, policy.of(name).applied(itu.constants)))
+            found.append((material, itu, policy.changes_of(name).applied(itu.constants)))
     return found
 
 
 def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
     """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
-    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+    if not hasattr(material, "itu_type") or policy.changes_of(name).is_electric or not material.is_used:
         return None
     return itu_material(name, material.itu_type, frequency_hz, policy)
 
@@ -603,7 +603,7 @@ class BodyPool:
         if asset not in self._later.meshes:
             asset = shown_asset(asset, self._first.meshes)
         own = self._later.materials.get(asset) or self._own_materials.get(asset, "")
-        return asset, self._objects.of(scene.names[i], scene.classes[i]) or own
+        return asset, self._objects.material_for(scene.names[i], scene.classes[i]) or own
 
     def assign(self, objects: Iterable[tuple[str, str]]) -> dict[str, Body]:
         """Choose a body for each object, as `assign_bodies` does.

@@ -347,7 +347,7 @@ class Following:
         self._followed.clear()
         self._placed = None
 
-    def of(self, transmitter: str) -> Followed:
+    def chains_from(self, transmitter: str) -> Followed:
         """The chains of a transmitter.
 
         Args:
