@@ -21,14 +21,13 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_beams import ChainPairs
 from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
 from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.channel.sionna.triangle_numbering import COPLANAR, COPLANAR_RELATIVE
 from caviar_space.materials import DRAWN
-from caviar_space.planes import PlaneTable
+from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
+from caviar_space.vectors import Rows
 
 OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first face, whose points float32 rounds."""

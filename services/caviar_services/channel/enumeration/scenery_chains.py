@@ -39,7 +39,6 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -47,7 +46,7 @@ from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import positions
 from caviar_space.meshes import Mesh
 from caviar_space.planes import two_sided_planes
-from caviar_space.vectors import cross, ranges
+from caviar_space.vectors import Rows, cross, ranges
 
 RIM = 1e-4
 """[m]; a point this far outside of a triangle counts as inside, so that none falls between two triangles."""

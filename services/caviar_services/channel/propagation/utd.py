@@ -43,9 +43,8 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.paths import Rows
 from caviar_space.materials import EPSILON_0
-from caviar_space.vectors import cross, unit
+from caviar_space.vectors import Rows, cross, unit
 
 # Sine of the angle between two directions below which they are one.
 _ALONG = 1e-9

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.ray_launcher import (
     DIFFRACTED,
@@ -41,6 +40,7 @@ from caviar_services.channel.sionna.ray_launcher import (
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
 from caviar_space.planes import PlaneTable
+from caviar_space.vectors import Rows
 
 MANY_RAYS = 1000
 """Of a chain that no half of a launch would miss."""

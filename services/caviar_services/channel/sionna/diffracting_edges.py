@@ -24,13 +24,13 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.paths import PathTable, Rows
+from caviar_services.channel.paths import PathTable
 from caviar_services.channel.propagation.utd import Wedges, wedges_of
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
 from caviar_space.meshes import Mesh
-from caviar_space.vectors import ranges
+from caviar_space.vectors import Rows, ranges
 
 # [rad]; faces that deviate less from one plane are one, as in `planes`.
 _FLAT_ANGLE = 2e-4

@@ -11,7 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_services.channel.paths import Antenna, PathTable, Rows, path_ends, spread_anew, with_direct
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.propagation.utd import (
@@ -25,6 +25,7 @@ from caviar_services.channel.propagation.utd import (
 from caviar_services.channel.sionna import dr
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.vectors import Rows
 
 # Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`.
 _POLE = 100 * 2.0**-24
