@@ -42,10 +42,10 @@ from caviar_services.channel.enumeration.image_beams import (
     scenery_beams,
     shown_scenery,
 )
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.

@@ -26,18 +26,14 @@ from caviar_services.channel.enumeration.image_paths import (
     unhidden,
     unhidden_over_edges,
 )
-from caviar_services.channel.enumeration.scenery_chains import (
-    FaceRectangles,
-    KnownScenery,
-    SceneFaces,
-    seen_planes,
-)
+from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneFaces, seen_planes
 from caviar_services.channel.propagation.utd import reflection_fields
 from caviar_services.channel.sionna.candidates import Faces, first_of_each
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.path_table import Traced, joined, nothing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.rectangles import FaceRectangles
 
 _NO_SHAPE = 0xFFFFFFFF
 

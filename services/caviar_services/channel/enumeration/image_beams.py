@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import ranges
 
 # Pairs that one kernel tests at most, so that its memory is bounded.

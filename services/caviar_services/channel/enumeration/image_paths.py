@@ -20,13 +20,13 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_beams import ChainPairs
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
 from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.materials import DRAWN
 from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import Rows
 
 OFF_SURFACE = 2e-4

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.enumeration.scenery_chains import RIM, FaceRectangles, narrowest_sides
 from caviar_space.meshes import Mesh, unit_box
 from caviar_space.planes import plane_numbers, two_sided_planes
+from caviar_space.rectangles import RIM, FaceRectangles, narrowest_sides
 from caviar_space.vectors import ranges
 
 L_SHAPE = np.array(
