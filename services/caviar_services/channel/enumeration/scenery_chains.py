@@ -44,6 +44,7 @@ from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import positions
 from caviar_space.meshes import Mesh
 from caviar_space.planes import two_sided_planes
+from caviar_space.rectangles import FaceRectangles, narrowest_sides
 from caviar_space.vectors import ranges
 
 
