@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.triangle_numbering import CoplanarFaces, JoinedFaces
 from caviar_space.meshes import Mesh, box
-from caviar_space.planes import PlaneTable, plane_numbers
+from caviar_space.planes import CoplanarFaces, JoinedFaces, PlaneTable, plane_numbers
 
 FACES = 6
 

@@ -16,7 +16,9 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_services.channel.propagation.utd import EPSILON_0
+
+EPSILON_0 = 8.8541878128e-12
+"""Permittivity of vacuum [F/m] (CODATA 2018)."""
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
@@ -98,7 +100,7 @@ class ObjectMaterials:
         """The materials, sorted."""
         return tuple(sorted(set(self.by_key.values())))
 
-    def of(self, name: str, cls: str = "") -> str:
+    def material_for(self, name: str, cls: str = "") -> str:
         """Material of an object, or of a piece of scenery; empty where no key is for it.
 
         Args:
@@ -107,8 +109,9 @@ class ObjectMaterials:
 
         Example:
             >>> materials = ObjectMaterials({"car": "glass", "bus.*": "metal"})
-            >>> materials.of("bus.3", "bus"), materials.of("c7", "car"), materials.of("wall")
-            ('metal', 'glass', '')
+            >>> named = ("bus.3", "bus"), ("c7", "car"), ("wall", "")
+            >>> [materials.material_for(*name_and_class) for name_and_class in named]
+            ['metal', 'glass', '']
         """
         return self.by_key.get(self.key_for(name, cls), "")
 
@@ -117,7 +120,7 @@ class ObjectMaterials:
         class.
 
         Args:
-            name, cls: See `of`.
+            name, cls: See `material_for`.
 
         Returns:
             The key; empty where there is none.
@@ -231,7 +234,7 @@ class MaterialPolicy:
     key: str = field(default="settings", compare=False)
     """Of the settings in the scenario, for messages."""
 
-    def of(self, name: str) -> MaterialSettings:
+    def changes_of(self, name: str) -> MaterialSettings:
         """Changes of a material.
 
         Args:
@@ -334,7 +337,7 @@ def itu_material(
     if table is None:
         known = sorted({*ITU_MATERIALS_PROPERTIES, *OTHER_MATERIALS})
         raise ScenarioError(
-            f"there is no ITU material {itu_type!r}; {policy.of(itu_type).missing(itu_type)}"
+            f"there is no ITU material {itu_type!r}; {policy.changes_of(itu_type).missing(itu_type)}"
             f"{suggestion(itu_type, known)}",
             key=f"{policy.key}.{name}" if remedy else f"{policy.key}.materials.{name}",
         )

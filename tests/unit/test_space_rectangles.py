@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.enumeration.scenery_chains import RIM, FaceRectangles, narrowest_sides
 from caviar_space.meshes import Mesh, unit_box
 from caviar_space.planes import plane_numbers, two_sided_planes
+from caviar_space.rectangles import RIM, FaceRectangles, narrowest_sides
 from caviar_space.vectors import ranges
 
 L_SHAPE = np.array(
@@ -71,7 +71,7 @@ def test_images_are_as_far_behind_as_points_are_in_front() -> None:
 
 def test_faces_that_are_taken_keep_their_triangles() -> None:
     made, _, _ = faces()
-    other = made.take(np.array([1])).and_those(made.take(np.array([0])))
+    other = FaceRectangles.joined([made.take(np.array([1])), made.take(np.array([0]))])
     assert other.plane.tolist() == [7, 3]
     assert other.sizes.tolist() == [4, 1]
     assert np.array_equal(other.triangles, np.concatenate([made.triangles[1:], made.triangles[:1]]))
