@@ -20,8 +20,8 @@ from xml.parsers import expat
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.errors import AssetError, suggestion
-from caviar_protocol.geometry import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.space.ply import read_ply
 from caviar_space.meshes import Mesh, ply
 

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 import numpy as np
 
 from caviar_protocol.arrays import Payload
+from caviar_protocol.assets import recorded_meshes
 from caviar_protocol.errors import RecordingError, suggestion
-from caviar_protocol.geometry import recorded_meshes
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import (
     FrameEntry,
@@ -100,7 +100,15 @@ class Recording:
         self._starts = [0]
         for segment in self._segments:
             self._starts.append(self._starts[-1] + len(segment.chunks))
-        self._index = self._build_index()
+        # Segments of two runs in one folder would interleave: numbers must ascend without exception.
+        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
+        for earlier, later in pairwise(order):
+            if later <= earlier:
+                raise RecordingError(
+                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
+                    f"episode {earlier[0]}: segments of two runs are mixed"
+                )
+        self._index = {key: index for index, key in enumerate(order)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Its files are mapped into the memory of this process: another one opens them itself.
@@ -398,17 +406,6 @@ class Recording:
             for item in entry.inputs
             if item.status is Status.LATE
         }
-
-    def _build_index(self) -> dict[tuple[int, int], int]:
-        # Segments of two runs in one folder would interleave: numbers must ascend without exception.
-        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
-        for earlier, later in pairwise(order):
-            if later <= earlier:
-                raise RecordingError(
-                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
-                    f"episode {earlier[0]}: segments of two runs are mixed"
-                )
-        return {key: index for index, key in enumerate(order)}
 
     def _read_metadata(self) -> RecordingMetadata:
         found = [metadata_of(segment) for segment in self._segments]
