@@ -160,7 +160,7 @@ def tables_command(
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
     from caviar_clients.datasets.catalogue import Catalogue
-    from caviar_clients.datasets.export import check_out, export_tables
+    from caviar_clients.datasets.formats import check_out, export_tables
     from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.remote import located
 
@@ -231,7 +231,8 @@ def verify_command(
 
     from caviar_clients.cli.shared import require_writable, write_json
     from caviar_clients.datasets.reader import check_level
-    from caviar_clients.datasets.verification.verify import as_rows, verify
+    from caviar_clients.datasets.verification import as_rows
+    from caviar_clients.datasets.verification.verify import verify
 
     check_level(dataset)
     require_writable(json)  # before minutes of reading

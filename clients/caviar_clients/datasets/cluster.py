@@ -7,7 +7,6 @@ may be played twice without harm: so a worker that dies, hangs or loses its sche
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import time
 from collections import deque
@@ -16,16 +15,20 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
-from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
-from caviar_clients.datasets.exits import KNOWN_S, exit_of, noting_nanny
-from caviar_protocol.errors import CaviarError, RunError, SetupError
-from caviar_protocol.files import PrivateFolder
-from caviar_protocol.host import install_command, safe_path
+from caviar_clients.datasets.local_cluster import (
+    CONNECT_S,
+    KNOWN_S,
+    exit_of,
+    noting_nanny,
+    set_up_dask,
+    start_workers,
+)
+from caviar_protocol.errors import CaviarError, RunError
 
 # Part of the extra `datasets`: imported where it is used.
 if TYPE_CHECKING:
-    from distributed import Client, Future, LocalCluster
+    from distributed import Client, Future
 
 ATTEMPTS = 5
 """Times that an episode is begun, where the processes that play it die."""
@@ -296,8 +299,7 @@ class Episodes:
         return self._client
 
     def _connect(self) -> None:
-        import dask
-        from distributed import Client, LocalCluster, Security
+        from distributed import Client, Security
 
         if self._scheduler:
             if self._scheduler.startswith("tls:") and Security().tls_client_cert is None:
@@ -323,30 +325,7 @@ class Episodes:
             self._watch_workers()
             self.workers = len(self._last_seen())
             return
-        # A scheduler runs the code of any client, and any user of the machine reaches its port.
-        try:
-            security = Security.temporary()
-        except ImportError as error:
-            raise SetupError(f"{error}, for TLS between processes: {install_command('datasets')}") from error
-        self._stack.enter_context(safe_path())
-        folder = self._stack.enter_context(PrivateFolder("dask")).path
-        self._stack.enter_context(dask.config.set({"temporary-directory": str(folder)}))
-        # In two steps, since Ctrl-C may end the second one, which leaves a cluster that is half made.
-        cluster = LocalCluster.__new__(LocalCluster)
-        self._stack.callback(_abandon, cluster)
-        cluster.__init__(
-            security=security,
-            n_workers=self.workers,
-            threads_per_worker=1,
-            worker_class=noting_nanny(),
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            scheduler_kwargs={"dashboard": False},
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-        )
-        self._stack.enter_context(cluster)
-        self._client = self._stack.enter_context(Client(cluster, set_as_default=False))
+        self._client = start_workers(self.workers, self._stack)
         self._watch_workers()
 
     def _watch_workers(self) -> None:
@@ -441,14 +420,6 @@ class _Playing:
         self._begun.clear()
         self._twins.clear()
         return list(found.values())
-
-
-def _abandon(cluster: LocalCluster) -> None:
-    """Close a cluster, half made, whole or closed, so that Dask does not at the end of the process."""
-    cluster.shutdown_on_close = False
-    with suppress(Exception):  # workers that have not started yet are in the way of its own order
-        if cluster.status.name not in ("closing", "closed"):
-            cluster.close(timeout=5)
 
 
 async def _exit() -> None:

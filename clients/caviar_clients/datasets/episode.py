@@ -55,9 +55,9 @@ class EpisodeTask:
     kept: str = ""
     """Where the recording of a trial is moved to; empty: it is removed."""
     cached: Mapping[str, bytes] = field(default_factory=dict)
-    """Files that the cache of the process's user needs, by their names in it (`traffic.saved_states`)."""
+    """Files that the cache of the process's user needs, by their names in it (`generate.SharedTraffic`)."""
     settings: str = ""
-    """Digest of the settings of the dataset (`catalogue.fingerprint`): kept beside the recording, so that a
+    """Digest of the settings of the dataset (`settings.fingerprint`): kept beside the recording, so that a
     catalogue can be made from recordings; empty: not known."""
 
 

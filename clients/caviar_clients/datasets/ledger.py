@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,13 +16,13 @@ from typing import Any
 
 import msgspec
 
-from caviar_clients.datasets.catalogue import Catalogue, fingerprint
-from caviar_clients.datasets.differences import refusal
+from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.episode import MEASURED, SETTINGS
 from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset
-from caviar_clients.datasets.rows import rows_of
+from caviar_clients.datasets.rows import rows_of, whole_recording
+from caviar_clients.datasets.settings import fingerprint, refusal
 from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.recording import Recording
@@ -194,10 +193,7 @@ class Ledger:
             self.remote.fetch_episode(number, self.directory)
         folder = self.directory.episode(number)
         try:
-            with warnings.catch_warnings(action="ignore"):  # of damage, which is told below
-                recording = Recording(folder)
-            if recording.damage or not recording.complete:
-                raise RecordingError(recording.damage[0] if recording.damage else f"{folder} breaks off")
+            recording = whole_recording(lambda: Recording(folder))
             rows = rows_of(recording)
             if rows.episode[0] != number:
                 raise RunError(

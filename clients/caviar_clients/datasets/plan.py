@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from caviar_clients.datasets.catalogue import FORMAT
+from caviar_clients.datasets.settings import FORMAT
 from caviar_clients.session.checks import check_implementations
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import ScenarioError

@@ -20,8 +20,9 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_clients.datasets.catalogue import Catalogue, fingerprint
+from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there
+from caviar_clients.datasets.settings import fingerprint
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.host import install_command

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -136,6 +137,24 @@ class EpisodeRows:
     scenes: tuple[tuple[Any, ...], ...]
     users: tuple[tuple[Any, ...], ...]
     products: tuple[tuple[Any, ...], ...]
+
+
+def whole_recording(opened: Callable[[], Recording], *, with_digests: bool = False) -> Recording:
+    """Open a recording that is neither damaged nor broken off.
+
+    Args:
+        opened: Opens it.
+        with_digests: Whether every byte is compared with its digest.
+
+    Raises:
+        RecordingError: It is damaged or breaks off; says where.
+    """
+    with warnings.catch_warnings(action="ignore"):  # of damage, which is the error
+        recording = opened()
+    damage = [*recording.damage, *(recording.run_digest().damage if with_digests else ())]
+    if damage or not recording.complete:
+        raise RecordingError(damage[0] if damage else f"{recording.path} breaks off")
+    return recording
 
 
 def rows_of(recording: Recording) -> EpisodeRows:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_names, checked_path, checked_patterns
 from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
-from caviar_clients.plots.scene_map import MapRenderer
+from caviar_clients.plots.moving import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import CONNECT_TIMEOUT_S, agent_of, open_session

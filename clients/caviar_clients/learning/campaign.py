@@ -23,9 +23,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from caviar_clients.files import writing
-from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_clients.learning.checkpoints import locked, newest_checkpoint
 from caviar_clients.learning.experiment import Experiment
-from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import (
     CHECKPOINTS,
     Progress,

@@ -1,8 +1,8 @@
-"""What a catalogue says that cannot be, and what of it does not follow from the recordings.
+"""Checks of a catalogue: values that cannot be, and rows that do not follow from the recordings.
 
-`check_structure` and `impossible_values` look at the database alone: a catalogue comes from anywhere, and
-SQLite keeps an infinite number, or a text in a column of numbers, where another program wrote it. The others
-compare its tables with one another and with the rows of a recording.
+`impossible_values` looks at the database alone: a catalogue comes from anywhere, and SQLite keeps an infinite
+number, or a text in a column of numbers, where another program wrote it. The others compare its tables with
+one another and with the rows of a recording.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from typing import Any, get_args, get_type_hints
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
 from caviar_clients.datasets.rows import EpisodeRows
-from caviar_clients.datasets.verification.checked_settings import checked_settings
-from caviar_clients.datasets.verification.findings import Finding, gaps, listed, runs
+from caviar_clients.datasets.verification import Finding, gaps, listed, runs
 from caviar_protocol.arrays import MAX_COORDINATE_M
 from caviar_protocol.errors import RecordingError
 
@@ -26,30 +25,11 @@ _PLACES = ("x_m", "y_m", "z_m")
 _SIGNED = (*_PLACES, "gain_db", "snr_db")
 
 
-def check_structure(catalogue: Catalogue) -> None:
-    """Check that a catalogue has all tables and columns, and settings that are a map.
-
-    Args:
-        catalogue: Of the dataset.
-
-    Raises:
-        RecordingError: It lacks one; names it and the way out.
-    """
-    for table in (*TABLES, *MEASURED_TABLES):
-        columns, _ = catalogue.query(f"SELECT * FROM {table} LIMIT 0")  # noqa: S608 - names of our own
-        if lacking := [name for name in columns_of(table) if name not in columns]:
-            raise RecordingError(
-                f"{catalogue.path}: table {table} has no column {lacking[0]}: it is no catalogue of "
-                "this version; generate the dataset anew with --overwrite"
-            )
-    _ = catalogue.planned, catalogue.settings
-
-
 def impossible_values(catalogue: Catalogue, tables: tuple[str, ...]) -> Iterator[Finding]:
     """Values that their columns cannot have: of another type, not finite, below 0 where they count something.
 
     Args:
-        catalogue: With its structure checked.
+        catalogue: Of the dataset.
         tables: That are looked at.
 
     Yields:
@@ -83,11 +63,8 @@ def refuse_impossible(catalogue: Catalogue, *, but: tuple[str, ...] = ()) -> Non
         but: Columns that may have such values, as ``users.tx_beam``.
 
     Raises:
-        RecordingError: It lacks a table or a column, or has values or settings that cannot be; names the
-            first one.
+        RecordingError: It has values that cannot be; names the first one.
     """
-    check_structure(catalogue)
-    checked_settings(catalogue)
     for one in impossible_values(catalogue, (*TABLES, *MEASURED_TABLES)):
         column = one.what.removeprefix("catalogue: ")
         if column in but:
