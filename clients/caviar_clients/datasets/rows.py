@@ -13,6 +13,7 @@ import numpy as np
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
+from caviar_protocol.multipath import delay_spread
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.recording.integrity import declared_digest
 from caviar_protocol.space.scene import antennas, device_pose
@@ -279,9 +280,7 @@ def _profile(a: Any, tau: Any) -> tuple[float | None, float | None, float | None
     total = float(power.sum())
     if not total:
         return None, None, None
-    mean = float((power * tau).sum()) / total
-    spread = math.sqrt(float((power * (tau - mean) ** 2).sum()) / total)
-    return 10.0 * math.log10(total), float(tau.min()), spread
+    return 10.0 * math.log10(total), float(tau.min()), float(delay_spread(a, tau))
 
 
 def _best_pair(
