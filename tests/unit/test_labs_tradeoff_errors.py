@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from caviar_protocol.multipath import power_spread
 from caviar_labs.tradeoff import errors
+from caviar_protocol.multipath import power_spread
 
 RNG = np.random.default_rng(7)
 
@@ -65,7 +65,7 @@ def test_angular_spread_does_not_see_where_angles_wrap() -> None:
 def test_one_wave_has_no_spread() -> None:
     power = np.array([1e-13])
     assert errors.angular_spread_rad(np.array([0.1]), power) == pytest.approx(0, abs=1e-7)
-    assert errors.delay_spread_s(np.array([3e-7]), power) < 1e-20
+    assert power_spread(power, np.array([3e-7])) < 1e-20
 
 
 @pytest.mark.parametrize("scale", [0.9, 1.25, 1j, -1.0])

@@ -2,7 +2,7 @@
 its paths, |y| of the pairs of beams by H, and SNR by |y|.
 
 Points of interaction are recorded, so the geometry of each path is computed anew from them: delay,
-departure, arrival and Doppler shift (`caviar_services.channel.propagation.geometry`). What happens at a point
+departure, arrival and Doppler shift (`caviar_services.channel.paths`). What happens at a point
 takes power and brings none: |a| of a path is at most c/(4πf·cτ) times the amplitudes of both elements towards
 it (Friis 1946), of which reflection and transmission leave the part that Fresnel's coefficients say.
 """
@@ -24,8 +24,7 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, unit_vectors
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES, Interaction
-from caviar_services.channel.paths import Antenna, Turning
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+from caviar_services.channel.paths import Antenna, PathGeometry, Turning, path_geometry
 from caviar_services.link.link_budget import noise_power
 
 GAIN_DB = 0.5
