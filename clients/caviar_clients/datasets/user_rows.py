@@ -47,7 +47,7 @@ class Columns(Mapping[str, NDArray[Any]]):
         self._columns = dict(columns)
 
     @classmethod
-    def of(cls, row: type[Any], names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Columns:
+    def of_rows(cls, row: type[Any], names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Columns:
         """Make columns of the rows of a database.
 
         Args:

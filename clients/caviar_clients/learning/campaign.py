@@ -42,8 +42,6 @@ RECORD = "experiment.json"
 _LOCK = "lock"
 _GOODBYE_S = 5.0
 
-Report = Callable[[Progress], None]
-
 
 class _Record(msgspec.Struct, frozen=True):
     digest: str
@@ -54,7 +52,7 @@ def train_experiment(
     experiment: Experiment,
     root: Path,
     jobs: int = 1,
-    report: Report = lambda progress: None,
+    report: Callable[[Progress], None] = lambda progress: None,
 ) -> list[SeedResult]:
     """Train all seeds of an experiment, or go on with those that are left.
 
@@ -299,7 +297,7 @@ def _start(training: _Training) -> tuple[Connection, Any]:
     return pipe, process
 
 
-def _take(pipe: Connection, report: Report) -> bool:
+def _take(pipe: Connection, report: Callable[[Progress], None]) -> bool:
     """Take what a process says; False: it has ended."""
     try:
         said = pipe.recv()

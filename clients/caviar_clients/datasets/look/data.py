@@ -98,7 +98,7 @@ def read_users(catalogue: Catalogue, progress: Progress) -> UserColumns:
     groups = {pair: at for at, pair in enumerate(pairs)}
 
     def arrays_of(found: list[Any]) -> list[Any]:
-        columns = Columns.of(UserRow, _USER_COLUMNS, found)
+        columns = Columns.of_rows(UserRow, _USER_COLUMNS, found)
         *numbers, carrier, tx = columns.values()
         return [*numbers, np.array([groups[pair] for pair in zip(carrier, tx, strict=True)], dtype=int)]
 

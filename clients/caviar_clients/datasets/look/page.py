@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.look import figures, maps
 from caviar_clients.datasets.look.data import (
     SAMPLE_SCENES,
     Content,
@@ -24,29 +25,7 @@ from caviar_clients.datasets.look.data import (
     read_throughput,
     read_users,
 )
-from caviar_clients.datasets.look.figures import (
-    PANELS,
-    draw_angles,
-    draw_beams,
-    draw_correlation,
-    draw_counts,
-    draw_histograms,
-    draw_services,
-    draw_shares,
-    draw_throughput,
-    lags,
-    picture,
-    pixels,
-)
-from caviar_clients.datasets.look.maps import (
-    cell_m,
-    draw_gain,
-    draw_scans,
-    draw_sight_map,
-    map_height,
-    map_of,
-    scans_height,
-)
+from caviar_clients.datasets.look.figures import picture, pixels
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.texts import (
     bytes_text,
@@ -306,20 +285,20 @@ def _coverage(content: Content) -> dict[str, Any]:
     users, placed = content.users, content.users.placed
     if not placed.any():
         return {}
-    place = map_of(users, content.footprints, content.sample.transmitters)
+    place = maps.map_of(users, content.footprints, content.sample.transmitters)
     gains = users.gain_db[placed & np.isfinite(users.gain_db)]
-    height = map_height(place)
+    height = maps.map_height(place)
     return {
         "placed": int(placed.sum()),
         "span": (gains.min(), gains.max()) if len(gains) else (),
         "has_buildings": content.footprints is not None,
         "scenery_error": content.scenery_error,
         "dots": place.dots is not None,
-        "cell_m": cell_m(place),
+        "cell_m": maps.cell_m(place),
         "lacking": int((placed & ~np.isfinite(users.gain_db)).sum()),
         "share": float(users.los[placed].mean()),
-        "gain": picture(draw_gain(users, place), height, map_like=True),
-        "sight": picture(draw_sight_map(users, place), height, map_like=True),
+        "gain": picture(maps.draw_gain(users, place), height, map_like=True),
+        "sight": picture(maps.draw_sight_map(users, place), height, map_like=True),
     }
 
 
@@ -345,10 +324,10 @@ def _sight(content: Content) -> dict[str, Any]:
     return {
         "rows": table, "valid": valid, "sight": sight, "hidden": hidden, "none": none,
         "others": max(len(rows) - CLASSES, 0),
-        "bars": picture(draw_shares(names, *parts), 0.9 + 0.42 * len(bars)),
+        "bars": picture(figures.draw_shares(names, *parts), 0.9 + 0.42 * len(bars)),
         "each": each,
         "paths": users.paths,
-        "counts": picture(draw_counts([("Users of a scene", each), ("Paths of a user", users.paths)]), 3.3),
+        "counts": picture(figures.draw_counts([("Users of a scene", each), ("Paths of a user", users.paths)]), 3.3),
     }  # fmt: skip
 
 
@@ -376,15 +355,15 @@ def _histogram(users: UserColumns, values: Any, some: Any, name: str, unit: str)
         if mask.any():
             title = f"carrier {wanted}" if len(carriers) > 1 else ""
             panels.append((title, values[mask], users.los[mask]))
-    panels = panels[:PANELS]
+    panels = panels[: figures.PANELS]
     low, median, high = (f"{decimal(at)} {unit}" for at in np.percentile(values[some], [5, 50, 95]))
-    shown = picture(draw_histograms(panels, f"{name} [{unit}]"), 3.0 * -(-len(panels) // 2) + 0.5)
+    shown = picture(figures.draw_histograms(panels, f"{name} [{unit}]"), 3.0 * -(-len(panels) // 2) + 0.5)
     return {"shown": shown, "low": low, "median": median, "high": high}
 
 
 def _angles(content: Content) -> dict[str, Any]:
     paths = content.sample.paths
-    return {"paths": paths, "shown": picture(draw_angles(content.sample), 5.6)} if paths else {}
+    return {"paths": paths, "shown": picture(figures.draw_angles(content.sample), 5.6)} if paths else {}
 
 
 def _impossible_beams(content: Content) -> str:
@@ -421,7 +400,7 @@ def _beams(content: Content) -> dict[str, Any]:
     if tx_beams * rx_beams > MOST_PAIRS:
         return {"shown": None, "codebooks": (tx_beams, rx_beams)}
     counts = np.bincount(users.group[some], minlength=len(users.groups))
-    shown = [int(group) for group in np.argsort(-counts, kind="stable")[:PANELS] if counts[group]]
+    shown = [int(group) for group in np.argsort(-counts, kind="stable")[: figures.PANELS] if counts[group]]
     panels = []
     for group in sorted(shown):
         mask = some & (users.group == group)
@@ -431,7 +410,7 @@ def _beams(content: Content) -> dict[str, Any]:
     group, tx_beam, rx_beam = pairs[:, numbers.argmax()]
     carrier, tx = users.groups[group]
     return {
-        "shown": picture(draw_beams(panels, (tx_beams, rx_beams)), 3.2 * -(-len(panels) // 2) + 0.4),
+        "shown": picture(figures.draw_beams(panels, (tx_beams, rx_beams)), 3.2 * -(-len(panels) // 2) + 0.4),
         "carrier": carrier, "tx": tx, "tx_beam": tx_beam, "rx_beam": rx_beam,
         "pairs": pairs.shape[1],
         "share": numbers.max() / some.sum(),
@@ -473,10 +452,10 @@ def _correlation(content: Content) -> dict[str, Any]:
     if absent := next((text for text, is_so in reasons.items() if is_so), ""):
         return {"absent": absent}
     values = np.array(sample.correlation)[np.array(sample.consecutive)]
-    apart, _, median, _ = lags(sample)
+    apart, _, median, _ = figures.lags(sample)
     return {
         "absent": "",
-        "shown": picture(draw_correlation(sample), 3.4),
+        "shown": picture(figures.draw_correlation(sample), 3.4),
         "pairs": len(values),
         "median": float(np.median(values)),
         "last": (apart[-1], median[-1]) if len(apart) > 1 else (),
@@ -488,7 +467,7 @@ def _lidar(content: Content) -> dict[str, Any]:
     if not scans:
         return {}
     return {
-        "shown": picture(draw_scans(scans), scans_height(scans), map_like=True),
+        "shown": picture(maps.draw_scans(scans), maps.scans_height(scans), map_like=True),
         "has_grid": any(scan.grid is not None for scan in scans),
         "titles": [scan.title.replace("\n", ", ") for scan in scans],
     }
@@ -522,13 +501,13 @@ def _generation(content: Content) -> dict[str, Any]:
         shares["start, reset, saving"] = rest
     values |= {
         "rate": (per * found.scenes / found.elapsed_s, name),
-        "throughput": picture(draw_throughput(found), 3.1),
+        "throughput": picture(figures.draw_throughput(found), 3.1),
         "services": None,
     }
     if shares:
         longest = max(shares, key=lambda name: shares[name])
         values |= {
-            "services": picture(draw_services(shares, found.scenes), 0.9 + 0.36 * len(shares)),
+            "services": picture(figures.draw_services(shares, found.scenes), 0.9 + 0.36 * len(shares)),
             "longest": longest,
             "longest_share": shares[longest] / sum(shares.values()),
         }

@@ -11,13 +11,7 @@ from caviar_clients.datasets.catalogue import MEASURED_TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.remote import RemoteDataset, is_address, located
 from caviar_clients.datasets.rows import rows_of, whole_recording
-from caviar_clients.datasets.verification import Finding, listed, runs
-from caviar_clients.datasets.verification.catalogue_checks import (
-    against_recording,
-    impossible_values,
-    missing_episodes,
-    orphans,
-)
+from caviar_clients.datasets.verification import Finding, catalogue_checks, listed, runs
 from caviar_clients.datasets.verification.physics import PhysicsChecks
 from caviar_protocol.errors import AssetError, RecordingError
 from caviar_protocol.messages import Status
@@ -44,11 +38,11 @@ def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: N
     catalogue = Catalogue(directory.catalogue)
     try:
         settings = catalogue.settings
-        yield from impossible_values(catalogue, MEASURED_TABLES)
+        yield from catalogue_checks.impossible_values(catalogue, MEASURED_TABLES)
         known = catalogue.episodes()
-        yield from missing_episodes(catalogue, known)
+        yield from catalogue_checks.missing_episodes(catalogue, known)
         yield from _not_listed(directory.finished() if remote is None else remote.episodes(), known)
-        yield from orphans(catalogue)
+        yield from catalogue_checks.orphans(catalogue)
         checks = PhysicsChecks(directory.assets, settings)
         scenery = list(lacking_scenery(settings, checks.files))
         if checks.scenery_error and not scenery:
@@ -104,7 +98,7 @@ def _episode(
         yield _damaged(number, str(error), str(folder.parent))
         return
     run = settings.get("scenario", {}).get("run", {})
-    yield from against_recording(catalogue, rows, number)
+    yield from catalogue_checks.against_recording(catalogue, rows, number)
     yield from _scenes_and_stamps(recording, run, number)
     yield from _seeds(recording, run, number)
     yield from _products(recording, run, number)
