@@ -97,8 +97,14 @@ def generate_command(
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
     from caviar_clients.cli.scenarios import extras_of
     from caviar_clients.datasets.generate import generate
-    from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
-    from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
+    from caviar_clients.datasets.plan import (
+        PRESETS,
+        apply_preset,
+        find_preset,
+        plan_dataset,
+        with_cameras,
+        with_own_traffic,
+    )
     from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))

@@ -29,9 +29,8 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -385,21 +384,21 @@ def _check_steps(experiment: Experiment) -> None:
             )
 
 
+# By key of an encoding: what each of its numbers fulfils, and what to write. The network computes with 32
+# bits, of which the least positive number is about 1e-38.
+_ENCODINGS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "scale": (lambda value: 1e-30 <= value <= 1e30, "write numbers > 0, from 1e-30 to 1e30"),
+    "offset": (lambda value: abs(value) <= 1e30, "write finite numbers"),
+    "waves": (lambda value: 0 <= value <= 1024, "write whole numbers from 0 to 1024"),
+}
+
+
 def _check_encodings(experiment: Experiment) -> None:
     for name, encoding in experiment.features.items():
-        scales = encoding.scale if isinstance(encoding.scale, tuple) else (encoding.scale,)
-        # The network computes with 32 bits, of which the least positive number is about 1e-38.
-        if not all(1e-30 <= scale <= 1e30 for scale in scales):
-            place = experiment.place("features", name, "scale")
-            raise place.error(f"is {encoding.scale}, write numbers > 0, from 1e-30 to 1e30")
-        offsets = encoding.offset if isinstance(encoding.offset, tuple) else (encoding.offset,)
-        if not all(math.isfinite(offset) and abs(offset) <= 1e30 for offset in offsets):
-            place = experiment.place("features", name, "offset")
-            raise place.error(f"is {encoding.offset}, write finite numbers")
-        waves = encoding.waves if isinstance(encoding.waves, tuple) else (encoding.waves,)
-        if not all(0 <= count <= 1024 for count in waves):
-            place = experiment.place("features", name, "waves")
-            raise place.error(f"is {encoding.waves}, write whole numbers from 0 to 1024")
+        for key, (is_right, remedy) in _ENCODINGS.items():
+            given = getattr(encoding, key)
+            if not all(map(is_right, given if isinstance(given, tuple) else (given,))):
+                raise experiment.place("features", name, key).error(f"is {given}, {remedy}")
 
 
 def _import(module: str) -> None:

@@ -230,17 +230,17 @@ def draw_shares(
     return draw
 
 
-def draw_counts(panels: Sequence[tuple[str, Any]]) -> Draw:
+def draw_counts(panels: Mapping[str, Any]) -> Draw:
     """A panel for each label, with the shares of small whole numbers.
 
     Args:
-        panels: Label of the axis, and the numbers.
+        panels: Numbers by the label of their axis.
     """
 
     def draw(drawn: Any, theme: Theme) -> None:
         from matplotlib.ticker import MaxNLocator
 
-        for axes, (label, numbers) in zip(panel_axes(drawn, len(panels)), panels, strict=True):
+        for axes, (label, numbers) in zip(panel_axes(drawn, len(panels)), panels.items(), strict=True):
             low, high = int(numbers.min()), int(numbers.max())
             step = -(-(high - low + 1) // 60)  # many numbers share bars
             edges = np.arange(low, high + step + 1, step) - 0.5

@@ -37,7 +37,7 @@ from caviar_clients.datasets.texts import (
     small_time_unit,
     time_text,
 )
-from caviar_clients.datasets.verification.catalogue_checks import refuse_impossible
+from caviar_clients.datasets.verification.verify import refuse_impossible
 from caviar_clients.files import reserved, write_file
 from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
 from caviar_protocol.errors import AssetError, CaviarError, SetupError
@@ -316,6 +316,7 @@ def _sight(content: Content) -> dict[str, Any]:
     names, _, *parts = zip(*bars, strict=True)
     _, scenes = content.catalogue.query("SELECT users FROM scenes")
     each = np.array([number for (number,) in scenes])
+    counts = {"Users of a scene": each, "Paths of a user": users.paths}
     table = [
         (name, f"{count:,}", *map(percent, (1 - none / count, sight / count, hidden / count, none / count)))
         for name, count, sight, hidden, none in (*named, ("all", *total))
@@ -327,7 +328,7 @@ def _sight(content: Content) -> dict[str, Any]:
         "bars": picture(figures.draw_shares(names, *parts), 0.9 + 0.42 * len(bars)),
         "each": each,
         "paths": users.paths,
-        "counts": picture(figures.draw_counts([("Users of a scene", each), ("Paths of a user", users.paths)]), 3.3),
+        "counts": picture(figures.draw_counts(counts), 3.3),
     }  # fmt: skip
 
 

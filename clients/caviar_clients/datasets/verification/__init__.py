@@ -1,8 +1,8 @@
 """Verification of a dataset: what is missing, altered, or does not follow from physics.
 
-`verify` compares files with the catalogue (`catalogue_checks`), looks at what each recording has to have, and
-at the content of each scene (`physics`, `channel_checks`), computed anew from positions, scenery and H. A
-`Finding` is something that is wrong.
+`verify` compares files with the catalogue, looks at what each recording has to have, and at the content of
+each scene (`physics`, `channel_checks`), computed anew from positions, scenery and H. A `Finding` is
+something that is wrong.
 """
 
 from __future__ import annotations
