@@ -134,7 +134,7 @@ class Episodes:
         return found
 
     def _tried(self, pending: dict[Future, str]) -> Iterator[Any]:
-        """What came of trials, as they end, by the address of their workers."""
+        """Yield results of trials, as they end."""
         what = "scenes have been tried beforehand, at every worker,"
         while pending:
             for future in self._ended(pending):
@@ -244,7 +244,7 @@ class Episodes:
         return {address: about["last_seen"] for address, about in found["workers"].items()}
 
     def _ended(self, tasks: Mapping[Future, object]) -> list[Future]:
-        """Those of some tasks that have ended, after a second at most."""
+        """Tasks of these that have ended, after a second at most."""
         from distributed import wait
         from distributed.client import FuturesCancelledError
 
@@ -261,7 +261,7 @@ class Episodes:
         return ended
 
     def _result(self, future: Future, task: EpisodeTask, playing: _Playing) -> EpisodeResult | None:
-        """What came of a task; None: it is begun once more."""
+        """Result of a task; None: it is begun once more."""
         if future.status == "finished":
             try:
                 found: EpisodeResult = future.result(timeout=ANSWER_S)
@@ -275,7 +275,7 @@ class Episodes:
         return self._again(task, playing, f"that died ({self._exit_of(error)})")
 
     def _exit_of(self, error: Any) -> str:
-        """How the process of a `KilledWorker` of Dask ended."""
+        """Say how the process of a `KilledWorker` of Dask ended."""
         return exit_of(error.last_worker.address, wait_s=0.0 if self._scheduler else KNOWN_S)
 
     def _again(self, task: EpisodeTask, playing: _Playing, why: str) -> EpisodeResult | None:

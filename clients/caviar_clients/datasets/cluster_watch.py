@@ -1,4 +1,4 @@
-"""What a generation waits for: workers that are gone or give no sign of life, and steps that do not end.
+"""Watch of a generation: workers that are gone or give no sign of life, and steps that do not end.
 
 `StepWatch` tells it in the process that plays an episode, `ClusterWatch` in the command. Times are arguments:
 the command reads the clock.
@@ -93,7 +93,7 @@ class Stall:
 
     @property
     def error(self) -> str:
-        """Why what waits for it is given up."""
+        """Error of an episode that is given up for it."""
         return (
             f"given up after {self.stands_s:.0f} s in one step, {STALLED_S:.0f} s are the limit: {self.text}"
             "; mend the service, or ask less of it"

@@ -1,4 +1,4 @@
-"""What is there of a dataset: its catalogue against its recordings, before more is played.
+"""Ledger of a dataset: its catalogue against its recordings, before more is played.
 
 The catalogue may be lost, or know of less than there is after a kill: recordings tell what they are, and are
 listed anew. One that is damaged is refused by name, and nothing is removed but by the user.
@@ -34,7 +34,7 @@ SHOWN = 3
 
 
 class _Measured(msgspec.Struct):
-    """What stands beside a recording (`episode.MEASURED`), as far as the catalogue has columns for it."""
+    """File beside a recording (`episode.MEASURED`), as far as the catalogue has columns for it."""
 
     settings: str = ""
     started: str | None = None
@@ -78,7 +78,7 @@ class MissingEpisodes(Sequence[int]):
 
 @dataclass(frozen=True)
 class Ledger:
-    """What is there of a dataset, and where.
+    """Recordings and catalogue of a dataset, and their place.
 
     Args:
         plan: What shall be there.
@@ -98,7 +98,7 @@ class Ledger:
 
     @property
     def began(self) -> bool:
-        """Whether anything of the dataset is there, so that its catalogue is worth keeping."""
+        """True where anything of the dataset is there, so that its catalogue is worth keeping."""
         return any((self.catalogue.settings, self.catalogue.episodes(), self.catalogue.failures()))
 
     @property
@@ -239,7 +239,7 @@ def _with_defaults(made_from: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _measured(folder: Path) -> _Measured:
-    """What stands beside a recording; empty where it cannot be read, since nothing follows from it."""
+    """Read the file beside a recording; empty where it cannot be read, since nothing follows from it."""
     try:
         return msgspec.json.decode((folder / MEASURED).read_bytes(), type=_Measured)
     except (OSError, msgspec.MsgspecError):

@@ -226,9 +226,9 @@ def with_cameras(scenario: Scenario) -> Scenario:
 # --- presets ------------------------------------------------------------------------------------------------
 
 # The columns of Table 2 of the paper, applied to any scenario. Source: Oliveira et al., "Simulation of
-# Machine Learning-Based 6G Systems in Virtual Worlds" (2021), Table 2 and the text around it. Of its sets s011
-# and s012 alone have arrays that turn with their vehicles; s012 is played with spherical waves, which stand
-# for its arrays inside the ray tracer (MIMO-RT).
+# Machine Learning-Based 6G Systems in Virtual Worlds" (2021), Table 2 and the text around it. Of its sets
+# s011 and s012 alone have arrays that turn with their vehicles; s012 is played with spherical waves, which
+# stand for its arrays inside the ray tracer (MIMO-RT).
 
 NO_TIME_MS = 1000
 """[ms] Sampling period of a set whose episodes have one scene: SUMO's longest step."""

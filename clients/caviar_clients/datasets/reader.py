@@ -89,7 +89,7 @@ class Dataset:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """How it was made: ``scenario``, ``versions``, ``device``, digests of ``files``."""
+        """Settings that it was made with: ``scenario``, ``versions``, ``device``, digests of ``files``."""
         return self._catalogue.settings
 
     @property

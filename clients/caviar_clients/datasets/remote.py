@@ -41,7 +41,7 @@ _ALMOST = re.compile(
 
 
 def is_address(location: str | Path) -> bool:
-    """Whether a location of a dataset is an address, not a folder.
+    """Check whether a location of a dataset is an address, not a folder.
 
     Raises:
         RunError: It is empty, or an address that lacks a colon or a slash; has the intended form.

@@ -118,7 +118,7 @@ USER_COLUMNS = {
 
 @dataclass(frozen=True)
 class ProductRow:
-    """What a service made for one instant."""
+    """Product of a service for one instant."""
 
     episode: int
     scene: int

@@ -95,7 +95,7 @@ def student_95(degrees: int) -> float:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured, by method: those of `METHODS`, and the agents that were compared with."""
+    """Measured figures by method: those of `METHODS`, and the agents that were compared with."""
 
     policy: str
     scenario: str

@@ -95,7 +95,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Arguments of the environment; a text ``file:PATH`` is a path relative to the folder of the file."""
 
     def spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """What is registered for the environment, of whose id ``gymnasium.spec`` takes no module.
+        """Registered entry of the environment, of whose id ``gymnasium.spec`` takes no module.
 
         Raises:
             ImportError: Its module cannot be imported; the text says why.
@@ -108,7 +108,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class _Algorithm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
-    """What algorithms share. A hyper-parameter that is left out is the library's default."""
+    """Keys that algorithms share. A hyper-parameter that is left out is the library's default."""
 
     own: ClassVar[tuple[str, ...]] = ("library", "final_learning_rate", "policy_network")
 
@@ -149,7 +149,7 @@ class Dqn(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True, tag
 
 
 class _OnPolicy(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What PPO and A2C share."""
+    """Keys that PPO and A2C share."""
 
     n_steps: Count | None = None
     gae_lambda: Share | None = None
@@ -213,7 +213,7 @@ class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is trained, how, and with which seeds."""
+    """An experiment: what is trained, how, and with which seeds."""
 
     not_in_file: ClassVar[tuple[str, ...]] = ("source", "written")
 
@@ -254,7 +254,7 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return hashlib.sha256(encoded + b"\n" + content).hexdigest()
 
     def place_of_option(self, message: str) -> Place:
-        """Where the option of the environment stands that an error is about.
+        """Place of the option of the environment that an error is about.
 
         Args:
             message: Of the error. It is about an option with whose name it begins, or whose value it quotes.
@@ -266,7 +266,7 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return place.at(found[0]) if len(found) == 1 else place
 
     def place(self, *names: str) -> Place:
-        """Where a key stands in the file."""
+        """Place of a key in the file."""
         place = Place("", self.source)
         for name in names:
             place = place.at(name)
@@ -422,7 +422,7 @@ def _import(module: str) -> None:
 
 
 def _is_of(spec: gymnasium.envs.registration.EnvSpec, module: str) -> bool:
-    """Whether an environment is defined in a module, or in one below it."""
+    """Check whether an environment is defined in a module, or in one below it."""
     made = spec.entry_point
     name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", None)
     if not name:  # a function made from text belongs to none

@@ -1,4 +1,4 @@
-"""What one camera saw at one instant: picture, depth, objects, surface normals, materials.
+"""Pictures of one sensor at one instant: a camera's picture, depth, objects, normals, materials; LIDAR scans.
 
 A LIDAR scan: from above, and as the sensor sees it.
 """

@@ -79,7 +79,7 @@ def link_source(recording: Recording) -> str:
 
 
 def has_users(recording: Recording) -> bool:
-    """Whether any frame of the link has a user."""
+    """Check whether any frame of the link has a user."""
     return any(link.rx for link in _links(recording))
 
 
