@@ -15,6 +15,7 @@ from dataclasses import fields
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_type_hints
+from urllib.parse import quote
 
 import msgspec
 
@@ -96,7 +97,7 @@ class Catalogue:
         with self._errors():
             mode = "rwc" if writable else "ro"
             self._connection = sqlite3.connect(
-                f"file:{_quoted(path)}?mode={mode}", uri=True, timeout=LOCKED_S
+                f"file:{quote(str(path))}?mode={mode}", uri=True, timeout=LOCKED_S
             )
         try:
             self._open()
@@ -345,11 +346,6 @@ def _holders_of(path: Path) -> list[str]:
             of = f" ({command.read_text().strip()})" if command.exists() else ""
             found[f"process {words[4]}{of}"] = None
     return list(found)
-
-
-def _quoted(path: Path) -> str:
-    """A path in the form of a URI, in which these three have meanings."""
-    return str(path).replace("%", "%25").replace("?", "%3f").replace("#", "%23")
 
 
 def columns_of(table: str) -> dict[str, str]:

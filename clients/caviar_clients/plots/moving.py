@@ -30,12 +30,12 @@ from caviar_clients.plots.rays import Footprints, rays
 from caviar_clients.plots.sensors import SKY_GREY
 from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, Labels, styled
 from caviar_clients.plots.user_curves import UserSeries, curves, shade
-from caviar_protocol.arrays import Float64Array, UInt8Array
+from caviar_protocol.arrays import UInt8Array
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.space.codebooks import codebook_of
 from caviar_protocol.space.scene import Pair, device_pose
-from caviar_protocol.topics import AntennaArray, Link, Scene
+from caviar_protocol.topics import Link, Scene
 
 # Width of a picture [inches]; all sizes below are inches too, so that texts grow with the pixels. A layout
 # engine of Matplotlib would place the panels by the texts that happen to be in the first picture.
@@ -387,7 +387,7 @@ class MapRenderer:
         if pair is not None and link is not None:
             users = zip(link.tx, link.rx, link.carrier, strict=True)
             user = next((u for u in users if u[:2] == (pair.tx.name, pair.rx.name)), None)
-        data = MapData(scene, None, link, None, _beam_gain, user, title)
+        data = MapData(scene, None, link, None, lambda array, *of: codebook_of(array).gain(*of), user, title)
         axes = self._axes
         axes.clear()
         self._widen(scene)
@@ -412,7 +412,3 @@ class MapRenderer:
         if len(seen):
             self._low = np.minimum(self._low, seen.min(0) - MARGIN_M)
             self._high = np.maximum(self._high, seen.max(0) + MARGIN_M)
-
-
-def _beam_gain(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:
-    return codebook_of(array).gain(beam, directions)

@@ -225,13 +225,15 @@ def draw_view(view: CameraView, title: str, folder: Path, stem: str = "camera") 
     Returns:
         The files, all in one first.
     """
+    from matplotlib.image import imsave
+
     panels = list(_panels(view))
     files = [folder / f"{stem}.png"]
     _draw_all(panels, title, files[0])
     for kind, name, draw, aspect in panels:
         files.append(folder / f"{stem}-{kind}.png")
         if kind == "rgb" and view.rgb is not None:
-            _save_pixels(view.rgb, files[-1])
+            imsave(files[-1], np.ascontiguousarray(view.rgb))
             continue
         with figure(files[-1], 9.5, 7.0 * aspect + 0.6) as drawn:
             axes = drawn.subplots()
@@ -397,9 +399,3 @@ def _legend(axes: Any, entries: list[tuple[str, tuple[float, ...]]]) -> None:
 
     handles = [Patch(facecolor=colour, edgecolor=LIGHT_GREY, label=name) for name, colour in entries]
     axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0, frameon=False)
-
-
-def _save_pixels(rgb: UInt8Array, file: Path) -> None:
-    from matplotlib.image import imsave
-
-    imsave(file, np.ascontiguousarray(rgb))
