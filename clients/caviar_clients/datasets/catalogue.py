@@ -97,7 +97,7 @@ class Catalogue:
         with self._errors():
             mode = "rwc" if writable else "ro"
             self._connection = sqlite3.connect(
-                f"file:{quote(str(path))}?mode={mode}", uri=True, timeout=LOCKED_S
+                f"file:{quote(os.fsencode(path))}?mode={mode}", uri=True, timeout=LOCKED_S
             )
         try:
             self._open()

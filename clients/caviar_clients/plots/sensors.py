@@ -225,11 +225,11 @@ def draw_view(view: CameraView, title: str, folder: Path, stem: str = "camera") 
     Returns:
         The files, all in one first.
     """
-    from matplotlib.image import imsave
-
     panels = list(_panels(view))
     files = [folder / f"{stem}.png"]
     _draw_all(panels, title, files[0])
+    from matplotlib.image import imsave  # where that drew, it is installed
+
     for kind, name, draw, aspect in panels:
         files.append(folder / f"{stem}-{kind}.png")
         if kind == "rgb" and view.rgb is not None:
