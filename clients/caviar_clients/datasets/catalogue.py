@@ -13,13 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 from urllib.parse import quote
 
 import msgspec
 
-from caviar_clients.datasets.rows import Episode, EpisodeRows, ProductRow, SceneRow, UserRow
+from caviar_clients.datasets.rows import Episode, EpisodeRows, ProductRow, SceneRow, UserRow, column_types
 from caviar_clients.datasets.settings import FORMAT, check_settings
 from caviar_protocol.errors import RecordingError
 
@@ -401,7 +400,5 @@ def _schema() -> str:
 
 
 def _columns(cls: type[Any]) -> Iterator[str]:
-    for name, hint in get_type_hints(cls).items():
-        optional = isinstance(hint, UnionType)
-        kind = get_args(hint)[0] if optional else hint
+    for name, (kind, optional) in column_types(cls).items():
         yield f"{name} {_SQL_TYPES[kind]}{'' if optional else ' NOT NULL'}"

@@ -6,7 +6,8 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -138,6 +139,20 @@ class EpisodeRows:
     scenes: tuple[tuple[Any, ...], ...]
     users: tuple[tuple[Any, ...], ...]
     products: tuple[tuple[Any, ...], ...]
+
+
+def column_types(row: type[Any]) -> dict[str, tuple[type[Any], bool]]:
+    """Find the type of each column of a table, and whether it may lack a value.
+
+    Args:
+        row: Class whose fields are the columns.
+
+    Example:
+        >>> column_types(UserRow)["x_m"]
+        (<class 'float'>, True)
+    """
+    hints = get_type_hints(row).items()
+    return {n: (get_args(h)[0], True) if isinstance(h, UnionType) else (h, False) for n, h in hints}
 
 
 def whole_recording(opened: Callable[[], Recording], *, with_digests: bool = False) -> Recording:

@@ -6,13 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.remote import RemoteDataset, is_address, located
-from caviar_clients.datasets.rows import EpisodeRows, rows_of, whole_recording
+from caviar_clients.datasets.rows import EpisodeRows, column_types, rows_of, whole_recording
 from caviar_clients.datasets.verification import Finding, gaps, listed, runs
 from caviar_clients.datasets.verification.physics import PhysicsChecks
 from caviar_protocol.arrays import MAX_COORDINATE_M
@@ -190,17 +189,12 @@ def _number(value: object) -> int:
 def _rules(table: str) -> dict[str, tuple[str, str]]:
     """By column: what it has, in words, and the condition of SQL that holds where it has something else."""
     found = {}
-    optional = {}
-    if table in TABLES:
-        hints = get_type_hints(TABLES[table][0])
-        optional = {name: isinstance(hint, UnionType) for name, hint in hints.items()}
-        flags = {name for name, hint in hints.items() if bool in (hint, *get_args(hint))}
-    else:
-        flags = set()
+    types = column_types(TABLES[table][0]) if table in TABLES else {}
     for name, kind in columns_of(table).items():
+        python, optional = types.get(name, (None, True))
         if kind == "TEXT":
             words, right = "a text", f"typeof({name}) = 'text'"
-        elif name in flags:
+        elif python is bool:
             words, right = "0 or 1", f"typeof({name}) = 'integer' AND {name} IN (0, 1)"
         elif kind == "INTEGER":
             words, right = "a whole number from 0 on", f"typeof({name}) = 'integer' AND {name} >= 0"
@@ -210,7 +204,7 @@ def _rules(table: str) -> dict[str, tuple[str, str]]:
                 (f"a number within ±{limit:g}", -limit) if name in _SIGNED else ("a number from 0 on", 0)
             )
             right = f"typeof({name}) IN ('real', 'integer') AND {name} BETWEEN {low:g} AND {limit:g}"
-        if optional.get(name, table not in TABLES):
+        if optional:
             words, right = f"{words}, or none", f"({name} IS NULL OR {right})"
         found[name] = words, f"NOT ({right})"
     return found
