@@ -400,9 +400,7 @@ class MapRenderer:
             draw_beam(axes, beam)
         draw_objects(axes, data)
         draw_antennas(axes, data)
-        axes.set_xlabel("x, east [m]")
-        axes.set_ylabel("y, north [m]")
-        axes.set_title(title)
+        axes.set(xlabel="x, east [m]", ylabel="y, north [m]", title=title)
         self._canvas.draw()
         return np.array(self._canvas.buffer_rgba())[..., :3].copy()  # the canvas uses its buffer again
 

@@ -113,9 +113,7 @@ def _draw_above(drawn: Any, axes: Any, scan: LidarScan, moving: BoolArray, scene
         "", xy=(x + 0.12 * extent * heading[0], y + 0.12 * extent * heading[1]), xytext=(x, y),
         arrowprops={"arrowstyle": "->", "color": BLACK, "linewidth": 1.6}, zorder=6,
     )  # fmt: skip
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, east [m]")
-    axes.set_ylabel("y, north [m]")
+    axes.set(aspect="equal", xlabel="x, east [m]", ylabel="y, north [m]")
     axes.grid()
 
 
@@ -136,8 +134,7 @@ def _draw_ranges(drawn: Any, axes: Any, scan: LidarScan, device: LidarDevice) ->
         extent=(180 + half, -180 + half, *elevation),
     )  # fmt: skip
     drawn.colorbar(shown, ax=axes, label="Range [m]", pad=0.01)
-    axes.set_xticks(range(-180, 181, 45))
-    axes.set_xlabel("Azimuth from the sensor's x axis, counter-clockwise [°]")
+    axes.set(xticks=range(-180, 181, 45), xlabel="Azimuth from the sensor's x axis, counter-clockwise [°]")
     axes.set_ylabel("Elevation [°]")
 
 
@@ -317,8 +314,7 @@ def _aspect(image: Any) -> float:
 
 
 def _show(axes: Any, image: Any, **how: Any) -> Any:
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_visible(False)
     axes.set_facecolor(SKY_GREY)
