@@ -96,11 +96,15 @@ def unit_box() -> Mesh:
     return box((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 
 
+Body = tuple[str, int]
+"""Asset (or kind: an asset and a material) and slot, from 0, of a body in a ray tracer's pool."""
+
+
 def assign_bodies(
     objects: Iterable[tuple[str, str]],
     pool: Mapping[str, int],
     keys: Mapping[str, str] = MappingProxyType({}),
-) -> dict[str, tuple[str, int]]:
+) -> dict[str, Body]:
     """Choose the body of a ray tracer that stands for each object of a scene.
 
     Names are assigned in sorted order, so that the assignment follows from the scene alone, also after a
@@ -112,7 +116,7 @@ def assign_bodies(
         keys: Key of the scenario that says how many, by asset, for the error.
 
     Returns:
-        Asset and slot, from 0, of each object's body, by name.
+        The body of each object, by its name.
 
     Raises:
         PayloadError: There are more objects of an asset than bodies, or none of its bodies at all; names the
@@ -122,7 +126,7 @@ def assign_bodies(
         >>> assign_bodies([("car.2", ""), ("car.1", "")], {"": 2})
         {'car.1': ('', 0), 'car.2': ('', 1)}
     """
-    taken: dict[str, tuple[str, int]] = {}
+    taken: dict[str, Body] = {}
     used: Counter[str] = Counter()
     for name, asset in sorted(objects):
         count = pool.get(asset)
@@ -176,7 +180,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def contains(mesh: Mesh, point: Float64Array) -> bool:
-    """Whether a point lies inside a closed mesh; undecided on its surface.
+    """Test whether a point lies inside a closed mesh; undecided on its surface.
 
     Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
     triangle", 1983): ±4π inside, 0 outside.

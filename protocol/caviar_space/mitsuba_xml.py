@@ -65,7 +65,7 @@ class SceneryShape:
 
 @dataclass(frozen=True)
 class Scenery:
-    """What a description holds, in its order."""
+    """Content of a description, in its order."""
 
     file: Path
     shapes: tuple[SceneryShape, ...]
@@ -195,7 +195,7 @@ def find_scenery(assets: Mapping[str, Path]) -> Path | None:
 
 
 def asset_name(description: Path | None) -> str:
-    """What errors call a description that came from another service: its file is a copy in a cache.
+    """Name that errors give a description from another service: its file is a copy in a cache.
 
     Args:
         description: None: there is none.

@@ -117,7 +117,7 @@ def _claim_by_cells(
 
 
 def _parts(sizes: Int64Array) -> Int64Array:
-    """Where to cut these sizes into parts of about `_AT_ONCE` together."""
+    """Cuts of these sizes into parts of about `_AT_ONCE` together."""
     number = np.cumsum(sizes) // _AT_ONCE
     return np.flatnonzero(number[1:] != number[:-1]) + 1
 
@@ -169,7 +169,7 @@ def _about_middles(points: Float64Array, mesh: Int64Array, meshes: int) -> tuple
 
 
 def _begins(values: Int64Array) -> BoolArray:
-    """Where runs of equal values begin."""
+    """Mask of the beginnings of runs of equal values."""
     begins = np.ones(len(values), np.bool_)
     begins[1:] = values[1:] != values[:-1]
     return begins
@@ -296,7 +296,7 @@ def _apart_by_material(
 
 
 class PlaneTable:
-    """Where the planes of many meshes are: a triangle of each, and the box around all of its triangles.
+    """Table of the planes of many meshes: a triangle of each, and the box around all of its triangles.
 
     Args:
         numbers: Plane of each triangle, counted through all meshes from 0, Shape ``[F]``.
@@ -410,7 +410,7 @@ class PlaneTable:
 
 
 def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
-    """Whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
+    """Test whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
     normal = cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normal, axis=1)
     inside: BoolArray = length > 0
@@ -423,7 +423,7 @@ def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
 
 
 def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
-    """Whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
+    """Test whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
 
     From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
     triangle then belongs to as many triangles that go along it one way as the other.
@@ -453,7 +453,7 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Whether a mesh encloses a volume, with all normals to one side.
+    """Test whether a mesh encloses a volume, with all normals to one side.
 
     Args:
         mesh: Any.

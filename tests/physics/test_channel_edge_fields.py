@@ -22,8 +22,7 @@ from caviar_labs.stability.lab import (
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation import utd as module
-from caviar_services.channel.propagation.fresnel import Media
-from caviar_services.channel.propagation.utd import edge_fields, wedges_of
+from caviar_services.channel.propagation.utd import Media, edge_fields, wedges_of
 from caviar_services.channel.sionna import path_table
 
 pytestmark = pytest.mark.channel

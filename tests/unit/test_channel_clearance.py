@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.propagation.clearance import CLEARANCE, Surfaces, spread_anew, with_near_pairs
+from caviar_services.channel.paths import Antenna, PathTable, spread_anew, with_near_pairs
 from caviar_space.meshes import box
+from caviar_space.obstacles import CLEARANCE, Surfaces
 
 BOX = box((0.0, 2.0), (0.0, 3.0), (0.0, 1.0))
 TRIANGLES = BOX.vertices[BOX.faces]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
+from caviar_services.channel.sionna.triangle_numbering import CoplanarFaces, JoinedFaces
 from caviar_space.meshes import Mesh, box
 from caviar_space.planes import PlaneTable, plane_numbers
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.enumeration.scene_faces import RIM, FaceRectangles, narrowest_sides
+from caviar_services.channel.enumeration.scenery_chains import RIM, FaceRectangles, narrowest_sides
 from caviar_space.meshes import Mesh, unit_box
 from caviar_space.planes import plane_numbers, two_sided_planes
 from caviar_space.vectors import ranges

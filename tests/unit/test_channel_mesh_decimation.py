@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.mesh_detail import decimated, welded
+from caviar_space.mesh_detail import decimated, welded
 from caviar_space.meshes import Mesh, box, unit_box
 
 pytestmark = pytest.mark.slow

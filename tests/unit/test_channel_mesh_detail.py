@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from caviar_services.channel.mesh_detail import DetailSettings, detailed, piece_numbers
+from caviar_space.mesh_detail import DetailSettings, detailed, piece_numbers
 from caviar_space.meshes import Mesh, box
 
 

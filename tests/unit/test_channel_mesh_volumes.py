@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_services.channel.propagation.foliage import MeshVolumes, lengths_inside, outward
+from caviar_services.channel.propagation.attenuation import MeshVolumes, lengths_inside, outward
 from caviar_space.meshes import Mesh, box
 
 ONE, OTHER = ((0.0, 2.0), (0.0, 3.0), (0.0, 4.0)), ((1.0, 5.0), (1.0, 6.0), (-1.0, 2.0))

@@ -17,8 +17,8 @@ import msgspec
 import pytest
 
 from caviar_clients.cli import launch
-from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.processes import TAIL, Child
+from caviar_clients.cli.launch import TAIL, Child, Launcher
+from caviar_clients.session.prepared import implemented
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import remove_leftovers
 from caviar_protocol.scenario import load_scenario
@@ -37,7 +37,7 @@ def launcher(tmp_path: Path, frames: int = 10, extra: str = "", **values: Any) -
     if "sensors" in extra:
         text = text.replace('record = ["scene",', 'record = ["lidar", "scene",')
     path.write_text(text + extra)
-    return Launcher(load_scenario(path), path, tmp_path / "run", frames=frames, **values)
+    return Launcher(implemented(load_scenario(path)), path, tmp_path / "run", frames=frames, **values)
 
 
 def alive(started: Launcher) -> list[str]:
@@ -135,7 +135,7 @@ def test_a_run_that_cannot_use_a_socket_file_listens_on_a_port(
     if case == "remote":
         services["agent"] = msgspec.structs.replace(services["agent"], use="remote", settings={})
     scenario = msgspec.structs.replace(plain.scenario, services=services)
-    with Launcher(scenario, plain.path, plain.directory, bind="", keys=plain.keys) as started:
+    with Launcher(implemented(scenario), plain.path, plain.directory, bind="", keys=plain.keys) as started:
         assert started.bind == "tcp://127.0.0.1:0"
 
 

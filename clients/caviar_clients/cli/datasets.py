@@ -99,24 +99,24 @@ def generate_command(
     from caviar_clients.datasets.generate import generate
     from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
     from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
-    from caviar_clients.session.checks import checked_scenario
+    from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
     settings = keys_set(set_, record)
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
-        loaded = apply_preset(preset, checked_scenario(scene or preset.scenario, settings=settings))
+        loaded = apply_preset(preset, load_scenario(scene or preset.scenario, settings))
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
-        loaded = checked_scenario(scenario, settings=settings)
+        loaded = load_scenario(scenario, settings)
     for extra in dict.fromkeys(more or ()):
         require_known("--with", extra, ("camera",))
         loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
-    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(loaded)))
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
+    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(plan.scenario)))
     if overwrite:
         _remove(out)
     console = Console()
@@ -282,7 +282,7 @@ def _remove(out: str) -> None:
 
 @dataclass
 class Pace:
-    """How fast episodes are played, and what time is left.
+    """Rate of episodes, and the time that is left.
 
     Example:
         >>> pace = Pace(episodes=6, began=100.0)

@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from caviar_clients.cli.attachments import AttachingCommand
-from caviar_clients.cli.commands import LOOK, OPERATE, RUN, Commands
+from caviar_clients.cli.commands import LOOK, OPERATE, RUN, AttachingCommand, Commands
 from caviar_clients.cli.shared import (
     Attach,
     Embedded,
@@ -317,13 +316,13 @@ def radio_map(
     ] = None,
 ) -> None:
     """Map best server, path gain, received power and SINR over a plane or the ground."""
-    from caviar_clients.cli.radio_map import draw_radio_map, options_of
-    from caviar_clients.cli.radio_map_inputs import Wanted
+    from caviar_clients.cli.radio_map import MapOptions, beam_choice, draw_radio_map
 
-    cells = Wanted(height=height, cell=cell, surface=surface, area=area)
-    options = options_of(
-        metric, cells, beam, frame=frame, carrier=carrier, samples=samples, memory_gib=memory_gib
-    )
+    metrics = tuple(dict.fromkeys(metric or ("gain",)))
+    options = MapOptions(
+        metrics=metrics, height=height, cell=cell, surface=surface, area=area, frame=frame, carrier=carrier,
+        beam=beam_choice(beam), samples=samples, memory_gib=memory_gib,
+    )  # fmt: skip
     for file in draw_radio_map(source, out, options, _errors):
         typer.echo(file)
 
@@ -344,7 +343,7 @@ def video(
     user: Annotated[str | None, typer.Option(help="receiver whose |y| and beam are shown")] = None,
 ) -> None:
     """Make a video of a run: the map with rays and beam, |y| over time, and what a camera saw."""
-    from caviar_clients.cli.video import film_run
+    from caviar_clients.cli.plot import film_run
 
     film = film_run(run, out, fps, frames, camera, width, user, _errors)
     pace = f"{film.fps:g} frames/s, {film.speed:.3g} times real time"

@@ -11,10 +11,11 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from caviar_clients.cli.shared import description, print_line, require_installed
+from caviar_clients.session.prepared import PreparedScenario, PreparedService, implemented
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.plugins import plugins
-from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
+from caviar_protocol.scenario import Scenario, load_scenario, shipped_scenarios
 from caviar_services.registry import load
 from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
@@ -25,18 +26,16 @@ _TEMPLATE_NAME = 'name = "my-scenario"'
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
-def extras_of(scenario: Scenario) -> tuple[str, ...]:
+def extras_of(scenario: Scenario | PreparedScenario) -> tuple[str, ...]:
     """Name the extras of the distribution that the services of a scenario need, in alphabetical order.
 
     Remote services need theirs where they run.
     """
-    return tuple(sorted(set().union(*(_extras(spec) for spec in scenario.services.values()))))
+    return tuple(sorted(set().union(*map(_extras, implemented(scenario).services.values()))))
 
 
-def _extras(spec: ServiceSpec) -> set[str]:
-    if spec.remote:
-        return set()
-    found = {load(spec.role, spec.use).extra}
+def _extras(service: PreparedService) -> set[str]:
+    spec, found = service.spec, {service.cls.extra}
     # Scenes of Sionna are part of a package that both `world` and `channel` bring.
     scenery = spec.settings.get("scenery", "")
     if isinstance(scenery, str) and scenery.startswith("sionna:"):
@@ -51,13 +50,14 @@ def _extras(spec: ServiceSpec) -> set[str]:
     return found - {""}
 
 
-def require_extras(scenario: Scenario) -> None:
+def require_extras(scenario: Scenario | PreparedScenario) -> None:
     """Refuse a scenario for which an extra is not installed.
 
     Raises:
         SetupError: An extra is missing; the text has one command that installs all that are.
     """
-    require_installed(f"scenario {scenario.run.name!r}", extras_of(scenario))
+    prepared = implemented(scenario)
+    require_installed(f"scenario {prepared.scenario.run.name!r}", extras_of(prepared))
 
 
 def list_scenarios(console: Console) -> None:

@@ -24,7 +24,6 @@ from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_th
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
 from caviar_clients.files import printable
-from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import CaviarError
@@ -147,10 +146,9 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(file, content, durable=False, concurrent=True)
-    scenario = check_implementations(task.scenario)
     watch = StepWatch(task.episode)
     run = EmbeddedRun(
-        scenario,
+        task.scenario,  # which is checked where the dataset is planned
         folder,
         on_frame=watch.frame_finished,
         on_wait=watch.waits,

@@ -11,14 +11,13 @@ import msgspec
 from msgspec.structs import replace
 
 from caviar_clients.datasets.catalogue import FORMAT
-from caviar_clients.session.checks import check_implementations
+from caviar_clients.session.prepared import implemented, prepare
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.scenario.rules import with_overrides
 from caviar_services.drjit_setup import choose_variant
 from caviar_services.recorder.provenance import code_digests, used_versions
-from caviar_services.registry import load
 from caviar_space.scenery import scenery_assets
 
 
@@ -103,7 +102,7 @@ def plan_dataset(
     # A kill costs the episodes in progress, whatever the disk holds of them: each is synced as a whole.
     # Nor does a recording say how many episodes there are: a dataset may grow.
     run = replace(scenario.run, episodes=1, durability="none", checkpoint_frames=0)
-    return DatasetPlan(check_implementations(replace(scenario, run=run, services=services)), episodes)
+    return DatasetPlan(prepare(replace(scenario, run=run, services=services)).scenario, episodes)
 
 
 def with_own_traffic(scenario: Scenario) -> Scenario:
@@ -209,9 +208,9 @@ def with_cameras(scenario: Scenario) -> Scenario:
     # Where none is named all are recorded, and that shall stay so.
     before = scenario.run.record or [
         topic
-        for spec in scenario.services.values()
-        if spec.role != "sensors" and not spec.remote
-        for topic in load(spec.role, spec.use).outputs
+        for service in implemented(scenario).services.values()
+        if service.spec.role != "sensors"
+        for topic in service.cls.outputs
     ]
     topics = tuple(dict.fromkeys((*before, "camera")))
     return replace(

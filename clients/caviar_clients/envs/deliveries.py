@@ -1,4 +1,4 @@
-"""What a flight is for and what it costs: addresses in any order, boxes to keep out of, energy."""
+"""Purpose and cost of a flight: addresses in any order, boxes to keep out of, energy."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Deliveries:
 
     @property
     def delivered(self) -> tuple[bool, ...]:
-        """Of each address."""
+        """Mask of the addresses that are delivered to."""
         return tuple(not self._left >> i & 1 for i in range(len(self.addresses)))
 
     @property
     def is_done(self) -> bool:
-        """Whether every address is delivered to."""
+        """True once every address is delivered to."""
         return self._left == 0
 
     def tour_m(self, position: Vector) -> float:

@@ -178,7 +178,7 @@ class Contest:
     """Agents that play the same episodes.
 
     Args:
-        scenario: Checked, as `caviar_clients.session.checks.checked_scenario` returns it. The agents take the
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` checks it. The agents take the
             place of one of its own.
         players: By name.
         users: Receivers that count, as names with ``*`` and ``?``.
@@ -189,8 +189,8 @@ class Contest:
         ScenarioError: The scenario has no such agent, or no link, or several.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> scenario = checked_scenario("geometric", frames=20)
+        >>> from caviar_clients.session.prepared import prepare
+        >>> scenario = prepare("geometric", frames=20).scenario
         >>> agents = {name: made_player(scenario, name) for name in ("random", "oracle")}
         >>> with Contest(scenario, agents) as contest:
         ...     found = contest.play(seed=1)

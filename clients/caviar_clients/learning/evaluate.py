@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from caviar_clients.learning.contest import Contest, Played, Player, PolicyPlayer, episodes_of, made_player
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_services.agent.policy import PolicyModel
@@ -156,7 +156,7 @@ def evaluate(
                 f"{name!r} is compared with as it is, without {', '.join(settings)}; name another agent"
             )
     model = PolicyModel(file, called)
-    known = checked_scenario(Path(scenario))
+    known = prepare(Path(scenario)).scenario
     served = (users,) if isinstance(users, str) else tuple(users)
     players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, called)}
     for name, use in _AGENTS.items():

@@ -20,7 +20,7 @@ from caviar_clients.envs.arguments import (
     checked_seeds,
     whole_numbers,
 )
-from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
+from caviar_clients.envs.base import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.learning.tracks import NoProducts, Tracks, read_tracks
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.cell.rates import shannon

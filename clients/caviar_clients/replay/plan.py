@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from caviar_clients.replay.recorded import RecordedRun
-from caviar_clients.session.checks import declared_hello, served_from_recording, settings_type
+from caviar_clients.session.prepared import declared_hello, served_from_recording, settings_type
 from caviar_protocol.errors import RunError, suggestion
 from caviar_protocol.messages import Hello, Input
 from caviar_protocol.scenario import ReplaySpec, Scenario, ServiceSpec

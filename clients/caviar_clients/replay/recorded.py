@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from caviar_clients.session.checks import declared_hello, demanded
+from caviar_clients.session.prepared import declared_hello, demanded
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import DeclarationError, RecordingError
 from caviar_protocol.files import open_regular

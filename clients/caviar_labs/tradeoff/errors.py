@@ -136,7 +136,7 @@ def top_k(abs_y: Float64Array, k: int) -> list[int]:
 
 
 def hit(ranked: list[int], reference: list[int], k: int) -> bool:
-    """Whether the reference's best pair is among the first ``k`` (top-k accuracy).
+    """Tell whether the reference's best pair is among the first ``k`` (top-k accuracy).
 
     Example:
         >>> hit([1, 2], [2, 1], 1), hit([1, 2], [2, 1], 2)

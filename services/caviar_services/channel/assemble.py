@@ -15,12 +15,7 @@ from typing import Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Complex128Array,
-    Float64Array,
-    Int64Array,
-)
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, suggestion
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.space.scene import device_pose
@@ -45,16 +40,22 @@ from caviar_services.channel.arrays.channel_matrices import (
     subarray_amplitudes,
     wideband_parts,
 )
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
+from caviar_services.channel.paths import (
+    Antenna,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_geometry,
+    stable_ids,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 
 Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Product:
-    """What a product says about itself beside its paths."""
+    """Header of a product: all that it says about itself beside its paths."""
 
     rung: str
     options: ChannelOptions
@@ -368,7 +369,7 @@ def restricted(
 
 
 class Surroundings(Protocol):
-    """What a channel model knows about places; in the state of the last frame."""
+    """Knowledge of a channel model about places, in the state of the last frame."""
 
     @property
     def extent(self) -> tuple[Float64Array, Float64Array] | None:
@@ -443,7 +444,7 @@ class _Ends:
         return {name: around for name, around in sorted(self._around.items()) if around}
 
     def cause(self, t: int, r: int) -> Cause:
-        """Why a pair has no path."""
+        """Cause for which a pair has no path."""
         channel = self._channel
         names = channel.tx[t], channel.rx[r]
         start, end = (self._position(name) for name in names)
@@ -468,7 +469,7 @@ class _Ends:
         return self._around[name]
 
     def _is_beside(self, position: Float64Array) -> bool:
-        """Whether a place is beside the scenery or below it; above it, the sky goes on."""
+        """Test whether a place is beside the scenery or below it; above it, the sky goes on."""
         if self._surroundings.extent is None:
             return False
         low, high = self._surroundings.extent

@@ -1,4 +1,4 @@
-"""What all sensor services share: the base class, and the scene as a ray tracer holds it.
+"""Base of all sensor services, and the scene as their ray tracer holds it.
 
 A sensor implements `Sensors.observe`; meshes are loaded and moved here, the same way for every sensor.
 
@@ -177,7 +177,7 @@ class Sensors(Service[S]):
 
     @abstractmethod
     def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
-        """What the sensors of a scene see.
+        """Observe a scene with all its sensors.
 
         Args:
             mi: Mitsuba, with the variant that is active.
@@ -477,7 +477,7 @@ class TracedScene:
         return dr.select(moving, hit.t, fixed.t), face
 
     def occluded(self, ray: Any, active: Any, coherent: bool) -> Any:
-        """Whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
+        """Test whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
 
         Args:
             ray: Rays whose origins count from `centre`, as `mitsuba.Ray3f`.
@@ -497,7 +497,7 @@ class TracedScene:
         return np.concatenate([self._scenery_normals, _normals(self._joined_bodies)])
 
     def is_inside(self, asset: str, dimensions: Float64Array, point: Vector) -> bool:
-        """Whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
+        """Test whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
         # `contains` is undecided on the surface, where sensors are mounted: so points around it are asked.
         if not (dimensions > 0).all():
             return False
@@ -506,7 +506,7 @@ class TracedScene:
 
 
 def _centre(middle: Float64Array) -> Float64Array:
-    """Where to count from [m], coarse enough to be the same in float32, for a scene about a place."""
+    """Centre to count from [m], coarse enough to be the same in float32, for a scene about a place."""
     far: Float64Array = np.where(np.abs(middle) > _NEAR, np.round(middle / _CENTRE_STEP) * _CENTRE_STEP, 0.0)
     return far
 

@@ -2,7 +2,7 @@
 those of free space, and H as their sum.
 
 Points of interaction are recorded, so the geometry of each path is computed anew from them: delay,
-departure, arrival and Doppler shift (`caviar_services.channel.propagation.geometry`). What happens at a point
+departure, arrival and Doppler shift (`caviar_services.channel.paths`). What happens at a point
 takes power and brings none: |a| of a path is at most c/(4πf·cτ) times the amplitudes of both elements towards
 it (Friis 1946), of which reflection and transmission leave the part that Fresnel's coefficients say.
 """
@@ -21,8 +21,7 @@ from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES, Interaction
-from caviar_services.channel.paths import Antenna, Turning
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
+from caviar_services.channel.paths import Antenna, PathGeometry, Turning, path_geometry
 
 GAIN_DB = 0.5
 """Of a line of sight from free space; air and foliage take no more over a street."""

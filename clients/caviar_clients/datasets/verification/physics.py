@@ -45,9 +45,9 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.clearance import Boxes, Surfaces
 from caviar_services.channel.propagation.patterns import Patterns
 from caviar_services.pattern_files import read_pattern
+from caviar_space.obstacles import Boxes, Surfaces
 from caviar_space.scenery import scenery_triangles
 
 __all__ = ["Finding", "PhysicsChecks"]

@@ -31,14 +31,19 @@ from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
 from caviar_services.channel.adaptive.controller import (
+    AdaptiveSettings,
     Choice,
     Controller,
     ControllerState,
     CostModel,
     CostState,
+    Rung,
     Workload,
+    built,
+    models,
+    naming,
+    rung_of,
 )
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, naming, rung_of
 from caviar_services.channel.assemble import outage_counts
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna.scene import shared_scenes
@@ -157,7 +162,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return min((float(extent[0][2]) for extent in extents if extent is not None), default=0.0)
 
     def _is_free(self, place: Vector) -> bool:
-        """Whether a point is in the open."""
+        """Test whether a point is in the open."""
         model = self._every[-1].model
         if model.extent is not None:
             low, high = model.extent
@@ -239,7 +244,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     def _modelled(
         self, rung: Rung, frame: Frame, scene: Scene, devices: Devices, *, with_h: bool = False
     ) -> tuple[Modelled, int]:
-        """What a rung makes of a frame, and how long it took [ns]; ``with_h``: with matrices in any case."""
+        """Channel of a frame by a rung, and its duration [ns]; ``with_h``: with matrices in any case."""
         model = rung.model
         asked, model.with_h = model.with_h, model.with_h or with_h
         began = self.clock()
@@ -272,7 +277,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return self.calibration.check(partner, frame.number, other, made.channel)
 
     def checkpoint(self) -> bytes:
-        """What is known of costs and errors, the rung, and what the rungs follow.
+        """Saved state: costs and errors, the rung, and what the rungs follow.
 
         Durations decide, so the same frames lead to the same rungs only where those are imposed.
         """

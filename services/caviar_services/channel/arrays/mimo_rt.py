@@ -20,13 +20,18 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, Interaction
 from caviar_services.channel.arrays.channel_matrices import Bins, Located
-from caviar_services.channel.arrays.element_visibility import elements
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.arrays.element_paths import elements
+from caviar_services.channel.paths import (
+    Antenna,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_geometry,
+    with_near_pairs,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import path_ends, path_table
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -145,12 +150,7 @@ class ElementTracer:
         return table if self._los else table.take((table.types != 0).any(1))
 
     def _amplitudes(
-        self,
-        carrier: int,
-        wavelength: float,
-        table: PathTable,
-        source: Antenna,
-        targets: Sequence[Antenna],
+        self, carrier: int, wavelength: float, table: PathTable, source: Antenna, targets: Sequence[Antenna]
     ) -> tuple[Complex128Array, PathGeometry]:
         """Amplitudes with the phase of lengths in float64, Shape ``[P]``, and the geometry of the paths."""
         ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
@@ -252,7 +252,7 @@ class _ElementPaths:
         return column
 
     def weighted(self, asked: Bins, pair: int, begin: int, end: int) -> Complex128Array:
-        """What `Bins` ask for at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
+        """Responses in `Bins` at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
         mine = slice(*np.searchsorted(self.target, [begin, end]).tolist())
         weights = asked.weights(pair, self.tau[mine], self.doppler[mine]) * self.a[mine]
         response = np.zeros((len(weights), end - begin), np.complex128)

@@ -23,8 +23,17 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier
 from caviar_services.channel.arrays.channel_matrices import Bins, Blocks, Located, joined
-from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
-from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
+from caviar_services.channel.arrays.element_paths import (
+    Bend,
+    ElementPaths,
+    Elements,
+    Lengths,
+    Look,
+    Surfaces,
+    Visibility,
+    elements,
+    visibility,
+)
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import (
     ElementPattern,
@@ -328,7 +337,8 @@ class _Split:
         return [t * len(self.of_receiver) + r for t in of_t for r in of_r]
 
     def joined(self, blocks: list[Blocks]) -> Iterator[Blocks]:
-        """Of each pair of devices, from what is of each pair of subarrays, Shape ``[..., M, N]``."""
+        """Blocks of each pair of devices, joined from those of each pair of subarrays, Shape ``[..., M,
+        N]``."""
         for sent in self.of_transmitter:
             for taken in self.of_receiver:
                 yield joined([[blocks[s * len(self.receive) + r] for s in sent] for r in taken])
@@ -374,7 +384,7 @@ class _Field:
                     yield waves[first:last].sum(0)
 
     def responses(self, split: _Split, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
-        """What is asked, of each pair of subarrays in order, Shape ``[J, M, N]``."""
+        """Responses of each pair of subarrays in order, Shape ``[J, M, N]``."""
         arrays = [(rx.size, tx.size) for tx in self.transmit.arrays for rx in self.receive.arrays]
         ends = pairwise(split.offsets.tolist())
         for pair, sizes, (begin, end) in zip(split.pair, arrays, ends, strict=True):
@@ -397,7 +407,7 @@ class _Field:
         return self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
 
     def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
-        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+        """Waves of some paths, which add up to H, Shape ``[p, M, N]``."""
         tx, rx = self.transmitter[rows], self.receiver[rows]
         between = self._between(rows, sizes)
         # In place: these arrays are the largest of a frame.

@@ -1,13 +1,56 @@
-"""What paths lose beside free space and interactions: base of foliage and of people as screens."""
+"""Attenuation of paths beside free space and interactions: by foliage (Recommendation ITU-R P.833-10) and by
+people as screens (model B of 3GPP TR 38.901).
+
+Waves pass through foliage on straight lines and lose A = A_m·(1 − exp(−γ·d/A_m)) [dB] (section 2.1, eq. 1),
+with the length d within it [m], the specific attenuation γ [dB/m] for very short paths, and the maximum
+attenuation A_m [dB] of what arrives by other ways than straight through. Without a maximum that is γ·d.
+Amplitudes fall by 10^(−A/20), phases and directions stay.
+
+The length d is that of a straight line within closed meshes (`MeshVolumes`), in float64. A point is inside
+where the surfaces around it wind about it: a line that enters as often as it leaves is outside (winding
+number, here of the crossings before a point). So surfaces may overlap and enclose cavities. A line through an
+edge or a corner crosses what a line infinitesimally beside it crosses (H. Edelsbrunner and E. P. Mücke,
+"Simulation of simplicity", ACM Trans. Graph. 9(1), 1990).
+
+A person is a vertical rectangular screen (TR 38.901, section 7.6.4.2). A path that it stands in, or near, is
+diffracted at its four edges and loses
+
+    L = −20·log10(1 − (F_h1 + F_h2)·(F_w1 + F_w2)) [dB],
+    F = ±1/π · arctan(π/2 · sqrt(π/λ · (D1 + D2 − r))).
+
+for the upper and lower edge (h1, h2), in the top view for the others (w1, w2). All signs are + in a view in
+which the screen is in the way; where it is not, the edge of the shorter way D1 + D2 has −, so that L tends
+to 0 away from the screen. Losses [dB] of several screens are added.
+
+What the report leaves open is fixed so: a screen stands across the path, as in the model of METIS (D1.4,
+"METIS channel models", 2015, section 6) that the report took over, and is as wide as the person looks from
+there, whose outline seen from above is an ellipse. A path with reflections is unfolded: each of its legs has
+its ends at the images of TX and RX, so that the form of the direct path holds for all of them (the report has
+no geometry beyond the receiver's side, and lets D2 − r fall away). Diffraction and scattering begin a new
+wave. Only screens between the ends of a leg itself count for it.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated
 
-from caviar_protocol.arrays import Float64Array, UInt8Array
-from caviar_protocol.topics import Scene
-from caviar_services.channel.paths import PathTable
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, quantity
+from caviar_protocol.errors import AssetError, suggestion
+from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
+from caviar_protocol.space.scene import object_pose
+from caviar_protocol.topics import Carrier, Interaction, Scene
+from caviar_services.channel.paths import PathTable, path_corners
+from caviar_services.channel.sionna.materials import ObjectMaterials
+from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_space.vectors import ranges
 
 
 class Attenuation(ABC):
@@ -50,3 +93,640 @@ class Attenuation(ABC):
         """
         factor = self.amplitude_factor(start, table.points, end, table.types)
         return replace(table, transfer=table.transfer * factor[..., None, None])
+
+
+# Boxes in a box of the next level, and triangles in one of the first.
+_BRANCHES = 8
+
+# By which boxes are wider, relative to the largest coordinate and 1 m.
+_SLACK = 1e-9
+
+# Pairs of a line and a box or triangle that are looked at together: what stays in a processor's cache.
+_AT_ONCE = 1 << 16
+
+
+def outward(mesh: Mesh) -> Float64Array:
+    """Triangles of a closed mesh, all with their outside in front.
+
+    Args:
+        mesh: Corners at exactly one place count as one.
+
+    Returns:
+        Corners [m], counter-clockwise as seen from outside, Shape ``[F, 3, 3]``.
+
+    Raises:
+        ValueError: Edges are open, or have both triangles on one side; says how many.
+
+    Example:
+        >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> crown = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
+        >>> outward(crown).shape
+        (4, 3, 3)
+    """
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    corners = place.reshape(-1)[mesh.faces]
+    sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
+    sides = sides[sides[:, 0] != sides[:, 1]]
+    edges, edge, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    # Two triangles with the same outside run along their common edge in opposite directions.
+    ways = np.bincount(edge.reshape(-1), np.where(sides[:, 0] < sides[:, 1], 1, -1), minlength=len(edges))
+    is_open = np.count_nonzero(count % 2)
+    if is_open or not len(edges):
+        raise ValueError(f"{is_open} of its {len(edges)} edges are open")
+    if ways.any():
+        turned = np.count_nonzero(ways)
+        raise ValueError(f"at {turned} of its {len(edges)} edges one triangle faces out and the other in")
+    triangles: Float64Array = mesh.vertices[mesh.faces]
+    # Six times the volume, relative to a corner: at UTM coordinates the digits would be lost.
+    a, b, c = np.moveaxis(triangles - triangles[0, 0], 1, 0)
+    volume = float((np.cross(a, b) * c).sum())
+    return triangles[:, ::-1] if volume < 0 else triangles
+
+
+@dataclass(frozen=True, eq=False)
+class MeshVolumes:
+    """Volumes within closed surfaces of F triangles, each of one of some kinds."""
+
+    triangles: Float64Array
+    """Corners [m], Shape ``[F, 3, 3]``, neighbours near to each other."""
+    kind: Int64Array
+    """What the volume is of that each is around, Shape ``[F]``."""
+
+    @classmethod
+    def of(cls, surfaces: Sequence[tuple[Float64Array, int]]) -> MeshVolumes:
+        """Volumes within surfaces.
+
+        Args:
+            surfaces: Triangles of each (`outward`), and the kind of its volume.
+        """
+        triangles = np.concatenate([np.zeros((0, 3, 3)), *(corners for corners, _ in surfaces)])
+        kind = np.repeat(
+            np.array([kind for _, kind in surfaces], np.int64), [len(corners) for corners, _ in surfaces]
+        )
+        order = _near_each_other(triangles.mean(1))
+        return cls(triangles[order], kind[order])
+
+    @cached_property
+    def _boxes(self) -> list[tuple[Float64Array, Float64Array]]:
+        """Lowest and highest corners of boxes, Shape ``[3, N]`` each, level by level: around triangles,
+        around `_BRANCHES` of these, and so on up to one box, each a little wider than what it holds."""
+        slack = _SLACK * (1 + np.abs(self.triangles).max())
+        low, high = self.triangles.min(1).T - slack, self.triangles.max(1).T + slack
+        levels = [(np.ascontiguousarray(low), np.ascontiguousarray(high))]
+        while low.shape[1] > 1:
+            first = np.arange(0, low.shape[1], _BRANCHES)
+            low, high = np.minimum.reduceat(low, first, axis=1), np.maximum.reduceat(high, first, axis=1)
+            levels.append((low, high))
+        return levels
+
+    def crossings(
+        self, start: Float64Array, direction: Float64Array
+    ) -> Iterator[tuple[Int64Array, Int64Array, Float64Array, Int64Array]]:
+        """Crossings of lines into and out of volumes.
+
+        Args:
+            start: A point of each of Q lines [m], Shape ``[Q, 3]``.
+            direction: Along each line [m], Shape ``[Q, 3]``.
+
+        Yields:
+            For some lines at a time: line, kind, multiple of the direction, and 1 for entering or −1 for
+            leaving, Shape ``[N]`` each. Left out are lines that miss all volumes from 0 to 1 or are not
+            finite, and some crossings beyond 1.
+        """
+        if not len(self.kind):
+            return
+        lines = np.flatnonzero((direction != 0).any(1) & np.isfinite(start + direction).all(1))
+        with np.errstate(divide="ignore"):
+            slabs = np.ascontiguousarray(start.T), 1 / np.ascontiguousarray(direction.T)
+        root = np.zeros(len(lines), np.int64)
+        met = _meets(slabs, lines, self._boxes[-1], root, (0.0, 1.0))
+        # Depth first, and large levels in halves, so that few pairs of lines and boxes exist at a time.
+        pending = [(len(self._boxes) - 1, lines[met], root[met])]
+        while pending:
+            level, lines, boxes = pending.pop()
+            if len(lines) > _AT_ONCE:
+                half = len(lines) // 2
+                pending += [(level, lines[:half], boxes[:half]), (level, lines[half:], boxes[half:])]
+            elif level:
+                below = self._boxes[level - 1]
+                sizes = np.minimum(_BRANCHES, below[0].shape[1] - boxes * _BRANCHES)
+                parent, boxes = ranges(boxes * _BRANCHES, sizes)
+                lines = lines[parent]
+                met = _meets(slabs, lines, below, boxes, (-np.inf, 1.0))
+                pending.append((level - 1, lines[met], boxes[met]))
+            elif len(lines):
+                crossed, along, step = _crossed(start[lines], direction[lines], self.triangles[boxes])
+                yield lines[crossed], self.kind[boxes[crossed]], along, step
+
+
+def lengths_inside(
+    volumes: Sequence[MeshVolumes], start: Float64Array, end: Float64Array, kinds: int
+) -> Float64Array:
+    """Lengths of segments within the union of all volumes of each kind.
+
+    Args:
+        volumes: Of all kinds, numbered from 0.
+        start: Start of each of Q segments [m], Shape ``[Q, 3]``; ``end`` likewise.
+        end: See ``start``.
+        kinds: Number of kinds, K.
+
+    Returns:
+        Lengths [m], Shape ``[Q, K]``.
+
+    Example:
+        >>> from caviar_space.meshes import box
+        >>> crown = MeshVolumes.of([(outward(box((0, 2), (0, 2), (0, 2))), 0)])
+        >>> start, end = np.array([[-1.0, 1.0, 1.5]]), np.array([[1.5, 1.0, 1.5]])
+        >>> lengths_inside([crown], start, end, kinds=1).tolist()
+        [[1.5]]
+    """
+    direction = end - start
+    found = [crossed for of in volumes for crossed in of.crossings(start, direction)]
+    if not found:
+        return np.zeros((len(start), kinds))
+    line, kind, along, step = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    # Along each line and kind, the running sum of +1 and −1 is the winding number after each crossing.
+    pair, along = line * kinds + kind, np.clip(along, 0.0, 1.0)
+    order = np.lexsort((step, along, pair))
+    pair, along, around = pair[order], along[order], np.cumsum(step[order])
+    first = np.diff(pair, prepend=-1) != 0
+    around -= np.repeat((around - step[order])[first], np.diff(np.flatnonzero(first), append=len(pair)))
+    # Up to the next crossing, or to the end: crossings beyond are not all known.
+    until = np.where(np.append(first[1:], True), 1.0, np.append(along[1:], 1.0))
+    gaps = np.where(around != 0, until - along, 0.0)
+    share = np.bincount(pair, gaps, minlength=len(start) * kinds).reshape(len(start), kinds)
+    inside: Float64Array = share * np.sqrt((direction**2).sum(1, keepdims=True))
+    return inside
+
+
+def _near_each_other(points: Float64Array) -> Int64Array:
+    """An order of points, Shape ``[N, 3]``, in which neighbours are near: Morton's, of 10 bits an axis."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    low, size = points.min(0), np.ptp(points, axis=0).max()
+    cells = ((points - low) / (size or 1.0) * 1023).astype(np.int64)
+    bits = (cells[..., None] >> np.arange(10)) & 1
+    code = (bits << (3 * np.arange(10) + np.arange(3)[:, None])).sum((1, 2))
+    return np.argsort(code, kind="stable")
+
+
+def _meets(
+    slabs: tuple[Float64Array, Float64Array],
+    lines: Int64Array,
+    corners: tuple[Float64Array, Float64Array],
+    boxes: Int64Array,
+    between: tuple[float, float],
+) -> BoolArray:
+    """Test whether lines touch boxes between two multiples of their directions, pair by pair, Shape ``[N]``.
+
+    By slabs (T. L. Kay and J. T. Kajiya, "Ray tracing complex scenes", SIGGRAPH 1986).
+
+    Args:
+        slabs: Start and inverse of the direction of all lines, Shape ``[3, Q]`` each.
+        lines, boxes: Number of the line and of the box, Shape ``[N]``.
+        corners: Lowest and highest of all boxes, Shape ``[3, M]`` each.
+    """
+    near, far = np.full(len(lines), between[0]), np.full(len(lines), between[1])
+    with np.errstate(invalid="ignore"):
+        for start, inverse, low, high in zip(*slabs, *corners, strict=True):
+            at, along = start[lines], inverse[lines]
+            one, other = (low[boxes] - at) * along, (high[boxes] - at) * along
+            np.fmax(near, np.fmin(one, other), out=near)
+            np.fmin(far, np.fmax(one, other), out=far)
+    met: BoolArray = near <= far
+    return met
+
+
+def _crossed(
+    origin: Float64Array, direction: Float64Array, triangles: Float64Array
+) -> tuple[Int64Array, Float64Array, Int64Array]:
+    """Triangles of N, Shape ``[N, 3, 3]``, that lines meet, at what multiple of the direction, and whether
+    they enter there, 1, or leave, −1.
+
+    In axes in which the line is the third one (S. Woop, C. Benthin and I. Wald, "Watertight ray/triangle
+    intersection", JCGT 2(1), 2013): the sign of the product of two corners is opposite for the two triangles
+    at an edge, and right or zero.
+    """
+    # The longest component of the direction becomes the third axis, so that the shear is well conditioned.
+    axis = np.argmax(np.abs(direction), axis=1)
+    axes = (axis[:, None] + np.array([1, 2, 0])) % 3
+    towards = np.take_along_axis(direction, axes, axis=1)
+    corners = np.take_along_axis(triangles - origin[:, None], axes[:, None], axis=2)
+    x = corners[..., 0] - towards[:, :1] / towards[:, 2:] * corners[..., 2]
+    y = corners[..., 1] - towards[:, 1:2] / towards[:, 2:] * corners[..., 2]
+    x_next, y_next = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    product = x * y_next - y * x_next
+    # On an edge, the line counts as a little beside it, by ε along x and by ε² along y.
+    beside = np.where(y != y_next, y - y_next, x_next - x)
+    side = np.sign(np.where(product == 0, beside, product))
+    met = np.flatnonzero((side[:, 0] != 0) & (side == side[:, :1]).all(1))
+    weight = np.roll(product[met], -1, axis=1)
+    depth = (weight * corners[met, :, 2]).sum(1) / weight.sum(1)
+    step = -side[met, 0] * np.sign(towards[met, 2])
+    return met, depth / towards[met, 2], step.astype(np.int64)
+
+
+# Mixed coniferous and deciduous woodland near St Petersburg (P.833-10, table 1): frequency [MHz], γ [dB/m]
+# and A_m [dB].
+_TABLE_1 = np.array(
+    [
+        (105.9, 0.04, 9.4),
+        (466.475, 0.12, 18.0),
+        (949.0, 0.17, 26.5),
+        (1852.2, 0.30, 29.0),
+        (2117.5, 0.34, 34.1),
+    ]
+)
+
+_SOURCE = "ITU-R P.833-10, table 1"
+
+_REMEDY = (
+    'attenuation_db_per_m = {{ {carrier} = … }} and source = "…"; figure 2 of the Recommendation has values '
+    "up to about 30 GHz"
+)
+
+
+class FoliageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Attenuation by one kind of foliage."""
+
+    attenuation_db_per_m: dict[
+        str, Annotated[float, quantity("dB/m", "specific attenuation γ on a carrier", ge=0)]
+    ] = {}
+    """By name of the carrier. Absent: that of ITU-R P.833's table 1, from 105.9 to 2117.5 MHz."""
+    maximum_db: dict[
+        str, Annotated[float, quantity("dB", "attenuation A_m at most, on a carrier", gt=0)]
+    ] = {}
+    """By name of the carrier. Absent: none where γ is given, that of table 1 where it is not."""
+    source: str = ""
+    """Where values that are given are from; products state it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoliageKind:
+    """One kind of foliage, on C carriers."""
+
+    key: str
+    """Name, pattern of names or class of what is of it."""
+    attenuation_db_per_m: Float64Array
+    """γ [dB/m], Shape ``[C]``."""
+    maximum_db: Float64Array
+    """A_m [dB], Shape ``[C]``; infinite: none."""
+    source: tuple[str, ...]
+    """Of the values, by carrier."""
+
+    def attenuation_db(self, length: Float64Array) -> Float64Array:
+        """Attenuation A [dB], Shape ``[C, P]``, of paths of these lengths within it [m], Shape ``[P]``
+        (P.833-10, eq. 1)."""
+        straight: Float64Array = self.attenuation_db_per_m[:, None] * length
+        most = np.where(np.isfinite(self.maximum_db), self.maximum_db, 1.0)[:, None]
+        # `expm1`: for short ways 1 − exp(…) would lose its digits.
+        saturating = -most * np.expm1(-straight / most)
+        return np.where(np.isfinite(self.maximum_db)[:, None], saturating, straight)
+
+    def briefs(self, carriers: Sequence[Carrier]) -> tuple[str, ...]:
+        """Lines that products state about it, carrier by carrier."""
+        return tuple(
+            f"{self.key}@{carrier.name}: {gamma:g} dB/m"
+            + (f", at most {most:g} dB" if np.isfinite(most) else "")
+            + f" ({source})"
+            for carrier, gamma, most, source in zip(
+                carriers, self.attenuation_db_per_m, self.maximum_db, self.source, strict=True
+            )
+        )
+
+
+class Foliage(Attenuation):
+    """The foliage of a scene, and the attenuation of paths in it.
+
+    The volume of a piece of scenery is within its mesh, that of an object is its bounding box. A path loses,
+    to each kind, A of the length that all of its legs run within the union of all volumes of this kind.
+
+    Args:
+        settings: By name of an object or a piece of scenery, pattern of names with ``*``, or class of
+            objects.
+        carriers: Of the run.
+        place: Where the settings of the channel stand.
+        others: Settings of the channel that say something else of objects, with their keys.
+
+    Raises `ScenarioError` naming the key where γ or its source is not given, a carrier does not exist, or
+    another setting has the same key.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, FoliageSettings],
+        carriers: Sequence[Carrier],
+        place: Place,
+        others: Mapping[str, Collection[str]],
+    ) -> None:
+        self.kinds = tuple(
+            _kind(key, of, carriers, place.at("foliage").at(key), others) for key, of in settings.items()
+        )
+        self.keys = ObjectMaterials({key: key for key in settings})
+        """Tells the kind of an object."""
+        self.briefs = tuple(brief for kind in self.kinds for brief in kind.briefs(carriers))
+        """What products state of them, kind by kind and carrier by carrier."""
+        self._number = {kind.key: number for number, kind in enumerate(self.kinds)}
+        self._box = unit_box()
+        self._still = self._moving = MeshVolumes.of([])
+
+    def stand(self, pieces: Mapping[str, Mesh]) -> None:
+        """Take pieces of scenery for foliage.
+
+        Args:
+            pieces: Meshes by name; a name has the kind that the settings give it.
+
+        Raises:
+            AssetError: A mesh is not closed.
+        """
+        surfaces = []
+        for name, mesh in pieces.items():
+            try:
+                surfaces.append((outward(mesh), self._number[self.keys.of(name)]))
+            except ValueError as error:
+                raise AssetError(
+                    f"piece of scenery {name!r} is foliage and has no inside: {error}; give it a closed "
+                    "mesh, such as the hull of a crown, and single leaves another name"
+                ) from error
+        self._still = MeshVolumes.of(surfaces)
+
+    def move(self, scene: Scene) -> None:
+        """Move the foliage among the objects of a scene to where they are."""
+        boxes = [
+            (placed(self._box, scene.dimensions[i], object_pose(scene, i))[self._box.faces], kind)
+            for i, (name, cls) in enumerate(zip(scene.names, scene.classes, strict=True))
+            if (kind := self._number.get(self.keys.of(name, cls))) is not None
+        ]
+        self._moving = MeshVolumes.of(boxes)
+
+    def amplitude_factor(
+        self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
+    ) -> Float64Array:
+        """Factors by foliage, 10^(−A/20), Shape ``[C, P]``; see `Attenuation`."""
+        corners = path_corners(start, points, end, (types != 0).sum(1))
+        paths, legs = len(corners), corners.shape[1] - 1
+        ends = corners[:, :-1].reshape(-1, 3), corners[:, 1:].reshape(-1, 3)
+        inside = lengths_inside((self._still, self._moving), *ends, len(self.kinds))
+        inside = inside.reshape(paths, legs, -1).sum(1)
+        lost = sum(kind.attenuation_db(inside[:, k]) for k, kind in enumerate(self.kinds))
+        return 10 ** (-np.asarray(lost) / 20)
+
+
+def _kind(
+    key: str,
+    settings: FoliageSettings,
+    carriers: Sequence[Carrier],
+    place: Place,
+    others: Mapping[str, Collection[str]],
+) -> FoliageKind:
+    for name, keys in others.items():
+        if key in keys:
+            raise place.error(
+                f"{key!r} is foliage here and stands in {name}, too; leave it out of one of them"
+            )
+    names = [carrier.name for carrier in carriers]
+    for field in ("attenuation_db_per_m", "maximum_db"):
+        given: Mapping[str, float] = getattr(settings, field)
+        for name in given:
+            if name not in names:
+                raise place.at(field).at(name).error(f"no carrier {name!r}; {suggestion(name, names)}")
+        if given and not settings.source:
+            raise place.at(field).error(
+                f"gives values without where they are from; write it as {place.at('source').key}"
+            )
+    rows = [_on_carrier(settings, carrier, place) for carrier in carriers]
+    return FoliageKind(
+        key=key,
+        attenuation_db_per_m=np.array([gamma for gamma, _, _ in rows]),
+        maximum_db=np.array([most for _, most, _ in rows]),
+        source=tuple(source for _, _, source in rows),
+    )
+
+
+def _on_carrier(settings: FoliageSettings, carrier: Carrier, place: Place) -> tuple[float, float, str]:
+    """γ [dB/m], A_m [dB] and their source on a carrier."""
+    given = settings.attenuation_db_per_m.get(carrier.name)
+    if given is not None:
+        return given, settings.maximum_db.get(carrier.name, np.inf), settings.source
+    megahertz, low, high = carrier.frequency_hz / 1e6, _TABLE_1[0, 0], _TABLE_1[-1, 0]
+    if not low <= megahertz <= high:
+        raise place.at("attenuation_db_per_m").error(
+            f"lacks carrier {carrier.name!r} at {megahertz:g} MHz, and table 1 of ITU-R P.833 is for "
+            f"{low:g}–{high:g} MHz; write {_REMEDY.format(carrier=carrier.name)}"
+        )
+    # Between the rows of the table, straight in logarithms of all three.
+    gamma, most = (
+        float(np.exp(np.interp(np.log(megahertz), np.log(_TABLE_1[:, 0]), np.log(_TABLE_1[:, column]))))
+        for column in (1, 2)
+    )
+    if carrier.name in settings.maximum_db:
+        return gamma, settings.maximum_db[carrier.name], f"{_SOURCE}, {settings.source}"
+    return gamma, most, _SOURCE
+
+
+# A leg whose horizontal part is shorter [m] is vertical: no screen stands across it.
+_VERTICAL_M = 1e-9
+
+
+class HumanBlockageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Objects that are screens, and their size.
+
+    Example:
+        >>> HumanBlockageSettings(width_m=0.3, height_m=1.7).classes  # the size of TR 38.901
+        ('pedestrian',)
+    """
+
+    classes: tuple[str, ...] = ("pedestrian",)
+    """Classes of objects that are screens; each has to stand in ``without_body``, too."""
+    width_m: Annotated[float, quantity("m", "of each screen", gt=0)] | None = None
+    """Absent: as wide as the object looks from the path. TR 38.901, table 7.6.4.2-5, has 0.3 m."""
+    height_m: Annotated[float, quantity("m", "of each screen, from the object's feet", gt=0)] | None = None
+    """Absent: that of the object. TR 38.901 has 1.7 m."""
+
+
+def check_screens(
+    settings: HumanBlockageSettings, others: Mapping[str, Collection[str]], without_body: Collection[str]
+) -> None:
+    """Refuse classes that would block twice, or in two ways.
+
+    Args:
+        settings: Of the screens.
+        others: Settings of the channel that say something else of objects, with their keys.
+        without_body: Classes through whose bodies waves pass.
+
+    Raises:
+        ValueError: Names the class and the remedy.
+    """
+    for name in settings.classes:
+        if name not in without_body:
+            raise ValueError(
+                f"human_blockage makes screens of the class {name!r}, whose traced bodies would block the "
+                f"same paths again; write without_body = [{name!r}], or leave human_blockage out"
+            )
+        for setting, keys in others.items():
+            if name in keys:
+                raise ValueError(
+                    f"{name!r} is a screen of human_blockage and stands in {setting}, too; leave it out of "
+                    "one of them"
+                )
+
+
+class HumanBlockage(Attenuation):
+    """Attenuation of paths by the people of a frame.
+
+    Args:
+        settings: Of the screens.
+        carriers: Of the run.
+
+    Example:
+        >>> model = HumanBlockage(HumanBlockageSettings(), (Carrier(name="c", frequency_hz=28e9),))
+        >>> model.put(np.array([[5.0, 0.0, 0.0]]), np.array([[0.3, 0.5, 1.7]]), np.array([0.0]))
+        >>> start, end = np.array([[0.0, 0.0, 1.5]]), np.array([[10.0, 0.0, 1.5]])
+        >>> factor = model.amplitude_factor(start, np.zeros((1, 0, 3)), end, np.zeros((1, 0), np.uint8))
+        >>> (-20 * np.log10(factor)).round(1).tolist()
+        [[9.9]]
+    """
+
+    def __init__(self, settings: HumanBlockageSettings, carriers: Sequence[Carrier]) -> None:
+        self._settings = settings
+        self._wavelengths = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in carriers])
+        self.put(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        size = " x ".join(
+            "as the object" if value is None else f"{value:g} m"
+            for value in (settings.width_m, settings.height_m)
+        )
+        self.briefs = tuple(f"{name}: screens of TR 38.901 model B, {size}" for name in settings.classes)
+        """What products state of it, class by class."""
+
+    def move(self, scene: Scene) -> None:
+        """Put the screens where the people of a scene are.
+
+        Args:
+            scene: Of the frame.
+        """
+        rows = [i for i, cls in enumerate(scene.classes) if cls in self._settings.classes]
+        size = scene.dimensions[rows].reshape(-1, 3)
+        feet = scene.position[rows].reshape(-1, 3) - np.array([0.0, 0.0, 0.5]) * size
+        axes = np.array([rotation_matrix(scene.orientation[i].tolist())[:, 0] for i in rows]).reshape(-1, 3)
+        self.put(feet, size, np.arctan2(axes[:, 1], axes[:, 0]))
+
+    def put(self, feet: Float64Array, size: Float64Array, yaw: Float64Array) -> None:
+        """Put K screens.
+
+        Args:
+            feet: Middle of the lower edge [m], Shape ``[K, 3]``.
+            size: Length, width and height of the people [m], Shape ``[K, 3]``.
+            yaw: Where they face [rad], Shape ``[K]``.
+        """
+        self._feet, self._size, self._yaw = feet, size, yaw
+
+    def amplitude_factor(
+        self, start: Float64Array, points: Float64Array, end: Float64Array, types: UInt8Array
+    ) -> Float64Array:
+        """Factors by screens, 10^(−L/20), Shape ``[C, P]``; see `Attenuation`."""
+        corners = path_corners(start, points, end, (types != 0).sum(1))
+        factor = np.ones((len(self._wavelengths), len(corners)))
+        if not len(self._feet) or not len(corners):
+            return factor
+        before, after = _unfolded(corners, types)
+        for leg in range(corners.shape[1] - 1):
+            ends = corners[:, leg], corners[:, leg + 1]
+            line = ends[1] - ends[0]
+            length = np.sqrt((line**2).sum(1))
+            # Unused legs have no length, vertical ones no side.
+            there = np.flatnonzero(np.hypot(line[:, 0], line[:, 1]) > _VERTICAL_M)
+            along = line[there] / length[there, None]
+            image = ends[0][there] - before[there, leg, None] * along
+            whole = before[there, leg] + length[there] + after[there, leg]
+            for screen in range(len(self._feet)):
+                reach = before[there, leg], before[there, leg] + length[there]
+                factor[:, there] *= self._leg_factor(screen, image, along, whole, reach)
+        return factor
+
+    def _leg_factor(
+        self,
+        screen: int,
+        start: Float64Array,
+        along: Float64Array,
+        whole: Float64Array,
+        reach: tuple[Float64Array, Float64Array],
+    ) -> Float64Array:
+        """Factors of one screen for straight waves, Shape ``[C, L]``.
+
+        Args:
+            screen: Its number.
+            start: Where each wave comes from [m], Shape ``[L, 3]``.
+            along: Unit vector of each, Shape ``[L, 3]``.
+            whole: Length of each [m], Shape ``[L]``.
+            reach: Lengths at which the leg begins and ends, on which a screen counts.
+        """
+        level = np.hypot(along[:, 0], along[:, 1])
+        side = along[:, :2] / level[:, None]
+        to = self._feet[screen] - start
+        # In the top view: how far along the wave the screen stands, and how far to its left.
+        at = to[:, 0] * side[:, 0] + to[:, 1] * side[:, 1]
+        left = to[:, 1] * side[:, 0] - to[:, 0] * side[:, 1]
+        counts = (at > reach[0] * level) & (at < reach[1] * level)
+        width, height = self._seen(screen, side)
+        far = whole * level
+        top = _edges((at, left - width / 2), (at, left + width / 2), (far, np.zeros_like(far)))
+        rise = whole * along[:, 2]
+        upright = _edges((at, to[:, 2]), (at, to[:, 2] + height), (far, rise))
+        k = np.pi / self._wavelengths[:, None]
+        passed: Float64Array = 1.0 - _knife(k, *upright) * _knife(k, *top)
+        return np.where(counts, passed, 1.0)
+
+    def _seen(self, screen: int, side: Float64Array) -> tuple[Float64Array | float, float]:
+        """Width, Shape ``[L]``, and height [m] of a screen across these horizontal directions."""
+        length, width, height = self._size[screen]
+        if self._settings.height_m is not None:
+            height = self._settings.height_m
+        if self._settings.width_m is not None:
+            return self._settings.width_m, height
+        c, s = np.cos(self._yaw[screen]), np.sin(self._yaw[screen])
+        forward, across = side[:, 0] * c + side[:, 1] * s, side[:, 1] * c - side[:, 0] * s
+        # The silhouette of an ellipse with these axes, seen along the direction.
+        return np.hypot(width * forward, length * across), height
+
+
+def _unfolded(corners: Float64Array, types: UInt8Array) -> tuple[Float64Array, Float64Array]:
+    """Lengths of the wave before and after each leg [m], Shape ``[P, D + 1]`` each: over reflections and
+    transmissions, up to where it is diffracted or scattered."""
+    lengths = np.sqrt((np.diff(corners, axis=1) ** 2).sum(-1))
+    passes = (types == Interaction.REFLECTION) | (types == Interaction.TRANSMISSION)
+    before, after = np.zeros_like(lengths), np.zeros_like(lengths)
+    for leg in range(1, lengths.shape[1]):
+        before[:, leg] = np.where(passes[:, leg - 1], before[:, leg - 1] + lengths[:, leg - 1], 0.0)
+    for leg in range(lengths.shape[1] - 2, -1, -1):
+        after[:, leg] = np.where(passes[:, leg], after[:, leg + 1] + lengths[:, leg + 1], 0.0)
+    return before, after
+
+
+_Point = tuple[Float64Array, Float64Array]
+
+
+def _edges(one: _Point, other: _Point, end: _Point) -> tuple[Float64Array, Float64Array]:
+    """Detours D1 + D2 − r [m] over two edges in a view, negative for an edge that counts as −.
+
+    Args:
+        one, other: Coordinates of the edges as seen from the start, one below the other.
+        end: That of the end.
+    """
+    r = np.hypot(*end)
+    detours = [np.hypot(*p) + np.hypot(end[0] - p[0], end[1] - p[1]) - r for p in (one, other)]
+    # Rounding: on the line itself the detour is 0.
+    first, second = (np.maximum(detour, 0.0) for detour in detours)
+    height = end[1] / end[0] * one[0]
+    blocks = (one[1] <= height) & (height <= other[1])
+    nearer = first <= second
+    return (np.where(blocks | ~nearer, first, -first), np.where(blocks | nearer, second, -second))
+
+
+def _knife(k: Float64Array, first: Float64Array, second: Float64Array) -> Float64Array:
+    """F of two edges, added; detours as of `_edges`, k = π/λ [1/m], Shape ``[C, 1]``."""
+    one, other = (
+        np.sign(detour) * np.arctan(np.pi / 2 * np.sqrt(k * np.abs(detour))) / np.pi
+        for detour in (first, second)
+    )
+    found: Float64Array = one + other
+    return found

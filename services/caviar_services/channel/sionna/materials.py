@@ -16,7 +16,7 @@ import msgspec
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_services.channel.propagation.fresnel import EPSILON_0
+from caviar_services.channel.propagation.utd import EPSILON_0
 
 Constants = tuple[float, float]
 """Relative permittivity and conductivity [S/m]."""
@@ -31,7 +31,7 @@ lost beside that of a reflection. The factor of two is a margin.
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceMaterial:
-    """What a surface in use is made of."""
+    """Material of a surface in use."""
 
     name: str
     constants: tuple[Constants, ...]
@@ -42,7 +42,7 @@ class SurfaceMaterial:
 
 @dataclass(frozen=True, kw_only=True)
 class UsedSurfaces:
-    """What waves can meet in a scene, at rest and moving."""
+    """Surfaces that waves can meet in a scene, at rest and moving."""
 
     materials: tuple[SurfaceMaterial, ...]
     """Of all surfaces; empty where there are none."""
@@ -175,7 +175,7 @@ constants of the nearest end of a range; or follow the power law of that range b
 
 
 class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What to change about a material of the scenery; what is not given stays."""
+    """Changes of a material of the scenery; a key that is not given changes nothing."""
 
     # At most 1e12, where |R| is 1 to 1e-5: beyond it squares leave float32, and reflections are lost.
     relative_permittivity: Annotated[float, quantity("1", "its real part", ge=1, le=1e12)] | None = None
@@ -192,7 +192,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     @property
     def is_electric(self) -> bool:
-        """Whether both electric constants are given, so that no ITU material is needed."""
+        """True if both electric constants are given, so that no ITU material is needed."""
         return self.relative_permittivity is not None and self.conductivity_s_per_m is not None
 
     def missing(self, name: str) -> str:
@@ -223,7 +223,7 @@ class MaterialSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialPolicy:
-    """What a scenario says about materials."""
+    """Policy of a scenario for materials."""
 
     changes: Mapping[str, MaterialSettings] = field(default_factory=dict)
     """By name of the material in the scenery."""
@@ -232,7 +232,7 @@ class MaterialPolicy:
     """Of the settings in the scenario, for messages."""
 
     def of(self, name: str) -> MaterialSettings:
-        """What is changed about a material.
+        """Changes of a material.
 
         Args:
             name: Of the material.
@@ -260,12 +260,12 @@ class ItuMaterial:
 
     @property
     def is_outside(self) -> bool:
-        """Whether the frequency lies outside all ranges."""
+        """True if the frequency lies outside all ranges."""
         return not self.taken_ghz[0] <= self.frequency_hz / 1e9 <= self.taken_ghz[1]
 
     @property
     def source(self) -> str:
-        """What was taken in place of constants that are not defined, in short."""
+        """Source of constants that are taken in place of undefined ones, in short."""
         low, high = self.taken_ghz
         if self.policy == "extrapolate":
             return f"extrapolate {low:g}–{high:g} GHz"
@@ -274,7 +274,7 @@ class ItuMaterial:
 
 @dataclass(frozen=True, kw_only=True)
 class OutsideUse:
-    """That a material is used where ITU-R P.2040 does not define it."""
+    """Use of a material where ITU-R P.2040 does not define it."""
 
     name: str
     carrier: int

@@ -27,11 +27,9 @@ from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.foliage import Foliage
-from caviar_services.channel.propagation.human_blockage import HumanBlockage
+from caviar_services.channel.paths import Antenna, PathTable, with_near_pairs
+from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
@@ -142,7 +140,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @property
     def _losses(self) -> tuple[Attenuation, ...]:
-        """What paths lose in beside what they meet."""
+        """Losses of paths beside interactions."""
         found: list[Attenuation] = []
         if self.foliage is not None:
             found.append(self.foliage)
@@ -161,12 +159,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @property
     def scene(self) -> SionnaScene:
-        """What waves meet; after `load_scene`."""
+        """Scene that waves meet; after `load_scene`."""
         return self._scene
 
     @property
     def launch_seed(self) -> int:
-        """Of all rays."""
+        """Seed of all rays."""
         return self._asked.seed
 
     # --- before the first frame ----------------------------------------------------------------------
@@ -305,8 +303,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _activate(self) -> None:
         """The variant of Mitsuba is the process's, and others may have set theirs."""
-        import mitsuba as mi
-
         if mi.variant() != self._variant:
             mi.set_variant(self._variant)
 
@@ -362,8 +358,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def release_memory(self) -> None:
         """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
-        import drjit as dr
-
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
@@ -428,12 +422,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return split
 
     def _power(
-        self,
-        pair: Int64Array,
-        traced: Traced,
-        antennas: Ends,
-        pairs: int,
-        weight: Float64Array | float = 1.0,
+        self, pair: Int64Array, traced: Traced, antennas: Ends, pairs: int, weight: Float64Array | float = 1.0
     ) -> Float64Array:
         """Weighted power of paths between each pair, with what foliage and people leave of them."""
         transfer = traced.transfer
@@ -445,7 +434,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return np.bincount(pair, weights=power, minlength=pairs).astype(np.float64)
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
-        """How the rung makes H; `PlaneWaves` where it has no way of its own."""
+        """Maker of the rung's H; `PlaneWaves` where it has no way of its own."""
         finder, memory = self._finder, int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)

@@ -1,4 +1,4 @@
-"""How the ray-traced channel finds the paths of a frame: by launches, by enumeration, or by both.
+"""Finder of the paths of a frame in the ray-traced channel: by launches, by enumeration, or by both.
 
 Reflections are launched in every frame, followed from frame to frame (`tracking`), or enumerated
 (`enumeration.enumerated_paths`); paths of other kinds are launched. Diffuse paths may have a launch of their
@@ -19,7 +19,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.arrays.element_visibility import outermost
+from caviar_services.channel.arrays.element_paths import outermost
 from caviar_services.channel.enumeration.enumerated_paths import EnumeratedTracer
 from caviar_services.channel.enumeration.scenery_chains import (
     ChainCache,
@@ -28,12 +28,11 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryLaunch,
 )
 from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
-from caviar_services.channel.sionna.diffuse_paths import Element
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.ray_launcher import Element, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.sionna.tracking import Followed, Following, FollowingState
@@ -338,5 +337,5 @@ class PathFinder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Of the last frame, for the report."""
+        """Counts of the last frame, for the report."""
         return {} if self._edge_range is None else {"no_edge_in_range": self._without_edge}

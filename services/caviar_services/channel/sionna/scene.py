@@ -31,10 +31,8 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.fresnel import EPSILON_0, Media
-from caviar_services.channel.sionna.body_pool import BodyPool, own_materials
+from caviar_services.channel.propagation.utd import EPSILON_0, Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.materials import (
     BODY_THICKNESS,
@@ -49,6 +47,7 @@ from caviar_services.channel.sionna.materials import (
     itu_material,
 )
 from caviar_services.channel.sionna.scene_loading import (
+    BodyPool,
     ObjectMaterial,
     Shape,
     bounds,
@@ -61,12 +60,17 @@ from caviar_services.channel.sionna.scene_loading import (
     near_middle,
     new_scene,
     object_materials,
+    own_materials,
     set_materials,
     with_detail,
 )
-from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
-from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
-from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_services.channel.sionna.triangle_numbering import (
+    NumberedTriangles,
+    closed_walls,
+    coinciding_materials,
+)
+from caviar_space.mesh_detail import DetailSettings
+from caviar_space.meshes import Body, Mesh, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
@@ -84,7 +88,7 @@ _OTHER_SKIN = "choose another body_material"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """What a scene is made with, beside its files; equal ones share a scene within `shared_scenes`."""
+    """Settings of a scene, beside its files; equal ones share a scene within `shared_scenes`."""
 
     frequencies_hz: tuple[float, ...]
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
@@ -254,7 +258,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
-        """Of the carriers [m]."""
+        """Wavelengths of the carriers [m]."""
         return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
 
     def tune(self, carrier: int) -> None:
@@ -269,7 +273,7 @@ class SionnaScene(NumberedTriangles):
         self._scene.frequency = frequency
 
     def used_surfaces(self) -> UsedSurfaces:
-        """What waves can meet, at rest and moving."""
+        """Surfaces that waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
         # Bodies that stand for nothing count: which objects will come is not known.
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _NOTHING]
@@ -297,7 +301,7 @@ class SionnaScene(NumberedTriangles):
 
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
-        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        """Permittivity and conductivity [S/m] of each shape on each carrier, Shape ``[2, C, S]``, and
         thickness [m] and scattering coefficient, Shape ``[2, S]``."""
         constants = []
         # The ray tracer has the constants of one carrier at a time; here are those of all, once for the run.
@@ -312,7 +316,7 @@ class SionnaScene(NumberedTriangles):
         return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
 
     def media(self, shapes: Int64Array) -> Media:
-        """What process-local shapes are made of; anything for no shape.
+        """Materials of process-local shapes; anything for no shape.
 
         Args:
             shapes: Of any Shape.
@@ -323,7 +327,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
-        """Of the kinds of bodies that there are (`body_kind`)."""
+        """Unit meshes of the kinds of bodies that there are (`body_kind`)."""
         return self._pool.unit_meshes
 
     @property
@@ -476,7 +480,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def has_scenery(self) -> bool:
-        """Whether anything stands still; `low` and `high` are its corners."""
+        """True if anything stands still; `low` and `high` are its corners."""
         return bool(self._scenery)
 
     def enclosing(self, position: Float64Array) -> int:
@@ -544,7 +548,7 @@ class SionnaScene(NumberedTriangles):
 
 
 def _material_name(shape: Shape) -> str:
-    """Of a shape, as a scenario has it."""
+    """Name of a shape's material, as a scenario has it."""
     name: str = shape.material.name
     return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.base import ChannelSettings, Found, PathModel
-from caviar_services.channel.batch import SameChannels
+from caviar_services.channel.base import ChannelSettings, Found, PathModel, SameChannels
 from caviar_services.channel.paths import Antenna, PathTable
 
 

@@ -1,4 +1,4 @@
-"""How much of the scenery is traced: small and far pieces are left out, the rest is made of fewer triangles.
+"""Detail of the traced scenery: small and far pieces are left out, the rest is made of fewer triangles.
 
 Reflections come from planes, and few of a city's planes matter to a street: what detail costs in accuracy
 depends on the scene, so measure it (``tests/bench/bench_detail.py``), notes list what is left out.
@@ -142,7 +142,7 @@ class _Decimation:
         return max((abs(a * x + b * y + c * z + d) for a, b, c, d in self._planes[vertex]), default=0.0)
 
     def _may_move(self, vertex: int, onto: int) -> bool:
-        """Whether the surface stays one: no triangle turns over, and no third surface is joined on."""
+        """Test whether the surface stays one: no triangle turns over, and no third surface is joined on."""
         shared = self._of_vertex[vertex] & self._of_vertex[onto]
         tips = {corner for face in shared for corner in self._faces[face]} - {vertex, onto}
         # The link condition (H. Edelsbrunner, "Geometry and Topology for Mesh Generation", 2001, 4.3).
@@ -218,7 +218,7 @@ def _unit(vector: Vector) -> Vector | None:
 
 
 class DetailSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What of the scenery the channel leaves out; what is not given leaves nothing out.
+    """Parts of the scenery that the channel leaves out; a key that is not given leaves nothing out.
 
     A piece is what hangs together by common corners within one named shape.
     """
@@ -243,13 +243,13 @@ class DetailSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     @property
     def is_full(self) -> bool:
-        """Whether nothing is left out."""
+        """True if nothing is left out."""
         return self.smallest_m == 0 and self.radius_m is None and self.tolerance_m == 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetailEffect:
-    """What became of the scenery."""
+    """Effect of detail on the scenery."""
 
     triangles: tuple[int, int]
     """Before and after."""
@@ -351,7 +351,7 @@ def piece_numbers(mesh: Mesh) -> Int64Array:
 
 
 def _reasons(mesh: Mesh, label: Int64Array, settings: DetailSettings) -> list[str]:
-    """Why each piece is left out; empty for those that stay."""
+    """Reasons for which pieces are left out; empty for those that stay."""
     reasons = []
     for piece in range(int(label.max(initial=-1)) + 1):
         corners = mesh.vertices[mesh.faces[label == piece]].reshape(-1, 3)

@@ -15,12 +15,12 @@ from gymnasium.utils.env_checker import check_env
 from radio_strike_reference import Fixed, Legacy
 
 import caviar_clients.envs
-from caviar_clients.envs.radio_strike.draws import BlockDraws
-from caviar_clients.envs.radio_strike.env import RadioStrikeEnv
-from caviar_clients.envs.radio_strike.rules import FIXED, LEGACY, Rays, magnitudes, straight_lines
-from caviar_clients.envs.radio_strike.simulation import EpisodesOverError
-from caviar_clients.envs.radio_strike.sources import synthetic_episode
-from caviar_clients.envs.radio_strike.trajectories import Episode, read_episode
+from caviar_labs.radio_strike.draws import BlockDraws
+from caviar_labs.radio_strike.env import RadioStrikeEnv
+from caviar_labs.radio_strike.rules import FIXED, LEGACY, Rays, magnitudes, straight_lines
+from caviar_labs.radio_strike.simulation import EpisodesOverError
+from caviar_labs.radio_strike.sources import synthetic_episode
+from caviar_labs.radio_strike.trajectories import Episode, read_episode
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.dft import dft_codebook

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from caviar_clients.envs.arguments import checked_names
-from caviar_clients.envs.radio_strike.rules import USERS
-from caviar_clients.envs.radio_strike.trajectories import SLOT_S, Episode, read_episode
+from caviar_labs.radio_strike.rules import USERS
+from caviar_labs.radio_strike.trajectories import SLOT_S, Episode, read_episode
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError, ScenarioError, suggestion
 from caviar_protocol.recording import Recording

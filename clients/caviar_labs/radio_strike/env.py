@@ -11,9 +11,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import whole_numbers
-from caviar_clients.envs.radio_strike.rules import BEAMS, USERS, RulesName, rules_of
-from caviar_clients.envs.radio_strike.simulation import Library, Outcome, Simulation
-from caviar_clients.envs.radio_strike.sources import Source, episode_loaders
+from caviar_labs.radio_strike.rules import BEAMS, USERS, RulesName, rules_of
+from caviar_labs.radio_strike.simulation import Library, Outcome, Simulation
+from caviar_labs.radio_strike.sources import Source, episode_loaders
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 
@@ -84,7 +84,7 @@ class RadioStrikeEnv(gymnasium.Env[Float64Array, NDArray[np.int64]]):
 
     In each slot of 10 ms packets arrive for a UAV, a car and a pedestrian; the action schedules one of them
     and chooses one of 64 beams of the base station. Packets of this user are sent, the oldest first; those
-    that could not be sent in ten slots are dropped. `caviar_clients.envs.radio_strike` has a table of what
+    that could not be sent in ten slots are dropped. `caviar_labs.radio_strike` has a table of what
     ``legacy`` and ``fixed`` do.
 
     **Action**: ``MultiDiscrete([3, 64])``, user and beam.

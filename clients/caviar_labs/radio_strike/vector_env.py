@@ -12,15 +12,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_members, checked_seeds, whole_numbers
-from caviar_clients.envs.radio_strike.env import (
+from caviar_labs.radio_strike.env import (
     action_space,
     episode_option,
     make_simulation,
     observation_space,
 )
-from caviar_clients.envs.radio_strike.rules import BEAMS, USERS, RulesName
-from caviar_clients.envs.radio_strike.simulation import OBSERVED, Outcome
-from caviar_clients.envs.radio_strike.sources import Source
+from caviar_labs.radio_strike.rules import BEAMS, USERS, RulesName
+from caviar_labs.radio_strike.simulation import OBSERVED, Outcome
+from caviar_labs.radio_strike.sources import Source
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import RunError, ScenarioError
 
@@ -40,7 +40,7 @@ class RadioStrikeVectorEnv(VectorEnv[Float64Array, NDArray[np.int64], NDArray[An
         autoreset_mode: ``AutoresetMode.NEXT_STEP`` (or its value): a member that ended is reset in the next
             step, its action without effect; ``SAME_STEP``: in the same step, with the last observation in
             ``info["final_obs"]``.
-        rules: As all others of `caviar_clients.envs.radio_strike.env.RadioStrikeEnv`.
+        rules: As all others of `caviar_labs.radio_strike.env.RadioStrikeEnv`.
         episodes: See ``rules``.
         users: See ``rules``.
         base_station: See ``rules``.

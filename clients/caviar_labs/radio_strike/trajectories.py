@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.rules import USERS, WAVELENGTH_M
+from caviar_labs.radio_strike.rules import USERS, WAVELENGTH_M
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from recording_builders import record_run
 
-from caviar_clients.envs.radio_strike.env import RadioStrikeEnv
-from caviar_clients.envs.radio_strike.rules import USERS
-from caviar_clients.envs.radio_strike.sources import (
+from caviar_labs.radio_strike.env import RadioStrikeEnv
+from caviar_labs.radio_strike.rules import USERS
+from caviar_labs.radio_strike.sources import (
     SYNTHETIC_EPISODES,
     episode_loaders,
     recorded_episodes,
     synthetic_episode,
 )
-from caviar_clients.envs.radio_strike.trajectories import Episode, read_episode
+from caviar_labs.radio_strike.trajectories import Episode, read_episode
 from caviar_protocol.errors import RecordingError, ScenarioError
 from caviar_protocol.recording import Recording
 

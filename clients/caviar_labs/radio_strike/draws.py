@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.rules import RAYS, SPREAD_DEG, TOGGLE_STEPS, USERS, Rays, Rules
+from caviar_labs.radio_strike.rules import RAYS, SPREAD_DEG, TOGGLE_STEPS, USERS, Rays, Rules
 from caviar_protocol.arrays import Float64Array, Int64Array
 
 BLOCK = 256

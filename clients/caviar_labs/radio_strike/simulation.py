@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.draws import BlockDraws, Draws, LegacyDraws
-from caviar_clients.envs.radio_strike.rules import (
+from caviar_labs.radio_strike.draws import BlockDraws, Draws, LegacyDraws
+from caviar_labs.radio_strike.rules import (
     BEAMS,
     LEGACY_STEPS,
     MAX_AGE,
@@ -21,7 +21,7 @@ from caviar_clients.envs.radio_strike.rules import (
     magnitudes,
     straight_lines,
 )
-from caviar_clients.envs.radio_strike.trajectories import Episode
+from caviar_labs.radio_strike.trajectories import Episode
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.errors import RunError
 
@@ -121,8 +121,8 @@ class Simulation:
         steps: Of an episode at most; None: as long as its trajectory.
 
     Example:
-        >>> from caviar_clients.envs.radio_strike.rules import FIXED
-        >>> from caviar_clients.envs.radio_strike.sources import episode_loaders
+        >>> from caviar_labs.radio_strike.rules import FIXED
+        >>> from caviar_labs.radio_strike.sources import episode_loaders
         >>> game = Simulation(FIXED, Library(episode_loaders(), FIXED), members=2)
         >>> for member in range(2):
         ...     game.seed(member, np.random.default_rng(member), member)

@@ -8,12 +8,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from test_envs_radio_strike import short_episode
+from test_labs_radio_strike import short_episode
 
 import caviar_clients.envs
-from caviar_clients.envs.radio_strike.env import RadioStrikeEnv
-from caviar_clients.envs.radio_strike.simulation import EpisodesOverError
-from caviar_clients.envs.radio_strike.vector_env import RadioStrikeVectorEnv
+from caviar_labs.radio_strike.env import RadioStrikeEnv
+from caviar_labs.radio_strike.simulation import EpisodesOverError
+from caviar_labs.radio_strike.vector_env import RadioStrikeVectorEnv
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from recording_builders import record_run
 
-from caviar_clients.envs.radio_strike.rules import FIXED, MAX_AGE, PACKET_BITS
-from caviar_clients.envs.radio_strike.vector_env import RadioStrikeVectorEnv
+from caviar_labs.radio_strike.rules import FIXED, MAX_AGE, PACKET_BITS
+from caviar_labs.radio_strike.vector_env import RadioStrikeVectorEnv
 from caviar_protocol.recording import Recording
 
 pytestmark = pytest.mark.slow
