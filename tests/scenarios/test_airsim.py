@@ -193,6 +193,7 @@ def test_a_call_that_is_not_offered_or_not_possible_says_so(session: Session) ->
     assert (found["nowhere"], found["objects"], found["wall"]) == ("nan", ["uav"], False)
 
 
+@pytest.mark.exhaustive
 def test_two_clients_at_once_make_thousands_of_calls_without_a_leak(session: Session) -> None:
     expected = {"sorted": True, "done": False, "control": [True, True]}
     assert session.script("warm") == {**expected, "frames": 3}  # caches fill, and the allocator's pools

@@ -35,6 +35,7 @@ def test_each_example_is_tried_here_and_on_the_page(program: str) -> None:
     assert f"({program})" in (EXAMPLES / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.exhaustive
 def test_train_and_evaluate(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
     printed = started(tmp_path, "train_and_evaluate.py", "--steps", "300")
@@ -116,6 +117,7 @@ def test_the_guide_makes_keys_as_the_remote_trainer_does() -> None:
     assert not [command for command in commands if f"    {command}\n" not in described]
 
 
+@pytest.mark.exhaustive
 def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
     """As they stand in its file, one after the other; but for the port, and the length of the run."""
     here, there = tmp_path / "here", tmp_path / "there"

@@ -206,6 +206,7 @@ def address_of(scheme: str, text: str) -> tuple[str, int]:
     return found.hostname, found.port
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_cluster_survives_a_worker_and_its_scheduler(
     scenario: Path, reference: Path, tmp_path: Path
