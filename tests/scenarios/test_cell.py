@@ -31,7 +31,7 @@ def test_a_link_that_is_killed_goes_on_with_the_packets_that_waited(tmp_path: Pa
         for frame in (30, 120):
             eventually(lambda f=frame: recorded_below(out) > f, 30, f"frame {frame} is recorded")
             os.kill(pid_of(mark, "caviar_services link"), signal.SIGKILL)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     directory = next(out.glob("*/"))
     told = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]

@@ -81,7 +81,7 @@ def test_a_service_that_raises_is_named_with_its_exception_and_frame(tmp_path: P
 def test_a_service_that_exits_is_named_with_its_status_and_last_line(tmp_path: Path) -> None:
     started = time.monotonic()
     finished = run(faulty(tmp_path, "Exits"), tmp_path / "out")
-    assert time.monotonic() - started < 30.0
+    assert time.monotonic() - started < 120.0
     assert_blamed(finished, "sensors 'sick'", "frame 5", "status 3", "segmentation of the world failed")
     assert_readable(finished, 5)
 
@@ -118,7 +118,7 @@ def test_a_service_killed_or_stopped_from_outside_is_named_with_the_signal(
     with running(scenario, tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         os.kill(pid_of(mark, "caviar_services sick"), number)
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 1
         assert "sensors 'sick' died" in output
         assert words in output
@@ -130,7 +130,7 @@ def test_ctrl_c_ends_everything_cleanly(tmp_path: Path, number: signal.Signals) 
     with running(scenario_file(tmp_path, radio=False), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         process.send_signal(number)
-        output, _ = process.communicate(timeout=10)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 130
         assert "stopped by" in output
         assert marked(mark) == []
@@ -143,7 +143,7 @@ def test_a_run_that_ctrl_c_ends_before_its_first_frame_leaves_no_directory(tmp_p
         log = "out/*/logs/broker.log"
         eventually(lambda: list(tmp_path.glob(log)), 20, "the broker starts")
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 130
         assert "no frame was simulated" in output
         assert marked(mark) == []
@@ -162,7 +162,7 @@ def test_a_broker_that_is_killed_is_named_and_leaves_no_process_behind(tmp_path:
     with running(scenario_file(tmp_path, radio=False), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         os.kill(pid_of(mark, "caviar_broker"), signal.SIGKILL)
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 1
         assert "the broker died: it was killed by SIGKILL" in output
         assert marked(mark) == []
@@ -215,7 +215,7 @@ def test_a_service_that_answers_garbage_is_named(tmp_path: Path, garbage: str) -
         for name, use in SMOKE_SERVICES.items():
             command = [sys.executable, "-m", "caviar_services", name, "--use", use, "--broker", endpoint]
             services.append(subprocess.Popen(command, env=env, stdout=DEVNULL, stderr=DEVNULL))
-        output, errors = broker.communicate(timeout=30)
+        output, errors = broker.communicate(timeout=120)
     for service in services:
         service.wait(10)
     leftovers = marked(env[MARK])
