@@ -7,8 +7,11 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from caviar_broker.core.clock import FrameClock
+# The launcher looks at processes, too, and loads no clock for it.
+if TYPE_CHECKING:
+    from caviar_broker.core.clock import FrameClock
 
 
 class LocalProcess:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from link_builders import antenna, channel_of, frame_of, given, random_h, scene_of
 
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.recording import Recording
@@ -193,7 +193,7 @@ def test_a_recording_of_something_else_is_refused(tmp_path: Path, recorded: Path
     file, use = tmp_path / "s.toml", 'use = "fingerprint"\nsettings.file = "/nowhere/run"'
     file.write_text((SCENARIOS / "smoke.toml").read_text().replace('use = "los-beam"', use, 1))
     with pytest.raises(CaviarError, match=r"settings\.file: there is no"):
-        checked_scenario(file)
+        prepare(file)
     with pytest.raises(CaviarError, match=r"settings\.file: .*none"):
         served(tmp_path / "run", tmp_path / "none")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
 
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Status
 from caviar_protocol.scenario import DeviceSpec, find_scenario
@@ -192,7 +192,7 @@ def test_what_the_scenario_does_not_have_is_refused_when_it_is_read(
     path.write_text(text.replace('use = "los-beam"', f'use = "learner"\nsettings.{settings}'))
     line = path.read_text().splitlines().index(f"settings.{settings}") + 1
     with pytest.raises(ScenarioError) as refused:
-        checked_scenario(path)
+        prepare(path)
     assert f"my.toml:{line}: services.agent.settings.{words}" in str(refused.value)
 
 

@@ -146,7 +146,7 @@ class Watchdog:
 
 
 def _doing(task: m.Message | Frame | None) -> str:
-    """What a service does, after «waiting for …»."""
+    """Work of a service in words, after «waiting for …»."""
     match task:
         case None:
             return "to close"

@@ -225,7 +225,7 @@ class End:
 
     @property
     def crashed(self) -> bool:
-        """Whether a signal of `CRASHES` ended it."""
+        """Tell whether a signal of `CRASHES` ended it."""
         # A shell in between reports a signal n as status 128 + n.
         return self.status is not None and any(self.status in (-n, 128 + n) for n in CRASHES)
 

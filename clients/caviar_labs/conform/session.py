@@ -109,7 +109,7 @@ class Session:
 
     @property
     def heard(self) -> bool:
-        """Whether the client has sent anything."""
+        """Tell whether the client has sent anything."""
         return self._route is not None
 
     # --- receiving -----------------------------------------------------------------------------------

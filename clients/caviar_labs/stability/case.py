@@ -80,7 +80,7 @@ Ask = Callable[[Lab], Outcome]
 def close(
     unit: str, expected: float | complex, got: float | complex, relative: float = 0.0, absolute: float = 0.0
 ) -> Outcome:
-    """Whether a number is as expected, within the larger of two tolerances.
+    """Tell whether a number is as expected, within the larger of two tolerances.
 
     Args:
         unit: Of the numbers, for the table.
@@ -103,14 +103,14 @@ def close(
 
 
 def equal(expected: object, got: object, what: str = "") -> Outcome:
-    """Whether two things are the same."""
+    """Tell whether two things are the same."""
     return Outcome(
         expected=f"{expected} {what}".strip(), got=f"{got} {what}".strip(), right=bool(expected == got)
     )
 
 
 def refused(error: type[CaviarError], words: str, call: Callable[[], object]) -> Outcome:
-    """Whether a call raises an error of exactly this class, with these words in its text."""
+    """Tell whether a call raises an error of exactly this class, with these words in its text."""
     expected = f"{error.__name__}: … {words} …"
     try:
         answer = call()
@@ -130,7 +130,7 @@ def all_of(*outcomes: Outcome) -> Outcome:
 
 
 def worst(errors: Sequence[float], limit: float, unit: str, what: str) -> Outcome:
-    """Whether all of many errors are within a limit.
+    """Tell whether all of many errors are within a limit.
 
     Args:
         errors: Without a sign; none or a NaN among them is wrong.

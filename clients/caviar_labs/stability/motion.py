@@ -121,7 +121,7 @@ def _(lab: Lab) -> Outcome:
 
 @case("jump", "a vehicle that jumps into the line of sight, 700 m from frame to frame, and out again")
 def _(lab: Lab) -> Outcome:
-    """What a frame says follows from that frame: no path by way of where the vehicle was."""
+    """Check that a frame follows from its own scene: no path by way of where the vehicle was."""
     model = lab.traced(F)
     tx, rx = (-40.0, 0.0, 2.0), (40.0, 1.0, 1.5)
     there, away = (

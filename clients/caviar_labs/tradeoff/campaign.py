@@ -384,7 +384,7 @@ class Campaign:
         measured.add_sample(self._scenes.instants[index].frame, sample)
 
     def _is_of_use(self, measured: Measured, name: Block) -> bool:
-        """Whether a setting was measured at all; adds notes for the reader of the table."""
+        """Tell whether a setting was measured at all; adds notes for the reader of the table."""
         if not measured.samples:
             self._skip(measured.setting, name, "; ".join(measured.notes))
             return False

@@ -37,7 +37,7 @@ SERVICE = "channel"
 
 
 def is_known(setting: Setting, scenes: Scenes) -> bool:
-    """Whether the channel knows a setting; nothing is loaded."""
+    """Tell whether the channel knows a setting; nothing is loaded."""
     try:
         cls = load("channel", setting.use)
         convert_settings(cls.Settings, setting.over(scenes.settings_of("channel", setting.use)))

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 import numpy as np
 
@@ -36,22 +36,20 @@ from caviar_protocol.recording.integrity import (
     metadata_of,
     recorded_digest,
 )
-from caviar_protocol.recording.scene import (
-    CameraArrays,
-    DepthArrays,
-    LidarArrays,
-    SceneArrays,
-    SegmentationArrays,
-)
 from caviar_protocol.recording.segment import Channel, Segment
-from caviar_protocol.recording.topics import (
-    TOPIC_ARRAYS,
-    ActionArrays,
-    ChannelArrays,
-    LinkArrays,
-)
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
+
+# Columns read the type hints of all payloads: what looks at frames and digests alone does without.
+if TYPE_CHECKING:
+    from caviar_protocol.recording.scene import (
+        CameraArrays,
+        DepthArrays,
+        LidarArrays,
+        SceneArrays,
+        SegmentationArrays,
+    )
+    from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays
 
 T = TypeVar("T", bound=str)
 Key: TypeAlias = T | tuple[T, str]
@@ -195,6 +193,8 @@ class Recording:
                 f"recording[{key!r}] is no topic, which is a text, as in recording['link']; frames are "
                 "recording.frame(episode=0, frame=7) and recording.frames()"
             )
+        from caviar_protocol.recording.topics import TOPIC_ARRAYS
+
         topic, source = (key, "") if isinstance(key, str) else key
         return TOPIC_ARRAYS[check_topic(topic)](
             self, topic, self._sources(topic, source), np.arange(len(self), dtype=np.int64)

@@ -65,7 +65,7 @@ class AirSimSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     lidar_frame: Literal["inertial", "sensor"] = "inertial"
     """Axes of LIDAR points, as ``DataFrame`` of AirSim's settings: NED from the origin, or the sensor's."""
     habits: Habits = Habits()
-    """How vehicles fly where a call does not say it."""
+    """Defaults of flight where a call does not say it."""
 
 
 class AirSimAgent(Agent[AirSimSettings]):

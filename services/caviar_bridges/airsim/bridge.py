@@ -48,7 +48,7 @@ class FrameGate:
 
     @property
     def is_open(self) -> bool:
-        """Whether frames go by, if only a few more."""
+        """Tell whether frames go by, if only a few more."""
         return not self.paused or self._frames > 0 or self._until_ns is not None
 
     def pause(self) -> None:
@@ -320,7 +320,7 @@ class Bridge:
 
 
 def boxes_overlap(scene: Scene, first: int, second: int) -> bool:
-    """Whether the boxes of two objects overlap.
+    """Tell whether the boxes of two objects overlap.
 
     Args:
         scene: The scene.

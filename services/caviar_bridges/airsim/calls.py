@@ -151,7 +151,7 @@ class StateCalls:
         await self._bridge.gate.held.wait()
 
     async def is_paused(self) -> bool:
-        """Whether no frame goes by."""
+        """Tell whether no frame goes by."""
         return not self._bridge.gate.is_open
 
     async def continue_for_frames(self, frames: object) -> None:

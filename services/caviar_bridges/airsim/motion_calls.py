@@ -51,7 +51,7 @@ _log = logging.getLogger("caviar.airsim")
 
 
 class Habits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How vehicles fly where a call does not say it."""
+    """Defaults of flight where a call does not say it."""
 
     speed_m_s: Annotated[float, quantity("m/s", "on the way home", gt=0)] = 5.0
     climb_m_s: Annotated[float, quantity("m/s", "of take-off and landing", gt=0)] = 2.0
@@ -106,7 +106,7 @@ class MotionCalls:
             vehicle.begin(Hover(vehicle.object))
 
     async def is_enabled(self, vehicle_name: object = "") -> bool:
-        """Whether a vehicle is taken over."""
+        """Tell whether a vehicle is taken over."""
         return self._vehicle(vehicle_name).api_enabled
 
     async def arm(self, arm: object, vehicle_name: object = "") -> bool:

@@ -130,7 +130,7 @@ NAVIGATION: Mapping[str, Callable[[Motion], Map]] = {
 
 
 def is_blocked(triangles: Float64Array, start: Vector, end: Vector) -> bool:
-    """Whether a triangle lies between two points (Möller and Trumbore, 1997).
+    """Tell whether a triangle lies between two points (Möller and Trumbore, 1997).
 
     Args:
         triangles: Corners [m], Shape ``[T, 3, 3]``.
@@ -193,13 +193,13 @@ class SensorCalls:
         return self._load_scenery()
 
     async def sees(self, point: object, vehicle_name: object = "") -> bool:
-        """Whether no scenery stands between a vehicle and a ``GeoPoint``."""
+        """Tell whether no scenery stands between a vehicle and a ``GeoPoint``."""
         _, flown = await self._bridge.flown(text(vehicle_name, "vehicle_name"))
         end = (await self._bridge.ned()).from_geo_point(point, "point")
         return not await asyncio.to_thread(lambda: is_blocked(self._scenery, flown.position, end))
 
     async def is_clear(self, point1: object, point2: object) -> bool:
-        """Whether no scenery stands between two ``GeoPoint``."""
+        """Tell whether no scenery stands between two ``GeoPoint``."""
         ned = await self._bridge.ned()
         start, end = ned.from_geo_point(point1, "point1"), ned.from_geo_point(point2, "point2")
         return not await asyncio.to_thread(lambda: is_blocked(self._scenery, start, end))

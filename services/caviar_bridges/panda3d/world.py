@@ -82,7 +82,7 @@ class Panda3dSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class _Order(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What was commanded until an instant."""
+    """Commands until an instant."""
 
     until_ns: Annotated[int, msgspec.Meta(ge=0)]
     commands: dict[str, VelocityCommand | WaypointCommand]

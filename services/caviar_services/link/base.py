@@ -22,7 +22,7 @@ from caviar_protocol.messages import GrantInput, Input, Role, Status
 from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Scene, UserSchedule
-from caviar_services.channel.batch import ChannelBatch, MemberSeed, SceneAt
+from caviar_services.channel.base import ChannelBatch, MemberSeed, SceneAt
 from caviar_services.service import Frame, Service
 
 S = TypeVar("S", bound=msgspec.Struct)

@@ -20,7 +20,7 @@ from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.space.beams import beam_gains, straight_beams
 from caviar_protocol.space.scene import antennas, directions
 from caviar_protocol.topics import Carrier, Link
-from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
+from caviar_services.channel.base import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import BatchLink, LinkBatch, User, Users
 from caviar_services.link.beam_scores import Interferers, RewardKind, Scored, SweepingLink, SweepSettings
 from caviar_services.link.link_budget import LinkBudget
