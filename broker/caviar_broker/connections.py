@@ -1,6 +1,6 @@
 """Connections of a run: whose each one is, and the answer to those who have no place in it.
 
-The one ROUTER port of a broker: parts in, parts out, and never a wait of more than a millisecond.
+`Router` is the one ROUTER port of a broker: parts in, parts out, and never a wait of more than a millisecond.
 """
 
 from __future__ import annotations

@@ -3,10 +3,8 @@
 The broker never looks into a payload, and a decoder checks types and shapes only. What a service
 consumes therefore passes through one `ContentCheck` before the service sees it: a product with a
 quaternion of norm 2, a negative dimension, a name twice or a number that is none is refused in the first
-frame, and the error names the service that made it. `scene_validation` looks at scenes, `part_validation` at
+frame, and the error names the service that made it. `scene_validation` looks at scenes, `PartCheck` at
 the parts that were asked for.
-
-Validation of the parts of products: whether those are there that consumers asked for, in the right shape.
 
 A producer computes a part where a consumer asks for it (contract, clause 5). Nothing but `PartCheck` notices
 one that leaves a part out, or that fills it for another numerology or other arrays.

@@ -1,6 +1,5 @@
-"""The table of an episode's decisions: each made once, in order, and entered in the journal.
-
-Budgets of an episode: when one is up, and what follows from that.
+"""The table of an episode's decisions, each made once, in order, and entered in the journal; and the budgets
+of an episode: when one is up, and what follows from that (`Deadlines`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Scores of the chosen beam pairs of a frame: |y|, SNR, spectral efficiency, bit rate and reward.
 
-Every beam pair of every user is swept (`beam_sweep`), so that the chosen pair stands beside the best one
+Every beam pair of every user is swept (`sweep_users`), so that the chosen pair stands beside the best one
 (paper, eq. 2) and beside the pair along the straight line (the baseline of section 4).
 
 Sweep of DFT codebooks, and what beam pairs get over the band.

@@ -1,7 +1,7 @@
 """Link budget: transmit power over thermal noise, of which the SNR of a beam pair follows.
 
 The SNR of a user is transmit power · |y|² / (k·T·B·F), with |y| of its beam pair (`beam_sweep`). What it
-carries follows from the SNR: `caviar_protocol.cell.rates`.
+carries follows from the SNR: `caviar_protocol.cell.link_adaptation`.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Channels at the instants of slots and over the band, for chosen beams, from the 
 
     y(Δf, Δt) = Σ_p (w* r_p) · (t_pᵀ f) · a_p · exp(j2π(ν_p·Δt − Δf·(τ_p − Δt·ν_p/f_c)))
 
-with the phases r_p and t_p of the elements on path p (`beam_sweep`): Doppler shifts ν turn the phases of the
+with the phases r_p and t_p of the elements on path p (`beam_scores`): Doppler shifts ν turn the phases of the
 paths against each other within a frame, delays τ over the band.
 
 Association: which transmitter serves a receiver, and what it costs to change.

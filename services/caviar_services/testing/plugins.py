@@ -1,7 +1,4 @@
-"""Conformance tests of codebooks.
-
-Conformance tests of noise models of sensors (`caviar_services.sensors.noise`).
-"""
+"""Conformance tests of codebooks, and of noise models of sensors (`caviar_services.sensors.noise`)."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ def braking_speed(distance: float, gain: float, acceleration: float) -> float:
 
 
 class Autopilot:
-    """The loops of the controller, without a state: what they keep is in `quadrotor.state`.
+    """The loops of the controller, without a state: what they keep is in `QuadrotorState`.
 
     Args:
         airframe: The quadrotor.
