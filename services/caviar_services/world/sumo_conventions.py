@@ -4,7 +4,8 @@ SUMO gives the centre of the front bumper on the ground, a heading in degrees cl
 slope in degrees, positive uphill; a scene has the centre of the bounding box and angles counter-clockwise
 from +x. Steps of SUMO fit the sampling period of a run and the spacing of its episodes.
 
-`People` smooths the motion of people who are moved by SUMO's models of pedestrians. These models are made for flows of people, not for bodies that reflect and block waves. ``striping`` moves a
+`People` smooths the motion of people who are moved by SUMO's models of pedestrians.
+These models are made for flows of people, not for bodies that reflect and block waves. ``striping`` moves a
 person at junctions by up to some 3.5 m in a step of 0.1 s, ``nonInteracting`` by more; ``jupedsim`` turns
 people about from one step to the next; and the speed that SUMO states is not that with which the position
 changes. Here a body walks after the place where SUMO has the person: with at most `FASTEST`, turned along the

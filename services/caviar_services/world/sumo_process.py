@@ -2,7 +2,8 @@
 
 libsumo is one simulation per process and prints what it warns of, so that its output is caught.
 
-`TrafficStates` are those at the beginnings of episodes that share one traffic. Episode e of such a run begins e·(time between episodes) after the first. To get there anew SUMO would pass
+`TrafficStates` are those at the beginnings of episodes that share one traffic.
+Episode e of such a run begins e·(time between episodes) after the first. To get there anew SUMO would pass
 through all that comes before: 62,580 s for the last of 2,086 episodes that are 30 s apart. One pass saves its
 state at the beginning of each episode, and every episode starts from its saved state, wherever and in
 whatever order it is played; whether the state was there or had to be made changes nothing.

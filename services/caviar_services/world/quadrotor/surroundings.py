@@ -15,7 +15,8 @@ the mean wind, Ω is a frequency of Ω·V. Filters of white noise with these spe
 
     H_u(s) = σ_u·√(2·T_u) / (1 + T_u·s),   H_v(s) = σ_v·√T_v·(1 + √3·T_v·s) / (1 + T_v·s)²,   T = L/V,
 
-are integrated in closed form over a step, so that variances do not depend on its length. In contacts a quadrotor is a ball.
+are integrated in closed form over a step, so that variances do not depend on its length.
+In contacts a quadrotor is a ball.
 """
 
 from __future__ import annotations
