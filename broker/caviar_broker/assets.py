@@ -13,7 +13,7 @@ import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.geometry import GEOMETRY, has_capability
+from caviar_broker.core.mesh_changes import GEOMETRY, has_capability
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m

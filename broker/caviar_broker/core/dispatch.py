@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from caviar_broker.core.decisions import Deadlines, DecisionTable
 from caviar_broker.core.events import Product
-from caviar_broker.core.geometry import GeometryLedger
+from caviar_broker.core.mesh_changes import GeometryLedger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import milliseconds
 from caviar_broker.core.run import Resumption, Run

@@ -11,8 +11,8 @@ from collections.abc import Iterable
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
-from caviar_broker.core.geometry import GEOMETRY, GEOMETRY_SINCE, has_capability
 from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
+from caviar_broker.core.mesh_changes import GEOMETRY, GEOMETRY_SINCE, has_capability
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 from caviar_protocol.codec import check_version

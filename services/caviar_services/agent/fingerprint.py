@@ -61,7 +61,7 @@ class Codebooks(NamedTuple):
     rx_codebook: str = DFT
 
     @classmethod
-    def of(cls, pair: Pair, carrier: str) -> Codebooks:
+    def for_pair(cls, pair: Pair, carrier: str) -> Codebooks:
         """Codebooks of a pair of a scene."""
         return cls(pair.tx.name, carrier, *pair.beams, pair.tx.array.codebook, pair.rx.array.codebook)
 
@@ -111,7 +111,7 @@ class Fingerprints:
         for u, (tx, rx, carrier) in enumerate(zip(link.tx, link.rx, link.carrier, strict=True)):
             if not link.has_path[u] or tx not in sizes or rx not in sizes:
                 continue
-            key = Codebooks.of(Pair(sizes[tx], sizes[rx]), carrier)
+            key = Codebooks.for_pair(Pair(sizes[tx], sizes[rx]), carrier)
             cell = self._cell(device_pose(scene, sizes[rx]).position)
             pairs = self._seen[key].setdefault(cell, {})
             for rank, ((tx_beam, rx_beam), gain) in enumerate(zip(beams[u], power[u], strict=True)):
@@ -231,7 +231,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         """The best of the first few pairs of each user's cell."""
         for index, user in enumerate(sounding.users):
             position = device_pose(sounding.scene, user.rx).position
-            pairs = self._table.pairs(Codebooks.of(user, user.carrier.name), position)
+            pairs = self._table.pairs(Codebooks.for_pair(user, user.carrier.name), position)
             if not pairs:
                 sounding.note(UNKNOWN)
                 at_tx, at_rx = directions(sounding.scene, [user])

@@ -241,7 +241,7 @@ class SweepingLink(LinkModel[B]):
 
     def _budget_of(self, scene: Scene, channel: Channel) -> LinkBudget:
         settings = self.settings
-        return LinkBudget.of(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
+        return LinkBudget.for_scene(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
 
     def counts(self, scored: Scored) -> dict[str, int]:
         """Events of a frame by name, those that did not happen too."""
@@ -412,7 +412,7 @@ class Interferers:
     """A number for each user, the same for those of one transmitter and carrier, Shape ``[U]``."""
 
     @classmethod
-    def of(cls, users: Users) -> Interferers:
+    def for_users(cls, users: Users) -> Interferers:
         """Make it for the users of a scene.
 
         Args:
@@ -421,7 +421,7 @@ class Interferers:
         Example:
             >>> from caviar_services.link.base import users_of
             >>> from caviar_services.testing.samples import CARRIERS, scene
-            >>> len(Interferers.of(users_of(scene(0), CARRIERS)).victims)  # one base station
+            >>> len(Interferers.for_users(users_of(scene(0), CARRIERS)).victims)  # one base station
             0
         """
         names = [(user.tx.name, user.rx.name, user.carrier.name) for user in users]

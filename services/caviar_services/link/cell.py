@@ -80,7 +80,7 @@ class _Serving:
     """Terminals of each transmitter and carrier, Shape ``[G, T]``."""
 
     @classmethod
-    def of(cls, layout: Layout, transmitters: Int64Array) -> _Serving:
+    def for_layout(cls, layout: Layout, transmitters: Int64Array) -> _Serving:
         users = layout.rows[np.arange(len(transmitters)), transmitters]
         groups = layout.carrier[users] * len(layout.transmitters) + transmitters
         numbers = np.array(list(dict.fromkeys(groups.tolist())), np.int64)
@@ -173,7 +173,7 @@ class CellLink(SweepingLink[CellSettings]):
             self._add_rates(scored, fields)
         layout = self._layout
         if layout is None or layout.users is not scored.budget.users:
-            layout = self._layout = Layout.of(scored.budget.users)
+            layout = self._layout = Layout.for_users(scored.budget.users)
         terminals, counts["bits-of-users-that-left"] = self._terminals_of(layout)
         before = terminals.buffers.totals
         # Traffic goes on in frames that were not granted; nothing is served then.
@@ -238,7 +238,7 @@ class CellLink(SweepingLink[CellSettings]):
         changed = terminals.serve_by([layout.transmitters[x] for x in found.tolist()])
         terminals.lost[changed] = settings.handover_slots
         if before is None or before.layout is not layout or (before.transmitters != found).any():
-            before = self._serving = _Serving.of(layout, found)
+            before = self._serving = _Serving.for_layout(layout, found)
         return before, int(changed.sum())
 
     def _rates(

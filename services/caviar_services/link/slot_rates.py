@@ -53,7 +53,7 @@ class Layout:
     """A number for the carrier of each user, Shape ``[U]``."""
 
     @classmethod
-    def of(cls, users: Users) -> Layout:
+    def for_users(cls, users: Users) -> Layout:
         """Make it for the users of a scene.
 
         Args:
@@ -62,7 +62,7 @@ class Layout:
         Example:
             >>> from caviar_services.link.base import users_of
             >>> from caviar_services.testing.samples import CARRIERS, scene
-            >>> Layout.of(users_of(scene(0), CARRIERS)).names
+            >>> Layout.for_users(users_of(scene(0), CARRIERS)).names
             (('car.1/rx', 'mmwave'), ('truck.2/rx', 'mmwave'))
         """
         names = {name: t for t, name in enumerate(dict.fromkeys((u.rx.name, u.carrier.name) for u in users))}
@@ -116,7 +116,7 @@ def associate(
     Example:
         >>> from caviar_services.link.base import users_of
         >>> from caviar_services.testing.samples import CARRIERS, scene
-        >>> layout = Layout.of(users_of(scene(0), CARRIERS))
+        >>> layout = Layout.for_users(users_of(scene(0), CARRIERS))
         >>> nowhere, power = np.array([-1, -1]), np.array([1e-9, 2e-9])
         >>> associate(layout, nowhere, power, power > 0, "best", 0.0)
         array([0, 0])

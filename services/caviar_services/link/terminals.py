@@ -209,7 +209,9 @@ class Terminals:
         self._settings, self._slot_s = settings, slot_s
         self._traffic = [_traffic_of(rx, settings.traffic) for rx, _ in self.names]
         # By the entry: most terminals share one.
-        self._offered = {id(entry): Offered.of(entry) for entry in self._traffic if entry.model != "full"}
+        self._offered = {
+            id(entry): Offered.for_traffic(entry) for entry in self._traffic if entry.model != "full"
+        }
         self.is_full: BoolArray = np.array([entry.model == "full" for entry in self._traffic], np.bool_)
         """Which always have something to send, Shape ``[T]``."""
         self.has_full = bool(self.is_full.any())
@@ -308,14 +310,14 @@ class Terminals:
         """State that outlives the frame."""
         return TerminalState(
             names=self.names,
-            buffers={name: Packed.of(array, "<i8") for name, array in self.buffers.state().items()},
-            turns=Packed.of(self.turns, "<i8"),
+            buffers={name: Packed.pack(array, "<i8") for name, array in self.buffers.state().items()},
+            turns=Packed.pack(self.turns, "<i8"),
             turn=self.turn,
             servers=self.servers,
-            lost=Packed.of(self.lost, "<i8"),
-            offset_db=Packed.of(self.adaptation.offset_db, "<f8"),
-            rise=Packed.of(self.adaptation.rise, "<f8"),
-            average=Packed.of(self.average, "<f8"),
+            lost=Packed.pack(self.lost, "<i8"),
+            offset_db=Packed.pack(self.adaptation.offset_db, "<f8"),
+            rise=Packed.pack(self.adaptation.rise, "<f8"),
+            average=Packed.pack(self.average, "<f8"),
         )
 
     @classmethod

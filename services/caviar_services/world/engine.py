@@ -73,7 +73,7 @@ class Engine(ABC):
         ...     def step(self, t, previous, commands):
         ...         at, level, velocity = (10 * t, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0), (10.0, 0.0, 0.0)
         ...         yield ObjectState("car", "car", at, level, velocity, (4.6, 1.9, 1.5))
-        >>> world = EngineWorld.of(Street())(WorldSettings(), RunInfo(name="world"))
+        >>> world = EngineWorld.for_engine(Street())(WorldSettings(), RunInfo(name="world"))
         >>> world.reset(0, 1, 0)
         >>> world.step(Frame(episode=0, number=2, t_ns=200_000_000)).products["scene"].position.tolist()
         [[2.0, 0.0, 0.75]]
@@ -174,7 +174,7 @@ class Engine(ABC):
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
         _log.info("%s: waiting for the broker at %s", name, endpoint)
         try:
-            cls = EngineWorld.of(self)
+            cls = EngineWorld.for_engine(self)
             runner = Runner(name, cls, type(self).__name__, endpoint, termination=SignalTermination())
             status = runner.run()
         except CaviarError as error:
@@ -207,7 +207,7 @@ class EngineWorld(World[WorldSettings]):
     engine: ClassVar[Engine]
 
     @classmethod
-    def of(cls, engine: Engine) -> type[EngineWorld]:
+    def for_engine(cls, engine: Engine) -> type[EngineWorld]:
         """Make the class of an engine's world.
 
         Args:
