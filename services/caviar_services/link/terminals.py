@@ -209,9 +209,7 @@ class Terminals:
         self._settings, self._slot_s = settings, slot_s
         self._traffic = [_traffic_of(rx, settings.traffic) for rx, _ in self.names]
         # By the entry: most terminals share one.
-        self._offered = {
-            id(entry): Offered.for_traffic(entry) for entry in self._traffic if entry.model != "full"
-        }
+        self._offered = {id(t): Offered.for_traffic(t) for t in self._traffic if t.model != "full"}
         self.is_full: BoolArray = np.array([entry.model == "full" for entry in self._traffic], np.bool_)
         """Which always have something to send, Shape ``[T]``."""
         self.has_full = bool(self.is_full.any())
