@@ -20,7 +20,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -42,7 +42,10 @@ def load_libsumo() -> ModuleType:
         SetupError: It is not installed; says the command that installs it.
     """
     try:
-        import libsumo
+        with redirect_stdout(
+            sys.stderr
+        ):  # it prints a remark beside a pyarrow; standard output is for results
+            import libsumo
     except ImportError as error:
         raise SetupError(
             f"the world `sumo` needs libsumo ({error}); run: {install_command('world')}"
