@@ -299,12 +299,7 @@ def changes(before: Channel, after: Channel) -> Changes:
     same = before.tx == after.tx and before.rx == after.rx
     if same and np.array_equal(before.offsets, after.offsets) and np.array_equal(before.id, after.id):
         return Changes(np.zeros(len(after.id), np.bool_), np.zeros(len(before.id), np.bool_))
-    earlier, later = _keys(before, after)
-    return Changes(~np.isin(later, earlier), ~np.isin(earlier, later))
-
-
-def _keys(before: Channel, after: Channel) -> tuple[Int64Array, Int64Array]:
-    """Numbers that two paths of the products, Shape ``[P]`` each, have in common where they are the same."""
+    # Numbers that two paths of the products, Shape ``[P]`` each, have in common where they are the same.
     channels = (before, after)
     tx, rx = (
         {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -316,4 +311,5 @@ def _keys(before: Channel, after: Channel) -> tuple[Int64Array, Int64Array]:
         for c in channels
     ]
     keys = np.concatenate(pairs) * len(numbers) + places.reshape(-1)
-    return keys[: len(before.id)], keys[len(before.id) :]
+    earlier, later = keys[: len(before.id)], keys[len(before.id) :]
+    return Changes(~np.isin(later, earlier), ~np.isin(earlier, later))

@@ -22,8 +22,8 @@ from types import MappingProxyType
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array
+from caviar_protocol.assets import check_unit_box, is_mesh_name
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.geometry import check_unit_box, is_mesh_name
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.space.ply import read_ply
 

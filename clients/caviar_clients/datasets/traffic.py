@@ -10,7 +10,7 @@ from caviar_protocol.scenario.conversion import convert_settings
 from caviar_services.registry import load
 from caviar_services.service import RunInfo
 from caviar_services.world.sumo import SumoWorld
-from caviar_services.world.sumo_states import TrafficStates
+from caviar_services.world.sumo_process import TrafficStates
 
 Progress = Callable[[float, float], None]
 """Called with SUMO's time [s], and with that at which the pass ends."""

@@ -23,7 +23,7 @@ from caviar_clients.envs.arguments import (
 from caviar_clients.envs.base import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.learning.tracks import NoProducts, Tracks, read_tracks
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.cell.rates import shannon
+from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.observations import Moment
 from caviar_services.link.base import BatchLink

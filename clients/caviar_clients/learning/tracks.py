@@ -24,7 +24,7 @@ from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.base import User, channels_of
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import LinkBudget
 

@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Payload, quantity
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.space.coordinates import Pose, Vector

@@ -21,8 +21,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import is_mesh_name, material_of
 from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.geometry import is_mesh_name, material_of
 from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Scene
