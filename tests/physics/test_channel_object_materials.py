@@ -191,7 +191,9 @@ def test_what_is_wrong_with_a_material_names_its_key(settings: dict[str, Any], k
     assert refused.value.key == f"services.channel.settings.{key}"
 
 
-@pytest.mark.parametrize("key", ["*", "c*", ""])
+@pytest.mark.parametrize(
+    "key", ["*", *(pytest.param(key, marks=pytest.mark.exhaustive) for key in ("c*", ""))]
+)
 @pytest.mark.parametrize("setting", ["object_materials", "foliage"])
 def test_a_pattern_of_everything_ends_no_enumerated_run(setting: str, key: str) -> None:
     """Kernels are compiled with objects of no name that the user's patterns could match."""

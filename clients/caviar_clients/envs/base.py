@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_names, checked_path, checked_patterns
-from caviar_clients.plots.scene_map import MapRenderer
+from caviar_clients.plots.moving import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.connected import CONNECT_TIMEOUT_S, agent_of, open_session
 from caviar_clients.session.prepared import PreparedScenario, prepare

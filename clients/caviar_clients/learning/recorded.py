@@ -212,7 +212,7 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     # --- links -----------------------------------------------------------------------------------
 
     def _scored(self, rows: Int64Array, beams: Int64Array) -> BatchLink:
-        """What the beams achieve in these frames, as they were recorded."""
+        """Figures of the beams in these frames, as they were recorded."""
         tracks, pair = self.tracks, self.tracks.pair
         abs_y = tracks.swept[rows, beams]
         snr = tracks.power_over_noise[rows] * abs_y**2
@@ -272,7 +272,7 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
 
 
 class _Order:
-    """Which user comes when: each once before one comes again."""
+    """Order of the users: each once before one comes again."""
 
     def __init__(self, count: int, seed: int | None) -> None:
         self._random, self._count, self._left = np.random.default_rng(seed), count, list[int]()

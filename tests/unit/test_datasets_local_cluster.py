@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from caviar_clients.datasets import exits
-from caviar_clients.datasets.exits import exit_of, exit_text, noting_nanny
+from caviar_clients.datasets import local_cluster
+from caviar_clients.datasets.local_cluster import exit_of, exit_text, noting_nanny
 
 
 @pytest.mark.parametrize("at_once", [True, False])
@@ -38,7 +38,7 @@ def test_a_command_that_is_interrupted_waits_for_no_step(
 
 
 def test_an_exit_is_said_with_status_or_signal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exits, "exit_codes", {"tcp://a": 3, "tcp://b": -11, "tcp://c": -40})
+    monkeypatch.setattr(local_cluster, "exit_codes", {"tcp://a": 3, "tcp://b": -11, "tcp://c": -40})
     assert exit_of("tcp://a", wait_s=0.0) == "it exited with status 3 (no signal), as os._exit(3) does"
     assert exit_of("tcp://b", wait_s=0.0) == "signal SIGSEGV ended it, a fault in compiled code"
     assert exit_of("tcp://c", wait_s=0.0) == "signal 40 ended it"

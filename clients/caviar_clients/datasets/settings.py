@@ -1,15 +1,126 @@
-"""In what two datasets differ, as keys of their scenarios with both values."""
+"""Settings of a dataset: what its catalogue has to hold of them, their digest, and in what two differ.
+
+They are JSON in a database that comes from anywhere. Of a scenario only what readers, `verify` and `look` use
+is looked at, so that datasets of other versions, with more keys or fewer, can be read.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+FORMAT = 1
+"""Version of the layout of a dataset: of its catalogue, its files and its settings."""
 
 SHOWN = 8
 """Differences that an error names."""
 _VALUE_CHARACTERS = 60
 _ABSENT = object()
+
+_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Small = Annotated[int, Meta(ge=0, le=2**24)]
+
+
+class _Run(msgspec.Struct, frozen=True):
+    frames: Annotated[int, Meta(ge=1, le=2**63 - 1)]
+    sampling_period_ns: _Count
+    name: str = ""
+    seed: _Count = 0
+    instants_s: tuple[float, ...] = ()
+    record: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        are_finite = all(map(math.isfinite, self.instants_s))
+        if self.instants_s and (len(self.instants_s) < self.frames or not are_finite):
+            raise ValueError(f"instants_s has {len(self.instants_s)} instants for {self.frames} scenes")
+
+
+class _Carrier(msgspec.Struct, frozen=True):
+    name: str = ""
+    frequency_hz: Annotated[float, Meta(gt=0)] = 1.0
+    bandwidth_hz: Annotated[float, Meta(gt=0)] = 1.0
+
+
+class _Array(msgspec.Struct, frozen=True):
+    rows: _Small = 1
+    columns: _Small = 1
+
+
+class _Device(msgspec.Struct, frozen=True):
+    name: str = ""
+    kind: str = ""
+    role: str = ""
+    on: str | None = None
+    array: _Array | None = None
+    power_dbm: float = 0.0
+    size_px: tuple[_Small, _Small] = (0, 0)
+    field_of_view_deg: float = 0.0
+    range_m: tuple[float, float] = (0.0, 0.0)
+    beams: _Small = 0
+    azimuth_steps: _Small = 0
+    count: _Count = 1
+
+
+class _Box(msgspec.Struct, frozen=True):
+    minimum_m: tuple[float, float, float]
+    maximum_m: tuple[float, float, float]
+
+
+class _ServiceSettings(msgspec.Struct, frozen=True):
+    obstacles: tuple[_Box, ...] = ()
+
+
+class _Service(msgspec.Struct, frozen=True):
+    role: str = ""
+    use: str = ""
+    settings: _ServiceSettings = _ServiceSettings()
+
+
+class _Scenario(msgspec.Struct, frozen=True):
+    run: _Run
+    services: dict[str, _Service]
+    carriers: tuple[_Carrier, ...] = ()
+    devices: tuple[_Device, ...] = ()
+
+
+class _Settings(msgspec.Struct, frozen=True):
+    """Settings of a dataset as far as its readers rely on them, whatever else they have."""
+
+    format: int
+    scenario: _Scenario
+    files: dict[str, str]
+    versions: dict[str, str]
+    device: str
+
+
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Check that settings have what readers of a dataset rely on.
+
+    Args:
+        settings: Of a catalogue.
+
+    Raises:
+        msgspec.ValidationError: They have not; names the key.
+    """
+    msgspec.convert(settings, _Settings)
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Digest of the settings of a dataset; the number of its episodes is none of them.
+
+    Args:
+        settings: Of `plan.DatasetPlan.settings`.
+
+    Example:
+        >>> fingerprint({"device": "llvm"}) == fingerprint({"device": "cuda"})
+        False
+    """
+    return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:

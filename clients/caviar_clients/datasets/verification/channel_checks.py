@@ -1,5 +1,5 @@
-"""What the paths of a channel have to be: lengths, directions and Doppler shifts by their points, gains below
-those of free space, and H as their sum.
+"""Checks of a channel and its link: paths by their points, gains below those of free space, H as the sum of
+its paths, |y| of the pairs of beams by H, and SNR by |y|.
 
 Points of interaction are recorded, so the geometry of each path is computed anew from them: delay,
 departure, arrival and Doppler shift (`caviar_services.channel.paths`). What happens at a point
@@ -10,18 +10,22 @@ it (Friis 1946), of which reflection and transmission leave the part that Fresne
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from caviar_clients.datasets.verification.findings import Finding
+from caviar_clients.datasets.verification import Finding
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.space.antenna_arrays import steering_vector
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.topics import Channel, Scene
+from caviar_protocol.space.beams import beam_gains, best_pairs
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, unit_vectors
+from caviar_protocol.space.scene import antennas
+from caviar_protocol.topics import Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES, Interaction
 from caviar_services.channel.paths import Antenna, PathGeometry, Turning, path_geometry
+from caviar_services.link.link_budget import noise_power
 
 GAIN_DB = 0.5
 """Of a line of sight from free space; air and foliage take no more over a street."""
@@ -42,6 +46,16 @@ relative, up to which the factor between both is looked at."""
 FACTOR_DB = 3.0
 """Of that factor, from 1."""
 
+BEAM = 1e-9
+"""Relative, of |y| from a recorded H."""
+FROM_PATHS = 1e-5
+"""Relative, of |y| from an H that the paths add up to: the link may have had it in single precision."""
+SNR = 1e-9
+"""Relative, of an SNR from |y|."""
+
+User = tuple[str, str, str]
+"""Carrier, transmitter and receiver."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -59,8 +73,8 @@ class Pair:
 
     @property
     def cut(self) -> slice:
-        """Of the path axis."""
-        return cut_of(self.channel, self.tx, self.rx)
+        """Slice of the path axis."""
+        return self.channel.pair(self.channel.tx[self.tx], self.user)
 
     @property
     def user(self) -> str:
@@ -70,12 +84,6 @@ class Pair:
     def finding(self, what: str, expected: str, found: str) -> Finding:
         """A finding of this receiver."""
         return Finding(*self.place, self.user, what, expected, found)
-
-
-def cut_of(channel: Channel, tx: int, rx: int) -> slice:
-    """Slice of the path axis that a pair has."""
-    pair = tx * len(channel.rx) + rx
-    return slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
 
 
 def pair_of(
@@ -94,7 +102,7 @@ def pair_of(
         pair: Indices of transmitter and receiver.
         ends: Their antennas.
     """
-    cut = cut_of(channel, *pair)
+    cut = channel.pair(channel.tx[pair[0]], channel.rx[pair[1]])
     points, types, objects = channel.points[cut], channel.interactions[cut], channel.objects[cut]
     count = len(points)
     at = {name: index for index, name in enumerate(scene.names)}
@@ -167,12 +175,6 @@ def _doppler(pair: Pair) -> Iterator[Finding]:
         if off[worst] > 0:
             what = f"Doppler shift of {_name(pair, worst)}, {carrier.name}"
             yield pair.finding(what, f"{right[worst]:.3f} Hz", f"{found[worst]:.3f} Hz")
-
-
-def unit_vectors(angles: Float64Array) -> Float64Array:
-    """Directions of angles (zenith, azimuth) [rad], Shape ``[P, 2]`` to ``[P, 3]``."""
-    sine = np.sin(angles[:, 0])
-    return np.stack([sine * np.cos(angles[:, 1]), sine * np.sin(angles[:, 1]), np.cos(angles[:, 0])], axis=-1)
 
 
 def _name(pair: Pair, path: int) -> str:
@@ -292,3 +294,117 @@ def _apart(h: Complex128Array, right: Complex128Array) -> str:
     size, scale = float(np.linalg.norm(h)), float(np.linalg.norm(right))
     off = float(np.linalg.norm(h - right)) / scale if scale else math.inf
     return f"‖H‖ {size:.6g}, {off:.2g} of it apart"
+
+
+# --- beams --------------------------------------------------------------------------------------------------
+
+
+def check_flags(place: tuple[int, int], channel: Channel, link: Link) -> Iterator[Finding]:
+    """Lines of sight of a link that are not those of its channel.
+
+    Args:
+        place: Episode and scene.
+        channel: Of the scene.
+        link: Of the scene.
+    """
+    for row, (tx, rx) in enumerate(zip(link.tx, link.rx, strict=True)):
+        if tx in channel.tx and rx in channel.rx:
+            right = bool(channel.los[channel.tx.index(tx), channel.rx.index(rx)])
+            if right != bool(link.los[row]):
+                words = {True: "free", False: "hidden"}
+                yield Finding(*place, rx, "line of sight of the link", words[right], words[not right])
+
+
+def check_beams(
+    place: tuple[int, int], scene: Scene, link: Link, matrices: Mapping[User, tuple[Complex128Array, float]]
+) -> Iterator[Finding]:
+    """Pairs of beams that are not those of H.
+
+    Args:
+        place: Episode and scene.
+        scene: With the arrays.
+        link: Of the scene.
+        matrices: H of each user, Shape ``[Nr, Nt]``, and how far |y| may be from it, relative.
+    """
+    arrays = {device.name: device.array for device in antennas(scene, "tx")}
+    arrays |= {device.name: device.array for device in antennas(scene, "rx")}
+    for row, user in enumerate(zip(link.carrier, link.tx, link.rx, strict=True)):
+        if user not in matrices or not link.has_path[row]:
+            continue
+        _, tx, rx = user
+        h, tolerance = matrices[user]
+        abs_y = beam_gains(h[None], arrays[tx], arrays[rx])[0]
+        for what, expected, found in _wrong_pairs(link, row, abs_y, tolerance):
+            yield Finding(*place, rx, what, expected, found)
+
+
+def _wrong_pairs(
+    link: Link, row: int, abs_y: Float64Array, tolerance: float
+) -> Iterator[tuple[str, str, str]]:
+    """Faults of a user's pairs, what each should be and is: the first of the list, and the chosen one.
+
+    Beams of equal |y| may stand in either order, as rounding has it.
+    """
+    listed = link.top_tx_beam.shape[1]
+    best = best_pairs(abs_y[None], listed)
+    error = tolerance * float(abs_y.max(initial=0.0))
+    seen: set[tuple[int, int]] = set()
+    for rank in range(min(listed, best.abs_y.shape[1])):
+        pair = int(link.top_tx_beam[row, rank]), int(link.top_rx_beam[row, rank])
+        said, right = float(link.top_abs_y[row, rank]), float(best.abs_y[0, rank])
+        of_pair = _at(abs_y, pair)
+        if of_pair is None or pair in seen or abs(of_pair - said) > error or abs(right - said) > error:
+            expected = _pair_text(int(best.tx_beam[0, rank]), int(best.rx_beam[0, rank]), right)
+            rank_text = "best pair of beams" if rank == 0 else f"pair of beams of rank {rank + 1}"
+            yield rank_text, expected, _pair_text(*pair, said)
+            break
+        seen.add(pair)
+    chosen = int(link.tx_beam[row]), int(link.rx_beam[row])
+    right_y = 0.0 if -1 in chosen else _at(abs_y, chosen)
+    said = float(link.abs_y[row])
+    if right_y is None:
+        beams = f"TX beams 0 to {abs_y.shape[0] - 1}, RX beams 0 to {abs_y.shape[1] - 1}"
+        yield "chosen pair of beams", beams, _pair_text(*chosen, said)
+    elif abs(right_y - said) > error:
+        yield "chosen pair of beams", _pair_text(*chosen, right_y), _pair_text(*chosen, said)
+
+
+def _at(abs_y: Float64Array, pair: tuple[int, int]) -> float | None:
+    """|y| of a pair; None where the codebooks have no such beam."""
+    inside = 0 <= pair[0] < abs_y.shape[0] and 0 <= pair[1] < abs_y.shape[1]
+    return float(abs_y[pair]) if inside else None
+
+
+def _pair_text(tx_beam: int, rx_beam: int, abs_y: float) -> str:
+    return f"TX {tx_beam}, RX {rx_beam}, |y| {abs_y:.6g}"
+
+
+def check_snr(
+    place: tuple[int, int],
+    scene: Scene,
+    link: Link,
+    carriers: tuple[Carrier, ...],
+    settings: Mapping[str, Any],
+) -> Iterator[Finding]:
+    """SNRs that are not P·|y|²/(k·T·B·F) (`topics.Link`).
+
+    Args:
+        place: Episode and scene.
+        scene: With the transmit powers.
+        link: Of the scene.
+        carriers: Of the channel.
+        settings: Of the link: ``temperature_k`` and ``noise_figure_db``, where they are not the default.
+    """
+    figure, temperature = settings.get("noise_figure_db", 9.0), settings.get("temperature_k", 290.0)
+    noise = {carrier.name: noise_power(carrier, figure, temperature) for carrier in carriers}
+    power = {device.name: 1e-3 * 10 ** (device.power_dbm / 10) for device in antennas(scene, "tx")}
+    kinds = [("SNR of the chosen pair", link.snr, link.abs_y)]
+    if link.top_abs_y.shape[1]:
+        kinds.append(("SNR of the best pair", link.snr_best, link.top_abs_y[:, 0]))
+    for row, (carrier, tx, rx) in enumerate(zip(link.carrier, link.tx, link.rx, strict=True)):
+        if carrier not in noise or tx not in power:
+            continue
+        for what, snr, abs_y in kinds:
+            right = power[tx] * float(abs_y[row]) ** 2 / noise[carrier]
+            if not np.isclose(snr[row], right, rtol=SNR, atol=0.0):
+                yield Finding(*place, rx, what, f"{right:.6g}", f"{float(snr[row]):.6g}")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from caviar_clients.datasets.differences import SHOWN, differences, refusal
+from caviar_clients.datasets.settings import SHOWN, differences, refusal
 
 
 @pytest.mark.parametrize(

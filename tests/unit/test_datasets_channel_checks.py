@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.verification.findings import Finding
-from caviar_clients.datasets.verification.path_checks import (
+from caviar_clients.datasets.verification import Finding
+from caviar_clients.datasets.verification.channel_checks import (
     Pair,
     check_gains,
     check_geometry,
