@@ -632,7 +632,7 @@ class ChainCache:
 
     def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
         """Write the tables of a key; where that fails, a note says so."""
-        packed = tuple([Packed.of(table, "<i4") for table in tables])
+        packed = tuple([Packed.pack(table, "<i4") for table in tables])
         file = _ChainFile(format=_FORMAT, key=key, tables=packed, digest=_digest(packed))
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
