@@ -152,6 +152,10 @@ class FrozenHeap:
         self.modules = 0
 
     def pytest_runtest_teardown(self) -> None:
+        self.freeze()
+
+    def freeze(self) -> None:
+        """Do so where modules were loaded since the last time."""
         if len(sys.modules) > self.modules + 50:
             self.modules = len(sys.modules)
             gc.collect()
