@@ -67,6 +67,12 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _logs_of_stable_baselines3(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """A model without a logger makes a folder, which would stay in the temporary folder of the machine."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.getbasetemp() / "stable-baselines3")
+
+
 @pytest.fixture(autouse=True)
 def _keeps_its_place() -> Iterator[None]:
     """No test leaves this process in the real-time class, where it would starve those that run beside it."""

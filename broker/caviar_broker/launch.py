@@ -50,8 +50,7 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import attached, load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 
 if TYPE_CHECKING:
@@ -210,7 +209,13 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, .
         load_scenario(arguments.scenario, arguments.set), arguments.frames, arguments.seed, arguments.pace
     )
     scenario = attached(scenario, arguments.attach)
-    directory = _made(arguments.directory)
+    try:
+        arguments.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write the run to {arguments.directory}: {error.strerror}; choose another --directory"
+        ) from error
+    directory = arguments.directory.resolve()
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
     versions = versions_of(scenario)
     return (
@@ -264,16 +269,6 @@ def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last
             "to run its scenario again leave out --resume"
         )
     return replace(left, losses=(*damage, *left.losses)) if left.is_cut else left
-
-
-def _made(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(
-            f"cannot write the run to {directory}: {error.strerror}; choose another --directory"
-        ) from error
-    return directory.resolve()
 
 
 def parser() -> argparse.ArgumentParser:

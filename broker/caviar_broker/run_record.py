@@ -47,7 +47,8 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
     used = {spec.use for spec in scenario.services.values()}
     libraries = [*LIBRARIES]
     libraries += TRAFFIC if used & {"sumo", "sumo-actuated"} else ()
-    libraries += TRACING if used & _tracers() else ()
+    # Implementations that import the ray tracer.
+    libraries += TRACING if used & frozenset({"sionna-rt", "adaptive", "lidar", "camera"}) else ()
     found = {
         "python": platform.python_version(),
         "protocol": ".".join(map(str, PROTOCOL_VERSION)),
@@ -77,11 +78,6 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
         for name in sorted({*before, *now})
         if before.get(name) != now.get(name)
     )
-
-
-def _tracers() -> frozenset[str]:
-    """Implementations that import the ray tracer."""
-    return frozenset({"sionna-rt", "adaptive", "lidar", "camera"})
 
 
 def _version(name: str) -> str:

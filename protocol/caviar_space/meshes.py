@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array
+from caviar_protocol.assets import check_unit_box, is_mesh_name
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
+from caviar_protocol.space.ply import read_ply
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +101,57 @@ def unit_box() -> Mesh:
 
 Body = tuple[str, int]
 """Asset (or kind: an asset and a material) and slot, from 0, of a body in a ray tracer's pool."""
+
+
+def object_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
+    """Read the unit meshes that objects may have.
+
+    Args:
+        files: PLY files of meshes by asset name; others of a run's files are left out.
+
+    Returns:
+        Meshes by asset name, and the box by the empty one.
+
+    Raises:
+        AssetError: A file is no mesh, or its bounding box is not −½…½ on every axis.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "box.ply")
+        ...     _ = file.write_bytes(ply(unit_box()))
+        ...     sorted(object_meshes({"objects/box.ply": file, "scenery/street.xml": file}))
+        ['', 'objects/box.ply']
+    """
+    meshes = {"": unit_box()}
+    for name in sorted(files):
+        if PurePosixPath(name).match("objects/*.ply"):
+            vertices, faces = read_ply(files[name], f"mesh {name!r}")
+            check_unit_box(vertices, f"mesh {name!r}")
+            meshes[name] = Mesh(vertices, faces.astype(np.int32))
+    return meshes
+
+
+def shown_asset(asset: str, meshes: Container[str]) -> str:
+    """Asset whose mesh stands for an object: its own, or the box's, empty, in place of one that came while
+    the run goes on and is not there.
+
+    Args:
+        asset: Asset of the object.
+        meshes: Names of the meshes that there are.
+    """
+    return "" if is_mesh_name(asset) and asset not in meshes else asset
+
+
+# [m]; a centre to count from is a multiple of it, so that a scene about the origin stays as it is.
+_CENTRE_STEP = 128.0
+
+
+def coarse_centre(middle: Float64Array) -> Float64Array:
+    """Centre that a ray tracer in float32 counts from, near the middle of a scene [m], Shape ``[3]``; no
+    negative zeros."""
+    centre: Float64Array = np.round(middle / _CENTRE_STEP) * _CENTRE_STEP + 0.0
+    return centre
 
 
 def assign_bodies(

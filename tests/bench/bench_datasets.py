@@ -29,10 +29,9 @@ from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask
-from caviar_clients.datasets.plan import plan_dataset
-from caviar_clients.datasets.presets import PRESETS, apply_preset
+from caviar_clients.datasets.generate import SharedTraffic
+from caviar_clients.datasets.plan import PRESETS, apply_preset, plan_dataset
 from caviar_clients.datasets.rows import EpisodeRows
-from caviar_clients.datasets.traffic import SharedTraffic
 from caviar_clients.session.prepared import prepare
 
 WORKERS = (1, 10, 100, 1000, 10_000)

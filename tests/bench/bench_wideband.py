@@ -42,7 +42,7 @@ from caviar_services.channel.paths import Antenna, PathGeometry
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.link.base import users_of
-from caviar_services.link.beam_sweep import beam_responses
+from caviar_services.link.beam_scores import beam_responses
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 NUMEROLOGY = {"subcarriers": 264, "subcarrier_spacing_hz": 120e3, "taps": 64}

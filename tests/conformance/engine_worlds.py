@@ -27,9 +27,9 @@ from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
 
 from caviar_protocol.arrays import WIRE_DTYPES
+from caviar_protocol.assets import digest_in
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.geometry import digest_in
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import (
     Action,
@@ -42,7 +42,7 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.world.assets import RunTimeMeshes
 
 FRAMES = 150
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))

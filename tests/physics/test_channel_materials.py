@@ -36,15 +36,15 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.materials import (
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.service import Preparation, RunInfo
+from caviar_space.materials import (
     ItuMaterial,
     MaterialPolicy,
     MaterialSettings,
     itu_material,
 )
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.service import Preparation, RunInfo
 from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel

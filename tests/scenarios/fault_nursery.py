@@ -37,7 +37,7 @@ IMPORTED = (
     "caviar_services.runner",
     "caviar_services.agent.baselines",
     "caviar_services.channel.statistical.free_space",
-    "caviar_services.link.beam_sweep",
+    "caviar_services.link.beam_scores",
     "caviar_services.recorder.mcap",
     "caviar_services.world.trajectory",
 )

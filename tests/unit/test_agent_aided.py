@@ -14,7 +14,7 @@ from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import DeviceSpec, load_scenario, parse_scenario
-from caviar_protocol.space.dft import dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Scene
 from caviar_services.agent.fingerprint import (
     UNKNOWN,
@@ -23,8 +23,8 @@ from caviar_services.agent.fingerprint import (
     Fingerprints,
     FingerprintSettings,
 )
-from caviar_services.agent.out_of_band import OutOfBandAgent, OutOfBandSettings
 from caviar_services.agent.pilots import PILOTS
+from caviar_services.agent.sweeps import OutOfBandAgent, OutOfBandSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Preparation, RunInfo, StepResult
 

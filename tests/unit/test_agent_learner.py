@@ -13,12 +13,11 @@ from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Status
 from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.space.beams import straight_beams
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Link, Scene
-from caviar_services.agent.learner import LearnerAgent, LearnerSettings
-from caviar_services.agent.perceptron import Perceptron
+from caviar_services.agent.learner import LearnerAgent, LearnerSettings, Perceptron
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Preparation, RunInfo
 

@@ -12,7 +12,7 @@ from broker_harness import MS, PATIENCE_S, Client, eventually, plan, play_to_the
 from security_harness import Ring, pair, ring
 from zmq.utils.monitor import recv_monitor_message
 
-from caviar_broker.router import Router
+from caviar_broker.connections import Router
 from caviar_broker.security.access import Access, answer, check_bind, is_local
 from caviar_protocol import keys as k
 from caviar_protocol import messages as m

@@ -191,7 +191,7 @@ def test_a_broker_that_hangs_is_given_up_once_its_services_have_left_it(
 ) -> None:
     monkeypatch.setattr(launch, "BROKER_S", 0.3)
     # It hangs, and why cannot be seen.
-    monkeypatch.setattr("caviar_broker.supervision.is_stopped", lambda _: False)
+    monkeypatch.setattr("caviar_clients.cli.launch.is_stopped", lambda _: False)
     with launcher(tmp_path, frames=1_000_000, extra="[timeouts]\nshutdown_s = 0.5\n") as started:
         wait_for(started, "frame")
         assert started._broker is not None

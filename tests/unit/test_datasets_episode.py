@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from caviar_clients.datasets.catalogue import fingerprint
-from caviar_clients.datasets.differences import differences
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
 from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.datasets.settings import differences, fingerprint
 from caviar_clients.session.base import failure_of
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_clients.session.prepared import prepare

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.plan import with_cameras, with_own_traffic
-from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
+from caviar_clients.datasets.plan import PRESETS, apply_preset, find_preset, with_cameras, with_own_traffic
 from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario, load_scenario

@@ -22,8 +22,7 @@ from caviar_labs.radio_strike.simulation import EpisodesOverError
 from caviar_labs.radio_strike.sources import synthetic_episode
 from caviar_labs.radio_strike.trajectories import Episode, read_episode
 from caviar_protocol.errors import RunError, ScenarioError
-from caviar_protocol.space.antenna_arrays import steering_vector
-from caviar_protocol.space.dft import dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_codebook, steering_vector
 from caviar_protocol.topics import AntennaArray
 
 pytestmark = pytest.mark.slow

@@ -20,8 +20,8 @@ from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)

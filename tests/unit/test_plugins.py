@@ -17,8 +17,7 @@ from caviar_clients.cli.main import app
 from caviar_clients.session.prepared import prepare
 from caviar_protocol import plugins
 from caviar_protocol.errors import CaviarError, DeclarationError
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import attached, load_scenario
 from caviar_services.registry import load, registered
 from caviar_services.world.quadrotor.airframe import Airframe, Plant, plant_named
 

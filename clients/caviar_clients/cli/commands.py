@@ -168,7 +168,7 @@ class _Alias(TyperOption):
     @property
     def help(self) -> str:  # type: ignore[override]
         """First line of the attachment's docstring; its module is imported where that is shown."""
-        from caviar_protocol.scenario.attachments import summary
+        from caviar_protocol.scenario import summary
 
         return summary(self.attachment)
 
@@ -178,7 +178,7 @@ class AttachingCommand(TyperCommand):
 
     def get_params(self, ctx: Any) -> list[Any]:
         """List the parameters, with the aliases after ``--attach``."""
-        from caviar_protocol.scenario.attachments import ATTACHMENTS  # `caviar --help` loads no scenarios
+        from caviar_protocol.scenario import ATTACHMENTS
 
         found = super().get_params(ctx)
         taken = {flag for parameter in found for flag in parameter.opts}

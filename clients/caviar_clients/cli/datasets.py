@@ -97,8 +97,14 @@ def generate_command(
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
     from caviar_clients.cli.scenarios import extras_of
     from caviar_clients.datasets.generate import generate
-    from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
-    from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
+    from caviar_clients.datasets.plan import (
+        PRESETS,
+        apply_preset,
+        find_preset,
+        plan_dataset,
+        with_cameras,
+        with_own_traffic,
+    )
     from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
@@ -160,7 +166,7 @@ def tables_command(
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
     from caviar_clients.datasets.catalogue import Catalogue
-    from caviar_clients.datasets.export import check_out, export_tables
+    from caviar_clients.datasets.formats import check_out, export_tables
     from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.remote import located
 
@@ -231,7 +237,8 @@ def verify_command(
 
     from caviar_clients.cli.shared import require_writable, write_json
     from caviar_clients.datasets.reader import check_level
-    from caviar_clients.datasets.verification.verify import as_rows, verify
+    from caviar_clients.datasets.verification import as_rows
+    from caviar_clients.datasets.verification.verify import verify
 
     check_level(dataset)
     require_writable(json)  # before minutes of reading

@@ -19,6 +19,7 @@ from typing import Any
 
 import zmq
 
+from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.keys import BorrowedKey
 from caviar_clients.session.prepared import PreparedScenario, module_folders
 from caviar_protocol.errors import RunError
@@ -225,12 +226,6 @@ ANY_PORT = "tcp://127.0.0.1:0"
 _TRACING_ROLES = ("channel", "sensors")
 LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
-
-
-def _describe_exit(status: int) -> str:
-    from caviar_broker.supervision import describe_exit  # late, as in `Launcher._look_after_broker`
-
-    return describe_exit(status)
 
 
 @dataclass
@@ -491,9 +486,6 @@ class Launcher:
 
     def _look_after_broker(self) -> None:
         """End a broker that is stopped (SIGSTOP, a debugger); its end is then handled like any other."""
-        # Imported here, with the frame clock, the module is loaded while the broker starts, and not before.
-        from caviar_broker.supervision import describe_stop, is_stopped
-
         broker = self._broker
         if not self._verdict and broker is not None and broker.poll() is None and is_stopped(broker.pid):
             self._verdict = describe_stop(broker.pid)
@@ -523,7 +515,7 @@ class Launcher:
         if broker.poll() is None:
             broker.kill()
         status = broker.wait()  # it has closed its output and got SIGKILL, if it needed that
-        verdict, self._verdict = self._verdict or _describe_exit(status), ""
+        verdict, self._verdict = self._verdict or describe_exit(status), ""
         self._end_services()  # the new broker knows none of their connections
         self._brokers += 1
         self.resume, self.bind, self._rest = True, self.endpoint, b""
@@ -551,7 +543,7 @@ class Launcher:
             raise RunError("the broker closed its output and does not end")
         if not self._over:
             log = self._log.read_text(errors="replace").strip()
-            last = self._verdict or (log.splitlines()[-1] if log else _describe_exit(status))
+            last = self._verdict or (log.splitlines()[-1] if log else describe_exit(status))
             own = last.startswith("caviar broker: ")  # its own error, and no crash
             self.refused = own and not self.endpoint
             raise RunError(last.removeprefix("caviar broker: ") if own else f"the broker died: {last}")
@@ -583,7 +575,7 @@ class Launcher:
         if all(other.process.poll() is not None for other in self._children.values()):
             self._give_up_at = time.monotonic() + self.scenario.timeouts.shutdown_s + BROKER_S
         if not self._over:
-            verdict = _describe_exit(status)
+            verdict = describe_exit(status)
             tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
             if child.name in self._awaited:

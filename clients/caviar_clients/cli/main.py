@@ -37,7 +37,7 @@ from caviar_clients.cli.shared import (
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.host import DISTRIBUTION, loading
 
 
 class _PlotGroup(TyperGroup):
@@ -117,7 +117,8 @@ def run(
     force: Force = False,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
-    from caviar_clients.cli.run import resume_run, run_scenario
+    with loading():
+        from caviar_clients.cli.run import resume_run, run_scenario
 
     keys_given = keys_set(set_, record, episodes)
     source = _started_anew(

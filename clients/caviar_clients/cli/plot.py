@@ -423,7 +423,7 @@ def film_run(
     samples = samples or list(pictures(spread[:1]))
     columns = (MofNCompleteColumn(), TimeRemainingColumn())
     with progress_bar(console or Console(quiet=True), *columns) as bar:
-        drawn = bar.track(pictures(range(count)), total=count, description="drawing")
+        drawn = iter(bar.track(pictures(range(count)), total=count, description="drawing"))
         WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
     speed = rate * recording.metadata.sampling_period_ns * 1e-9
     return Film(file, count, rate, speed, moving.size)

@@ -17,8 +17,6 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.text import Text
 
-from caviar_broker.run_record import read_record
-from caviar_broker.security.access import check_bind
 from caviar_clients.cli.launch import Interruption, Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
@@ -26,6 +24,7 @@ from caviar_clients.cli.shared import new_run_directory, print_line, progress_ba
 from caviar_clients.files import printable, write_file
 from caviar_clients.session.prepared import PreparedScenario, implemented, prepare
 from caviar_protocol.errors import RecordingError, RunError, SetupError
+from caviar_protocol.host import loading
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
@@ -217,9 +216,12 @@ def run_scenario(
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    prepared = prepare(path, frames, seed, pace, attachments, settings)
+    with loading():  # the classes of services
+        prepared = prepare(path, frames, seed, pace, attachments, settings)
     scenario = prepared.scenario
     if bind:
+        from caviar_broker.security.access import check_bind
+
         check_bind(bind, keys=keys is not None)
     require_extras(prepared)
     if embedded:
@@ -279,6 +281,8 @@ def resume_run(
         RecordingError: The directory has no record of a run, or one that cannot be read.
         RunError: A file cannot be written, or the broker cannot start.
     """
+    from caviar_broker.run_record import read_record
+
     prepared = implemented(read_record(directory).scenario)
     require_writable(json_file)
     print_line(console, f"run {directory}")

@@ -17,7 +17,6 @@ from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.plugins import plugins
 from caviar_protocol.scenario import Scenario, load_scenario, shipped_scenarios
 from caviar_services.registry import load
-from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
 TEMPLATE = "new/scenario.toml"
 """The scenario that `caviar new` writes, in the package of scenarios."""
@@ -42,8 +41,11 @@ def _extras(service: PreparedService) -> set[str]:
         found.add("channel" if has_extra("channel") and not has_extra("world") else "world")
     if spec.settings.get("rate_model") == "nr":  # of the link `cell`
         found.add("system")
-    engines = {flown.get("engine") for flown in spec.settings.get("flown", ())}  # of quadrotors
-    found.update(plant_named(engine).extra for engine in engines & plugins(PLANTS).keys())
+    if flown := spec.settings.get("flown", ()):  # perhaps quadrotors
+        from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
+
+        engines = {each.get("engine") for each in flown}
+        found.update(plant_named(engine).extra for engine in engines & plugins(PLANTS).keys())
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")
     for rung in (*ladder, *([reference] if reference else [])):  # models that an adaptive channel has
         found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)
@@ -62,13 +64,8 @@ def require_extras(scenario: Scenario | PreparedScenario) -> None:
 
 def list_scenarios(console: Console) -> None:
     """Print the scenarios that ship, each with a line and the extras that it needs."""
-    table = Table(
-        Column("name", no_wrap=True),
-        Column("what it is", overflow="fold"),
-        Column("needs", overflow="fold"),
-        box=None,
-        pad_edge=False,
-    )
+    columns = (Column(name, overflow="fold") for name in ("what it is", "needs"))
+    table = Table(Column("name", no_wrap=True), *columns, box=None, pad_edge=False)
     lacking: set[str] = set()
     for name, path in shipped_scenarios().items():
         extras = extras_of(load_scenario(path))

@@ -536,6 +536,9 @@ def recorded_figures(directory: Path) -> RunSummary | None:
         return None
 
 
+_OF_OUTCOME = ("frames_per_second", "warm_up_frames", "services", "deadlines", "pace", "digest")
+
+
 def summary_of(
     outcome: Mapping[str, Any],
     recorded: RunSummary | None,
@@ -566,12 +569,7 @@ def summary_of(
         "error": outcome["error"],
         "frames": outcome["frames"],
         "frames_recorded": recorded.frames if recorded else None,
-        "frames_per_second": outcome["frames_per_second"],
-        "warm_up_frames": outcome["warm_up_frames"],
-        "services": outcome["services"],
-        "deadlines": outcome["deadlines"],
-        "pace": outcome["pace"],
-        "digest": outcome["digest"],
+        **{key: outcome[key] for key in _OF_OUTCOME},
         **{
             name: msgspec.to_builtins(getattr(figures, name, None))
             for name in LinkSummary.__struct_fields__

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_names, checked_path, checked_patterns
-from caviar_clients.plots.scene_map import MapRenderer
+from caviar_clients.plots.moving import MapRenderer
 from caviar_clients.session.base import Frame, Session
 from caviar_clients.session.connected import CONNECT_TIMEOUT_S, agent_of, open_session
 from caviar_clients.session.prepared import PreparedScenario, prepare
@@ -300,6 +300,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         own, its = (None if path is None else Path(path) for path in (key, broker_key))
         self._credentials = None if broker is None else credentials(own, its)
         self._directory = None if directory is None else Path(directory)
+        self._beside: tuple[str, ...] = ()  # agents whose places are taken, too
         self._renderer: MapRenderer | None = None
         self._session: Session | None = None
         self._moment: Moment | None = None
@@ -451,6 +452,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
             self._directory,
             self._credentials,
             with_scenery=self.uses_scenery,
+            beside=self._beside,
             connect_timeout_s=self._connect_timeout_s,
         )
 

@@ -16,11 +16,10 @@ import gymnasium
 from caviar_clients.envs.arguments import checked_path
 from caviar_clients.envs.base import BeamSelectionEnv, Observation, SessionEnv
 from caviar_clients.envs.uav_path import MOTION, UavPathEnv
-from caviar_clients.session.base import Session
-from caviar_clients.session.connected import open_session
 from caviar_clients.session.prepared import PreparedScenario, prepare
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError, suggestion
 from caviar_protocol.host import install_command
+from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
 
 try:
@@ -174,21 +173,12 @@ class _Pilot(UavPathEnv):
 
     def __init__(self, scenario: PreparedScenario, selection: BeamSelectionEnv, **options: Any) -> None:
         super().__init__(scenario, **options)
-        self._selection = selection
+        self._selection, self._beside = selection, (selection.agent,)
 
-    def _open(self) -> Session:
-        inputs = {entry.topic: entry for entry in (*self._selection.inputs(), *self.inputs())}
-        return open_session(
-            self.prepared,
-            self.agent,
-            tuple(inputs.values()),
-            self._broker,
-            self._directory,
-            self._credentials,
-            with_scenery=True,
-            beside=(self._selection.agent,),
-            connect_timeout_s=self._connect_timeout_s,
-        )
+    def inputs(self) -> tuple[Input, ...]:
+        """Give what both agents consume."""
+        by_topic = {entry.topic: entry for entry in (*self._selection.inputs(), *super().inputs())}
+        return tuple(by_topic.values())
 
 
 def _check_options(name: str, given: object, environment: type[SessionEnv[Any]]) -> None:

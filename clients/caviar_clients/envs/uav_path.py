@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_names
 from caviar_clients.envs.base import Moment, Observation, SessionEnv
-from caviar_clients.envs.deliveries import MOST_ADDRESSES, Box, Deliveries, greatest_power, rotary_wing_power
-from caviar_clients.session.airspace import TRIES, Airspace
+from caviar_clients.envs.deliveries import (
+    MOST_ADDRESSES,
+    TRIES,
+    Airspace,
+    Box,
+    Deliveries,
+    greatest_power,
+    rotary_wing_power,
+)
 from caviar_clients.session.prepared import PreparedScenario
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError

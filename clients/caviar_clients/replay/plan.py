@@ -190,7 +190,7 @@ Part: TypeAlias = Literal["recorded", "replaced", "again", "left out"]
 
 @dataclass(frozen=True)
 class Role:
-    """What becomes of one service."""
+    """Part of one service in a replay."""
 
     name: str
     part: Part
@@ -267,7 +267,7 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
 
 
 def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> Role:
-    """What becomes of a service. The order is that of precedence: options before what follows from them."""
+    """Choose the part of a service, in the order of precedence: options before what follows from them."""
     if name in request.replace:
         return Role(name, "replaced", request.replace[name], f"in place of {spec.use}")
     if name in request.settings:

@@ -81,7 +81,7 @@ class RecordedRun:
 
     @cached_property
     def parts_are_known(self) -> bool:
-        """Whether every consumer's declaration is here, so that a part not demanded is not recorded."""
+        """True where every consumer's declaration is here, so that a part not demanded is not recorded."""
         return not any(spec.remote for spec in self.scenario.services.values())
 
     @cached_property

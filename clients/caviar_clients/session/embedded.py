@@ -32,9 +32,8 @@ from caviar_clients.session.direct import DirectFrames, plays_directly
 from caviar_clients.session.prepared import PreparedScenario, implemented
 from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore
+from caviar_protocol.assets import AssetStore, MeshCheck
 from caviar_protocol.errors import RunError
-from caviar_protocol.geometry import MeshCheck
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory

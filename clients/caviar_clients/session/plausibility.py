@@ -17,10 +17,8 @@ from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import scenario_error
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import Panel
-from caviar_services.channel.adaptive.controller import AdaptiveSettings, models
 from caviar_services.world.base import World
 from caviar_space.mitsuba_xml import read_scenery
-from caviar_space.obstacles import Surfaces
 from caviar_space.scenery import scenery_assets, scenery_file, scenery_triangles
 
 if TYPE_CHECKING:
@@ -178,7 +176,11 @@ def _ladders(prepared: PreparedScenario) -> _Warnings:
     """References of adaptive channels that know less than the rungs that they judge."""
     for channel in prepared.of_role("channel"):
         settings, place = channel.settings, channel.place
-        if not isinstance(settings, AdaptiveSettings) or settings.reference is None:
+        if getattr(settings, "reference", None) is None:
+            continue
+        from caviar_services.channel.adaptive.controller import AdaptiveSettings, models
+
+        if not isinstance(settings, AdaptiveSettings):
             continue
         *rungs, (_, reference) = models(settings, place)  # the reference stands last
         depth = getattr(reference, "max_depth", 0)
@@ -279,6 +281,8 @@ class _Ground:
     """The scenery of a scenario: how far it reaches, and what is below its ground."""
 
     def __init__(self, triangles: Float64Array) -> None:
+        from caviar_space.obstacles import Surfaces  # which a scenario without scenery does not need
+
         corners = triangles.reshape(-1, 3)
         self._low, self._high = corners.min(0), corners.max(0)
         self._surfaces = Surfaces(triangles, lambda triangle, normal: True)

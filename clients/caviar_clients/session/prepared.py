@@ -20,8 +20,7 @@ from caviar_broker.core.graph import build_graph
 from caviar_clients.session.plausibility import implausible_values, refuse_carriers
 from caviar_protocol.errors import DeclarationError, suggestion
 from caviar_protocol.messages import PROTOCOL_VERSION, Hello, Role
-from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import REMOTE, Scenario, ServiceSpec, attached, load_scenario
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import scenario_error, settings_place, with_overrides
 from caviar_protocol.topics import topics_of

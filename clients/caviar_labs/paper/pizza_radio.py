@@ -25,7 +25,7 @@ from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Channel
 from caviar_services.link.base import channels_of
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import LinkBudget
 

@@ -21,7 +21,7 @@ from typing import Final, Literal, NamedTuple, get_args
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_protocol.cell.rates import shannon
+from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 

@@ -45,6 +45,7 @@ from caviar_services.channel.paths import (
     PathGeometry,
     PathTable,
     antenna_fields,
+    path_ends,
     path_geometry,
     stable_ids,
 )
@@ -98,7 +99,18 @@ def assemble(
     table = _canonical_names(table)
     row = np.arange(len(table.pair))
     with np.errstate(invalid="ignore"):  # what is not finite is dropped and counted below
-        geometry = _geometry(table, transmitters, receivers)
+        (start, end), (start_velocity, end_velocity) = (
+            path_ends(table.pair, transmitters, receivers, field) for field in ("position", "velocity")
+        )
+        geometry = path_geometry(
+            start,
+            table.points,
+            end,
+            (table.types != 0).sum(1),
+            start_velocity,
+            table.point_velocity,
+            end_velocity,
+        )
         a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
         if product.absorption_db_per_km is not None:
             a = a * amplitude_factor(product.absorption_db_per_km, geometry.tau)
@@ -107,12 +119,12 @@ def assemble(
     dropped_pairs: frozenset[int] = frozenset()
     if dropped:
         dropped_pairs = frozenset(table.pair[~finite].tolist())
-        table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
+        table, geometry, a, row = table.take(finite), geometry.take(finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
     # Pairs that ascend, with one path each, as in free space, are in order.
     if np.count_nonzero(table.pair[1:] > table.pair[:-1]) < len(table.pair) - 1:
         order = _order(table, geometry, aod, aoa, a)
-        table, geometry, a, row = table.take(order), _select(geometry, order), a[:, order], row[order]
+        table, geometry, a, row = table.take(order), geometry.take(order), a[:, order], row[order]
         aod, aoa = aod[order], aoa[order]
 
     pairs = len(transmitters) * len(receivers)
@@ -121,13 +133,19 @@ def assemble(
     h: tuple[ChannelMatrix, ...] = ()
     wideband = Wideband()
     if product.with_h or product.wideband:
-        located = _located(product, row, table, offsets, geometry, a)
+        transfer, absorption = table.transfer, product.absorption_db_per_km
+        if absorption is not None:
+            transfer = transfer * amplitude_factor(absorption, geometry.tau)[..., None, None]
+        located = Located(row, table.pair, offsets, geometry, a, transfer, absorption)
         made = (matrices or PlaneWaves)(product.carriers, transmitters, receivers, located)
         if product.with_h:
-            kept = _in_single_precision if product.rounds_h else np.asarray
+            # Rounded values stay of the protocol's type: zeros at their ends compress.
             h = tuple(
                 ChannelMatrix(
-                    carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=kept(between)
+                    carrier=index,
+                    tx=pair // len(receivers),
+                    rx=pair % len(receivers),
+                    h=between.astype(np.complex64).astype(np.complex128) if product.rounds_h else between,
                 )
                 for index in range(len(product.carriers))
                 for pair, between in enumerate(made.matrices(index))
@@ -139,7 +157,7 @@ def assemble(
     # H is made by now; the list of paths is that of the centres of the arrays.
     if table.hidden is not None and table.hidden.any():
         shown = ~table.hidden
-        table, geometry, a = table.take(shown), _select(geometry, shown), a[:, shown]
+        table, geometry, a = table.take(shown), geometry.take(shown), a[:, shown]
         aod, aoa = aod[shown], aoa[shown]
         offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
@@ -171,25 +189,6 @@ def assemble(
     return channel, dropped_pairs
 
 
-def _in_single_precision(h: Complex128Array) -> Complex128Array:
-    """The values that single precision has, in the type of the protocol: zeros at their ends compress."""
-    return h.astype(np.complex64).astype(np.complex128)
-
-
-def _located(
-    product: Product,
-    row: Int64Array,
-    table: PathTable,
-    offsets: Int64Array,
-    geometry: PathGeometry,
-    a: Complex128Array,
-) -> Located:
-    transfer, absorption = table.transfer, product.absorption_db_per_km
-    if absorption is not None:
-        transfer = transfer * amplitude_factor(absorption, geometry.tau)[..., None, None]
-    return Located(row, table.pair, offsets, geometry, a, transfer, absorption)
-
-
 def _canonical_names(table: PathTable) -> PathTable:
     """Names that occur, sorted; points and objects past the last interaction set to their filler."""
     if not table.types.shape[1]:
@@ -216,24 +215,6 @@ def _canonical_names(table: PathTable) -> PathTable:
         faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
         joined_faces=table.joined_faces,
         hidden=table.hidden,
-    )
-
-
-def _geometry(
-    table: PathTable, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
-) -> PathGeometry:
-    def stacked(antennas: Sequence[Antenna], field: str) -> Float64Array:
-        return np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
-
-    tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    return path_geometry(
-        start=stacked(transmitters, "position")[tx],
-        points=table.points,
-        end=stacked(receivers, "position")[rx],
-        count=(table.types != 0).sum(1),
-        start_velocity=stacked(transmitters, "velocity")[tx],
-        point_velocity=table.point_velocity,
-        end_velocity=stacked(receivers, "velocity")[rx],
     )
 
 
@@ -267,12 +248,6 @@ def _amplitudes(
                 power = np.nansum(np.abs(every) ** 2, axis=(2, 3))
                 a[:, rows] = every[np.unravel_index(np.argmax(power), power.shape)]
     return a
-
-
-def _select(geometry: PathGeometry, which: Int64Array | BoolArray) -> PathGeometry:
-    return PathGeometry(
-        geometry.tau[which], geometry.departure[which], geometry.arrival[which], geometry.doppler_ratio[which]
-    )
 
 
 def _finite(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> BoolArray:

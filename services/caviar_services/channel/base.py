@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -467,23 +467,15 @@ class ChannelBatch(ABC):
         """
 
 
-class _Steps(Protocol):
-    """A channel model."""
-
-    def step(self, frame: Frame) -> StepResult:
-        """The channel of a frame."""
-
-
 class SameChannels(ChannelBatch):
     """Channels that depend on the scene alone, so that one product is that of all members.
 
     Args:
         model: Draws nothing, and remembers nothing.
-        name: Of its service.
     """
 
-    def __init__(self, model: _Steps, name: str) -> None:
-        self._model, self._name = model, name
+    def __init__(self, model: ChannelModel[Any]) -> None:
+        self._model, self._name = model, model.run.name
 
     def begin(self, members: Sequence[MemberSeed]) -> None:
         """Nothing depends on seeds."""

@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import ClassVar, Self
 
 import numpy as np
 
@@ -31,61 +30,11 @@ from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.propagation.patterns import ElementPattern, Field, Patterns, radiated_field
 from caviar_space.obstacles import Surfaces
-from caviar_space.vectors import cross
-
-
-class Rows:
-    """Base of frozen dataclasses whose arrays have a row for each path, candidate or chain.
-
-    Fields that are no arrays are the same for all rows, and stay.
-
-    Example:
-        >>> @dataclass(frozen=True, eq=False)
-        ... class Points(Rows):
-        ...     x: Float64Array
-        ...     unit: str
-        >>> points = Points(np.array([1.0, 2.0]), "m")
-        >>> Points.joined([points, points]).take(np.array([3, 0]))
-        Points(x=array([2., 1.]), unit='m')
-    """
-
-    by_carrier: ClassVar[frozenset[str]] = frozenset()
-    """Arrays whose second axis has the rows."""
-    shared: ClassVar[frozenset[str]] = frozenset()
-    """Arrays that are of all rows together."""
-
-    def take(self, which: Int64Array | BoolArray) -> Self:
-        """These rows, in this order.
-
-        Args:
-            which: Numbers of rows, or for each row whether it is taken.
-        """
-        # Without __init__, which sets each field of a frozen dataclass by a call.
-        taken = object.__new__(type(self))
-        for name, value in self.__dict__.items():
-            if isinstance(value, np.ndarray) and name not in self.shared:
-                value = value[:, which] if name in self.by_carrier else value[which]
-            taken.__dict__[name] = value
-        return taken
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of several, one at least, part by part; what is no array is that of the first.
-
-        Args:
-            parts: With arrays of one width.
-        """
-        made = object.__new__(cls)
-        for name, value in parts[0].__dict__.items():
-            if isinstance(value, np.ndarray) and name not in cls.shared:
-                columns = [part.__dict__[name] for part in parts]
-                value = np.concatenate(columns, axis=int(name in cls.by_carrier))
-            made.__dict__[name] = value
-        return made
+from caviar_space.vectors import Rows, cross
 
 
 @dataclass(frozen=True, eq=False)
-class PathGeometry:
+class PathGeometry(Rows):
     """Delays, directions and Doppler shifts of P paths."""
 
     tau: Float64Array
@@ -210,7 +159,7 @@ class Antenna:
             np.array(pose.position),
             rotation_matrix(pose.orientation),
             device_velocity(scene, device),
-            None if patterns is None else patterns.of(device.array),
+            None if patterns is None else patterns.element(device.array),
         )
 
     @cached_property
@@ -253,7 +202,7 @@ def antenna_fields(
         arrival: Whether the antennas receive.
 
     Example:
-        >>> element = Patterns().of(AntennaArray())
+        >>> element = Patterns().element(AntennaArray())
         >>> mast = Antenna("bs", AntennaArray(), np.zeros(3), np.eye(3), np.zeros(3), element)
         >>> antenna_fields([mast], np.array([0]), np.array([[1.0, 0.0, 0.0]])).tolist()
         [[0.0, 0.0, -1.0]]
@@ -466,9 +415,8 @@ def with_near_pairs(
     Returns:
         The paths, and the number of pairs that are too close for a direct one.
     """
-    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
-    end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
-    distance = np.sqrt(((end - start) ** 2).sum(-1)).reshape(-1)
+    start, end = path_ends(np.arange(len(los)), transmitters, receivers)
+    distance = np.sqrt(((end - start) ** 2).sum(-1))
     near = np.flatnonzero(distance < max(NEAR_PAIR, wavelengths.max()))
     tx, rx = np.divmod(near, max(len(receivers), 1))
     other = [transmitters[t].name != receivers[r].name for t, r in zip(tx.tolist(), rx.tolist(), strict=True)]
@@ -517,3 +465,21 @@ def with_direct(
         traced=None if table.traced is None else np.concatenate([table.traced, np.full(len(pairs), -1)]),
         faces=None if table.faces is None else np.concatenate([table.faces, empty.astype(np.int32)]),
     )
+
+
+def path_ends(
+    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna], field: str = "position"
+) -> tuple[Float64Array, Float64Array]:
+    """Positions [m] of TX and RX of paths, or another vector of theirs, each of Shape ``[P, 3]``.
+
+    Args:
+        pair: Pair of each path, Shape ``[P]``.
+        transmitters, receivers: Antennas.
+        field: Name of the vector in `Antenna`.
+    """
+    tx, rx = np.divmod(pair, max(len(receivers), 1))
+    start, end = (
+        np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
+        for antennas in (transmitters, receivers)
+    )
+    return start[tx], end[rx]

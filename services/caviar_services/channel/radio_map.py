@@ -656,7 +656,7 @@ def beam_gains(antenna: Antenna, beams: range, directions: Any) -> Any:
     ``|atᵀ f|²`` with the steering vector at: N at the most, and 1 in the mean over the whole codebook. For a
     uniform planar array it is the product of two Dirichlet kernels, one along the columns and one along the
     rows (C. A. Balanis, Antenna Theory, 3rd ed., eq. 6-10c and section 6.10.1); beams are those of
-    `caviar_protocol.space.dft.dft_codebook`.
+    `caviar_protocol.space.antenna_arrays.dft_codebook`.
 
     Args:
         directions: Unit vectors, a `mitsuba.Vector3f` of width R.

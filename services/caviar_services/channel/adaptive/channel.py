@@ -205,7 +205,10 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         self._current = choice.rung
         calibrates = self.calibration.is_due(frame.number)
         made, taken = self._modelled(rung, frame, scene, devices, with_h=calibrates)
-        self._observe(choice.rung, work, taken, calibrates)
+        # Calibration makes matrices: where frames do not ask for them, its duration says nothing about
+        # theirs.
+        if self._with_h or not calibrates:
+            self.costs.observe(choice.rung, work, taken)
         measured = {**made.measured, "rung": taken, "rung-predicted": round(predicted[choice.rung])}
         channel = self.calibration.stated(choice.rung, frame.number, made)
         if calibrates:
@@ -254,12 +257,6 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         finally:
             model.with_h = asked
         return made, self.clock() - began
-
-    def _observe(self, rung: int, work: Workload, taken: int, calibrates: bool) -> None:
-        # Calibration makes matrices: where frames do not ask for them, its duration says nothing about
-        # theirs.
-        if self._with_h or not calibrates:
-            self.costs.observe(rung, work, taken)
 
     def _calibrate(
         self, chosen: int, made: Modelled, frame: Frame, scene: Scene, devices: Devices
@@ -376,7 +373,8 @@ def rehearsal_scene(
         # An antenna in the middle of its object would be inside a body: its object is to have none.
         if carried is not None and (asset is None or carried.position == (0.0, 0.0, 0.0)):
             x, y, _ = here.tolist()
-            found.append(_alone(carried, (x, y, ground_m + _HEIGHT + 0.1 * number)))
+            place = (x, y, ground_m + _HEIGHT + 0.1 * number)
+            found.append(replace(carried, parent="", position=place))
         elif asset is not None:
             found += [] if carried is None else [carried]
             names.append((name, asset))
@@ -417,8 +415,3 @@ def _bodies(room: Mapping[str, int]) -> Iterator[str]:
         if not left:
             return
         yield from left
-
-
-def _alone(device: Device, position: Vector) -> Device:
-    """A device that stands in the world."""
-    return replace(device, parent="", position=position)

@@ -113,26 +113,21 @@ def built(settings: AdaptiveSettings, run: RunInfo) -> tuple[Rung, ...]:
     """The ladder of a scenario, and after it the reference where that is no rung. Raises `ScenarioError`
     naming the key for whatever cannot be."""
     place = run.settings_place
-    every = zip(_every(settings), _places(settings, place), models(settings, place), strict=True)
+    every = zip(_every(settings, place), models(settings, place), strict=True)
     return tuple(
         Rung(
             label=rung.label,
             model=cls(own, replace(run, settings_key=at.at("settings").key)),
             expected_error_db=rung.expected_error_db,
         )
-        for rung, at, (cls, own) in every
+        for (rung, at), (cls, own) in every
     )
 
 
-def _places(settings: AdaptiveSettings, place: Place) -> list[Place]:
-    """Places of the rungs in the scenario, and of the reference where it is none."""
-    places = [place.at("ladder").at(index) for index in range(len(settings.ladder))]
-    return places if settings.reference is None else [*places, place.at("reference")]
-
-
-def _every(settings: AdaptiveSettings) -> tuple[LadderRung, ...]:
-    """The rungs, and the reference where it is none."""
-    return settings.ladder if settings.reference is None else (*settings.ladder, settings.reference)
+def _every(settings: AdaptiveSettings, place: Place) -> list[tuple[LadderRung, Place]]:
+    """The rungs, and the reference where it is none, with their places in the scenario."""
+    found = [(rung, place.at("ladder").at(index)) for index, rung in enumerate(settings.ladder)]
+    return found if settings.reference is None else [*found, (settings.reference, place.at("reference"))]
 
 
 def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelModel[Any]], Any]]:
@@ -142,9 +137,8 @@ def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelM
     ``place`` is where ``settings`` stand.
     """
     _check(settings, place)
-    every = _every(settings)
-    places = _places(settings, place)
-    found = [_model(rung.use, where) for rung, where in zip(every, places, strict=True)]
+    every = _every(settings, place)
+    found = [_model(rung.use, where) for rung, where in every]
     known = [frozenset(cls.Settings.__struct_fields__) for cls in found]
     for name in settings.common:
         if not any(name in fields for fields in known):
@@ -155,7 +149,7 @@ def models(settings: AdaptiveSettings, place: Place) -> list[tuple[type[ChannelM
                 .error(f"no rung has a setting {name!r}; {suggestion(name, everything)}")
             )
     made: list[tuple[type[ChannelModel[Any]], Any]] = []
-    for rung, at, cls, fields in zip(every, places, found, known, strict=True):
+    for (rung, at), cls, fields in zip(every, found, known, strict=True):
         shared = {n: v for n, v in settings.common.items() if n in fields and n not in rung.settings}
         where = at.at("settings")
         try:
@@ -199,7 +193,7 @@ def _check(settings: AdaptiveSettings, place: Place) -> None:
     ladder = place.at("ladder")
     if not settings.ladder:
         raise ladder.error(f"has no rung; write [[{ladder.key}]] with label, use and settings for each")
-    for label, count in Counter(rung.label for rung in _every(settings)).items():
+    for label, count in Counter(rung.label for rung, _ in _every(settings, place)).items():
         if count > 1:
             raise ladder.error(f"has {count} rungs with the label {label!r}; give each its own")
     if settings.fixed and settings.fixed not in settings.labels:

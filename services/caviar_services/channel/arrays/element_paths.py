@@ -29,9 +29,10 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.antenna_arrays import element_positions
 from caviar_protocol.topics import AntennaArray, Interaction
-from caviar_services.channel.paths import Antenna, Rows
+from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.image_method import image_points
 from caviar_space.obstacles import CLEARANCE
+from caviar_space.vectors import Rows
 
 
 class Bend(IntEnum):
@@ -326,7 +327,7 @@ class Elements:
     positions: Float64Array
     """[m], Shape ``[elements of all antennas, 3]``."""
 
-    def of(self, antenna: int) -> Float64Array:
+    def positions_of(self, antenna: int) -> Float64Array:
         """Positions of one antenna's elements [m], Shape ``[N, 3]``."""
         begin = int(self.first[antenna])
         return self.positions[begin : begin + self.arrays[antenna].size]

@@ -42,10 +42,10 @@ from caviar_services.channel.enumeration.image_beams import (
     scenery_beams,
     shown_scenery,
 )
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
@@ -374,7 +374,6 @@ def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any,
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
     """Pairs of a beam from each side that meet at an edge within both beams."""
-
     order = np.argsort(other.edge, kind="stable")
     sizes = np.bincount(other.edge, minlength=len(edges))
     begin, sizes = (np.cumsum(sizes) - sizes)[one.edge], sizes[one.edge]

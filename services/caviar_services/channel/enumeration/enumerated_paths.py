@@ -26,18 +26,14 @@ from caviar_services.channel.enumeration.image_paths import (
     unhidden,
     unhidden_over_edges,
 )
-from caviar_services.channel.enumeration.scenery_chains import (
-    FaceRectangles,
-    KnownScenery,
-    SceneFaces,
-    seen_planes,
-)
+from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneFaces, seen_planes
 from caviar_services.channel.propagation.utd import reflection_fields
 from caviar_services.channel.sionna.candidates import Faces, first_of_each
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.path_table import Traced, joined, nothing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.rectangles import FaceRectangles
 
 _NO_SHAPE = 0xFFFFFFFF
 
@@ -64,7 +60,7 @@ class EnumeratedTracer:
     def __init__(self, scene: SionnaScene, options: LaunchOptions) -> None:
         self._scene = scene
         self._options = options
-        self._depth, self._most = options.max_depth, options.max_paths
+        self._depth = options.max_depth
         self._edges = scene.edges if options.diffraction else None
         self._faces = SceneFaces(scene, inner=options.refraction)
         self._look = Faces(scene)
@@ -94,10 +90,13 @@ class EnumeratedTracer:
             return nothing(len(scene.wavelengths), self._depth, 0)
         # The ray tracer's coordinates are relative to the middle of the scene: float32 has 7 digits.
         start, ends = transmitter - scene.centre, receivers - scene.centre
-        of_bodies, sizes = self._standing()
+        # Faces of bodies are made once for all transmitters of a frame.
+        if self._bodies is None or self._bodies[0] != scene.version:
+            self._bodies = (scene.version, *self._faces.bodies())
+        _, of_bodies, sizes = self._bodies
         planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)
         of_scenery = self._faces.scenery(planes[planes >= 0])
-        faces = of_scenery.and_those(of_bodies)
+        faces = FaceRectangles.joined([of_scenery, of_bodies])
         # A chain by way of a plane without area has no face to be mirrored in.
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
@@ -120,12 +119,11 @@ class EnumeratedTracer:
             found.append(
                 self._bent(faces, edges, self._edges.triangles[edges.number[bent.edge], 0], bent, start, ends)
             )
-        return joined([self._first(part) for part in found], len(scene.wavelengths), self._depth)
-
-    def _first(self, traced: Traced) -> Traced:
-        """The first paths of each receiver, as many as the options allow."""
-        kept = first_of_each(traced.receiver, self._most)
-        return replace(traced.take(kept), lost=len(kept) - int(kept.sum()))
+        parts = []
+        for traced in found:
+            kept = first_of_each(traced.receiver, self._options.max_paths)
+            parts.append(replace(traced.take(kept), lost=len(kept) - int(kept.sum())))
+        return joined(parts, len(scene.wavelengths), self._depth)
 
     def _once(self, faces: FaceRectangles, paths: ImagePaths) -> ImagePaths:
         """Paths of which no earlier one runs by way of the same surfaces: coplanar faces that touch are
@@ -147,13 +145,6 @@ class EnumeratedTracer:
             seen = seen_planes(self._look, receivers, scenery.plane, _RAYS)
         receiver, place = np.nonzero(seen)
         return SceneryViews(np.arange(len(scenery)), pairs, receiver, place)
-
-    def _standing(self) -> tuple[FaceRectangles, Int64Array]:
-        """Faces of bodies and their numbers, made once for all transmitters of a frame."""
-        version = self._scene.version
-        if self._bodies is None or self._bodies[0] != version:
-            self._bodies = (version, *self._faces.bodies())
-        return self._bodies[1:]
 
     def _reflected(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import ranges
 
 # Pairs that one kernel tests at most, so that its memory is bounded.
@@ -554,7 +554,8 @@ def ends_by_scenery(
     def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
         there = gathered(columns[1], block) + number
         within = there < gathered(columns[2], block)
-        return gathered(by_group, _either(within, there)), within
+        # Index 0 can be gathered without reading beyond an array.
+        return gathered(by_group, dr.select(within, there, 0)), within
 
     def near(block: Any, number: Any) -> Any:
         beam, within = beam_of(block, number)
@@ -623,11 +624,6 @@ def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
         square = dr.squared_norm(side)
         crosses &= dr.abs(dr.dot(beside, side)) <= square + targets.slack * dr.sqrt(square)
     return crosses
-
-
-def _either(used: Any, index: Any) -> Any:
-    """An index where it is used, else 0, which can be gathered without reading beyond an array."""
-    return dr.select(used, index, 0)
 
 
 @dataclass(frozen=True, eq=False)

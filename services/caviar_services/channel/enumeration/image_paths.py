@@ -20,15 +20,14 @@ from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
 from caviar_services.channel.enumeration.image_beams import ChainPairs
-from caviar_services.channel.enumeration.scenery_chains import FaceRectangles
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
 from caviar_services.channel.sionna.candidates import Faces
-from caviar_services.channel.sionna.materials import DRAWN
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_services.channel.sionna.triangle_numbering import COPLANAR, COPLANAR_RELATIVE
-from caviar_space.planes import PlaneTable
+from caviar_space.materials import DRAWN
+from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
+from caviar_space.rectangles import FaceRectangles
+from caviar_space.vectors import Rows
 
 OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first face, whose points float32 rounds."""
@@ -404,29 +403,15 @@ def edge_paths(
         one surface, the first one.
     """
     parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
-    parts.append(_no_paths(depth))
-    found = EdgePaths(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("chain", "bend", "count", "edge", "receiver", "points")
-        )
-    )
-    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
-    keys = np.column_stack(
-        [found.receiver, found.count, edges.number[found.edge], found.bend, _surfaces(edges, found.chain)]
-    )
-    return found.take(np.unique(keys, axis=0, return_index=True)[1])
-
-
-def _no_paths(depth: int) -> EdgePaths:
     none = np.zeros(0, np.int64)
-    return EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3)))
-
-
-def _surfaces(edges: EdgeTargets, chain: Int64Array) -> Int64Array:
-    surfaces = np.full(chain.shape, -1)
-    surfaces[chain >= 0] = edges.surface_of_face[chain[chain >= 0]]
-    return surfaces
+    parts.append(EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3))))
+    found = EdgePaths.joined(parts)
+    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
+    surfaces = np.full(found.chain.shape, -1)
+    surfaces[found.chain >= 0] = edges.surface_of_face[found.chain[found.chain >= 0]]
+    number = edges.number[found.edge]
+    keys = np.column_stack([found.receiver, found.count, number, found.bend, surfaces])
+    return found.take(np.unique(keys, axis=0, return_index=True)[1])
 
 
 def _with_points(
@@ -439,7 +424,11 @@ def _with_points(
 ) -> EdgePaths:
     start = np.broadcast_to(transmitter, (len(chains.edge), 3))
     ends = receivers[chains.receiver]
-    source, target = _image(faces, chains.before, start), _image(faces, chains.behind, ends)
+    source, target = start, ends
+    for column in chains.before.T:
+        source = faces.mirrored(source, column)
+    for column in chains.behind.T:
+        target = faces.mirrored(target, column)
     wedge = edges.ends[chains.edge]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
         place = keller_point(source, target, wedge)
@@ -466,13 +455,6 @@ def _with_points(
         chains.receiver[rows],
         points,
     )
-
-
-def _image(faces: FaceRectangles, chain: Int64Array, points: Float64Array) -> Float64Array:
-    """Images of points [m] in all faces of chains of one length, Shape ``[N, 3]``."""
-    for column in chain.T:
-        points = faces.mirrored(points, column)
-    return points
 
 
 def unhidden_over_edges(

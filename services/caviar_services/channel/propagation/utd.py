@@ -43,11 +43,8 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.paths import Rows
-from caviar_space.vectors import cross, unit
-
-# Permittivity of vacuum [F/m] (CODATA 2018).
-EPSILON_0 = 8.8541878128e-12
+from caviar_space.materials import EPSILON_0
+from caviar_space.vectors import Rows, cross, unit
 
 # Sine of the angle between two directions below which they are one.
 _ALONG = 1e-9
@@ -100,7 +97,7 @@ class Media:
 
 
 @dataclass(frozen=True, eq=False)
-class Wall:
+class Wall(Rows):
     """Slabs that P rays meet, at one wavelength [m]."""
 
     permittivity: Float64Array
@@ -122,16 +119,6 @@ class Wall:
             np.where(which, self.conductivity, other.conductivity),
             np.where(which, self.thickness, other.thickness),
             np.where(which, self.scattering, other.scattering),
-            self.wavelength,
-        )
-
-    def take(self, rows: Int64Array) -> Wall:
-        """Slabs of these rays."""
-        return Wall(
-            self.permittivity[rows],
-            self.conductivity[rows],
-            self.thickness[rows],
-            self.scattering[rows],
             self.wavelength,
         )
 
@@ -197,13 +184,7 @@ def reflection_fields(
         field = transverse + 0j
         for d in range(normals.shape[1]):
             rows = np.flatnonzero(count > d)
-            wall = Wall(
-                media.permittivity[carrier, rows, d],
-                media.conductivity[carrier, rows, d],
-                media.thickness[rows, d],
-                media.scattering[rows, d],
-                wavelength,
-            )
+            wall = Wall.of(media, carrier, d, wavelength).take(rows)
             dyad = wall.dyad(directions[rows, d], normals[rows, d], through[rows, d])
             field[rows] = dyad @ field[rows]
         fields[carrier] = field * (wavelength / (4 * np.pi) / total)[:, None, None]
@@ -295,7 +276,7 @@ def wedges_of(ends: Float64Array, apexes: Float64Array) -> tuple[Wedges, BoolArr
 
 
 @dataclass(frozen=True, eq=False)
-class Bends:
+class Bends(Rows):
     """Directions, legs and wedges of P paths at their edges."""
 
     at: Int64Array
@@ -304,8 +285,9 @@ class Bends:
     """Unit vectors along incoming waves, Shape ``[P, 3]``."""
     out: Float64Array
     """Unit vectors along outgoing waves, Shape ``[P, 3]``."""
-    legs: tuple[Float64Array, Float64Array]
-    """Lengths before and after the edge [m], each of Shape ``[P]``."""
+    before: Float64Array
+    """Length before the edge [m], Shape ``[P]``; ``behind`` is that after it."""
+    behind: Float64Array
     faces: Wedges
     """First the face that waves meet more steeply."""
     swapped: BoolArray
@@ -324,7 +306,7 @@ class Bends:
         met = -(faces.normals * k[:, None]).sum(-1)
         # By more than rounding: else a symmetric wedge would be counted from one face or the other by chance.
         swap = met[:, 1] > met[:, 0] + IN_PLANE
-        return cls(at, k, out, legs, faces.turned(swap), swap)
+        return cls(at, k, out, *legs, faces.turned(swap), swap)
 
     @property
     def angles(self) -> tuple[Float64Array, Float64Array]:
@@ -347,19 +329,8 @@ class Bends:
     @property
     def spread(self) -> Float64Array:
         """The length L = s'·s/(s' + s) [m] of the coefficients, Shape ``[P]``."""
-        spread: Float64Array = self.legs[0] * self.legs[1] / (self.legs[0] + self.legs[1])
+        spread: Float64Array = self.before * self.behind / (self.before + self.behind)
         return spread
-
-    def take(self, rows: Int64Array) -> Bends:
-        """Bends of these paths."""
-        return Bends(
-            self.at[rows],
-            self.k[rows],
-            self.out[rows],
-            (self.legs[0][rows], self.legs[1][rows]),
-            self.faces.take(rows),
-            self.swapped[rows],
-        )
 
 
 def edge_fields(
@@ -391,7 +362,7 @@ def edge_fields(
     steps = np.diff(corners, axis=1)
     bends = Bends.of(corners, types, faces)
     lit = np.zeros((len(types), 3), np.int64) if lit is None else lit
-    s_in, s_out = bends.legs
+    s_in, s_out = bends.before, bends.behind
     fields = []
     for carrier, wavelength in enumerate(wavelengths):
         k = unit(steps[:, 0])
@@ -570,7 +541,9 @@ def waves_beside(
     sights: dict[int, Sight] = {}
     # An angle times the spreading length is how far the path passes from the boundary.
     near = np.abs(margins) * bends.spread[:, None] < _UNSURE
-    near[:, 1:] &= _steep(bends)
+    # No reflection that could end is traced at a face that rays meet at too small an angle.
+    steep = np.abs((bends.faces.normals * bends.k[:, None]).sum(-1)) > _GRAZING
+    near[:, 1:] &= np.where(bends.swapped[:, None], steep[:, ::-1], steep)
     rows, waves = np.nonzero(near)
     if not len(rows):
         return lit, sights
@@ -588,13 +561,6 @@ def waves_beside(
             passes = before.lit and bool(margins[row, 0] > -IN_PLANE)
             sights[pair] = Sight(passes, before.passed | set(faces[row].tolist()))
     return lit, sights
-
-
-def _steep(bends: Bends) -> BoolArray:
-    """Mask of faces, as given, that rays meet steeper than `_GRAZING`, Shape ``[B, 2]``."""
-    met = np.abs((bends.faces.normals * bends.k[:, None]).sum(-1)) > _GRAZING
-    steep: BoolArray = np.where(bends.swapped[:, None], met[:, ::-1], met)
-    return steep
 
 
 def _without_edge(key: Sequence[tuple[int, int]], face: int | None) -> tuple[tuple[int, int], ...]:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.ray_launcher import (
     DIFFRACTED,
@@ -41,6 +40,7 @@ from caviar_services.channel.sionna.ray_launcher import (
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
 from caviar_space.planes import PlaneTable
+from caviar_space.vectors import Rows
 
 MANY_RAYS = 1000
 """Of a chain that no half of a launch would miss."""
@@ -546,13 +546,6 @@ class Faces:
         self._surface_of = scene.surface_of
         self._surface = mi.UInt(aligned_indices(scene.surface_of))
 
-    def _follow_scene(self) -> None:
-        """Know which faces are one surface now."""
-        # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
-        if self._surface_of is not self._scene.surface_of:
-            self._surface_of = self._scene.surface_of
-            self._surface = mi.UInt(aligned_indices(self._surface_of))
-
     def along(self, start: Any, end: Any, active: Any) -> tuple[Any, Any]:
         """Look along segments, in a kernel.
 
@@ -563,7 +556,10 @@ class Faces:
         Returns:
             How much farther than a segment's end [m] the first surface along it is, and its number.
         """
-        self._follow_scene()
+        # The table is replaced where faces were joined or parted: mostly nothing is to be uploaded.
+        if self._surface_of is not self._scene.surface_of:
+            self._surface_of = self._scene.surface_of
+            self._surface = mi.UInt(aligned_indices(self._surface_of))
         behind, triangle, hit = self._met(start, end, active)
         return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
 

@@ -24,13 +24,13 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.paths import PathTable, Rows
+from caviar_services.channel.paths import PathTable
 from caviar_services.channel.propagation.utd import Wedges, wedges_of
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.triangle_numbering import NumberedTriangles
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
 from caviar_space.meshes import Mesh
-from caviar_space.vectors import ranges
+from caviar_space.vectors import Rows, ranges
 
 # [rad]; faces that deviate less from one plane are one, as in `planes`.
 _FLAT_ANGLE = 2e-4
@@ -597,16 +597,14 @@ def edge_generator(edges: SceneEdges) -> Any:
     return EdgeGenerator()
 
 
+@dataclass(frozen=True, eq=False)
 class EdgeRange:
-    """Edges of a scene, as it stands, that are within a distance of one end of a path at least.
+    """Edges of a scene, as it stands, that are within a distance of one end of a path at least."""
 
-    Args:
-        edges: Of the scene; None: it has none.
-        within_m: How far they may be.
-    """
-
-    def __init__(self, edges: SceneEdges | None, within_m: float) -> None:
-        self._edges, self._within = edges, within_m
+    edges: SceneEdges | None
+    """Of the scene; None: it has none."""
+    within_m: float
+    """How far they may be."""
 
     def reaches(self, places: Float64Array) -> bool:
         """Test whether any edge is in range of any of these places.
@@ -614,16 +612,16 @@ class EdgeRange:
         Args:
             places: [m], Shape ``[N, 3]``.
         """
-        if self._edges is None:
+        if self.edges is None:
             return False
-        edges = self._edges.all_ends
+        edges = self.edges.all_ends
         begin, along = edges[:, 0], edges[:, 1] - edges[:, 0]
         square = (along**2).sum(-1)
         begin, along, square = begin[square > 0], along[square > 0], square[square > 0]
         for place in places:
             share = np.clip(((place - begin) * along).sum(-1) / square, 0.0, 1.0)
             nearest = begin + share[:, None] * along - place
-            if ((nearest**2).sum(-1) <= self._within**2).any():
+            if ((nearest**2).sum(-1) <= self.within_m**2).any():
                 return True
         return False
 
@@ -637,6 +635,6 @@ class EdgeRange:
         bent = table.types == Interaction.DIFFRACTION
         near = np.zeros(bent.shape, np.bool_)
         for place in (start, end):
-            near |= ((table.points - place[:, None]) ** 2).sum(-1) <= self._within**2
+            near |= ((table.points - place[:, None]) ** 2).sum(-1) <= self.within_m**2
         kept: BoolArray = (near | ~bent).all(1)
         return kept

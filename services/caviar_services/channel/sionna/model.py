@@ -27,19 +27,19 @@ from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
-from caviar_services.channel.paths import Antenna, PathTable, with_near_pairs
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, with_near_pairs
 from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
 from caviar_services.channel.sionna import dr, mi
-from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
+from caviar_services.channel.sionna.path_table import Ends, Traced, path_table, traced_surfaces
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, scene_of
 from caviar_services.channel.sionna.settings import SionnaSettings, contributing, transmits
 from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_space.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -106,6 +106,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """People as screens; None: they are bodies."""
         if settings.human_blockage is not None:
             self.blockage = HumanBlockage(settings.human_blockage, run.carriers)
+        self._losses: tuple[Attenuation, ...] = tuple(filter(None, (self.foliage, self.blockage)))
         # Names and classes of the last frame's objects, and which keys match none: both seldom change.
         self._known_unmatched: tuple[object, dict[str, int]] = (None, {})
         self._samples = settings.launched_samples()
@@ -137,16 +138,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
     @property
     def room(self) -> Mapping[str, int]:
         return self._room
-
-    @property
-    def _losses(self) -> tuple[Attenuation, ...]:
-        """Losses of paths beside interactions."""
-        found: list[Attenuation] = []
-        if self.foliage is not None:
-            found.append(self.foliage)
-        if self.blockage is not None:
-            found.append(self.blockage)
-        return tuple(found)
 
     def enclosing(self, position: Float64Array) -> str:
         """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from.
@@ -237,7 +228,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 surface.name for surface in surfaces if transmits(surface, self._launched, frequencies)
             }
             notes += self._scene.closed_walls(through)
-        return (*notes, *self._finder.notes, *switched, *self._warm_up())
+        self.run.progress("compiling kernels", COMPILE_GRACE_S)
+        begin = time.monotonic()
+        self._finder.compile_kernels()
+        self.run.progress("kernels compiled", 0.0)
+        compiled = f"kernels compiled in {time.monotonic() - begin:.1f} s"
+        return (*notes, *self._finder.notes, *switched, compiled)
 
     def _make_finder(self, before: PathFinder | None = None) -> tuple[str, ...]:
         """Make what finds paths in the scene as it is; notes on what is switched off.
@@ -305,14 +301,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """The variant of Mitsuba is the process's, and others may have set theirs."""
         if mi.variant() != self._variant:
             mi.set_variant(self._variant)
-
-    def _warm_up(self) -> tuple[str, ...]:
-        """Compile every kernel that frames need; how long that took."""
-        self.run.progress("compiling kernels", COMPILE_GRACE_S)
-        begin = time.monotonic()
-        self._finder.compile_kernels()
-        self.run.progress("kernels compiled", 0.0)
-        return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
 
     # --- frames --------------------------------------------------------------------------------------
 
@@ -475,7 +463,7 @@ def _refuse_buried(scene: Scene, without_body: Sequence[str], foliage: Foliage |
     for device in scene.devices:
         if isinstance(device, AntennaDevice) and device.parent and device.position == (0.0, 0.0, 0.0):
             cls = scene.classes[scene.names.index(device.parent)]
-            is_foliage = foliage is not None and foliage.keys.of(device.parent, cls)
+            is_foliage = foliage is not None and foliage.keys.material_for(device.parent, cls)
             if cls not in without_body and not is_foliage:
                 raise PayloadError(
                     f"antenna {device.name!r} stands in the middle of the body of {device.parent!r}, where "

@@ -27,11 +27,11 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryChains,
     SceneryLaunch,
 )
-from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.paths import Antenna, PathTable, path_ends
 from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends
+from caviar_services.channel.sionna.path_table import Ends, Traced
 from caviar_services.channel.sionna.ray_launcher import Element, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.settings import SionnaSettings
@@ -281,7 +281,7 @@ class PathFinder:
             targets = np.array([antenna.position for antenna in ends]).reshape(-1, 3)
             corners = self._corners(transmitter, ends) if elements else None
             pair = t * len(receivers) + others
-            for traced, missed in self._of(transmitter, targets, names, corners, with_missed):
+            for traced, missed in self._found(transmitter, targets, names, corners, with_missed):
                 found.append((pair[traced.receiver], traced))
                 if missed is not None:
                     self.missed.append((*found[-1], missed))
@@ -291,7 +291,7 @@ class PathFinder:
         longest = float(self.wavelengths.max())
         return Corners(outermost([transmitter], longest)[0], outermost(receivers, longest))
 
-    def _of(
+    def _found(
         self,
         transmitter: Antenna,
         targets: Float64Array,
@@ -314,7 +314,7 @@ class PathFinder:
             scenery = self._scenery.known_from(transmitter.name, source)
             found.append((self._enumerated.trace(source, targets, scenery, over_edges), None))
         if self.launches:
-            followed = None if self._following is None else self._following.of(transmitter.name)
+            followed = None if self._following is None else self._following.chains_from(transmitter.name)
             launched = tracer.trace(source, targets, at_once, followed, names, corners=corners)
             if self._enumerated is not None:
                 launched = self._enumerated.unknown(launched, found[0][0], scenery, over_edges)

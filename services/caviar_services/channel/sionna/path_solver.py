@@ -199,7 +199,9 @@ class Tracer:
         transmitter, receivers = transmitter - centre, receivers - centre
         corners = corners and corners.relative_to(centre)
         key = transmitter.tobytes() + (element.key if element else b"")
-        self._drop_outdated()
+        # Launches into the scene as it was match no frame any more.
+        version = self._scene.version
+        self._last = {key: last for key, last in self._last.items() if last.version == version}
         # What is found for the corners of arrays is of these arrays alone, and not kept.
         last = None if corners else self._last.get(key)
         if last is None:
@@ -219,11 +221,6 @@ class Tracer:
             # Dictionaries keep their order: the oldest goes.
             del self._last[next(iter(self._last))]
         return traced
-
-    def _drop_outdated(self) -> None:
-        """Free the launches into the scene as it was: they match no frame any more."""
-        version = self._scene.version
-        self._last = {key: last for key, last in self._last.items() if last.version == version}
 
     def _launched(self, transmitter: Float64Array, element: Element | None) -> Offer:
         """Offer of a launch of all rays."""

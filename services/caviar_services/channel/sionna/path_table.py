@@ -11,7 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_services.channel.paths import Antenna, PathTable, Rows, spread_anew, with_direct
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.propagation.utd import (
@@ -25,6 +25,7 @@ from caviar_services.channel.propagation.utd import (
 from caviar_services.channel.sionna import dr
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.vectors import Rows
 
 # Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`.
 _POLE = 100 * 2.0**-24
@@ -343,21 +344,6 @@ def _with_sights(
     start, end = path_ends(pairs, *antennas)
     distance = np.sqrt(((end - start) ** 2).sum(1))
     return with_direct(table, pairs, np.zeros(len(pairs), np.bool_), distance, np.array(scene.wavelengths))
-
-
-def path_ends(
-    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
-) -> tuple[Float64Array, Float64Array]:
-    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``.
-
-    Args:
-        pair: Of each path, Shape ``[P]``.
-        transmitters, receivers: Antennas.
-    """
-    tx, rx = np.divmod(pair, max(len(receivers), 1))
-    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
-    end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
-    return start[tx], end[rx]
 
 
 def traced_surfaces(

@@ -33,13 +33,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
-from caviar_services.channel.propagation.utd import EPSILON_0
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
+from caviar_space.materials import EPSILON_0
 
 T = TypeVar("T")
 
@@ -288,6 +288,8 @@ class Launcher:
         From launch to launch, by its ``number``, other things are drawn where a ray may go on in several
         ways, and all rays are turned by less than what lies between two of them; at 0 by nothing.
         """
+        from sionna.rt.utils import WedgeGeometry
+
         passes = self._options.passes
         if not passes:
             return Launch((), None)
@@ -307,7 +309,7 @@ class Launcher:
         active, enabled = dr.full(mi.Bool, True, lanes), dr.full(mi.UInt, passes[0], lanes)
         if len(passes) > 1:
             enabled = dr.select(dr.arange(mi.UInt, lanes) < dr.opaque(mi.UInt, samples), enabled, passes[1])
-        wedges = self._no_wedges(lanes)
+        wedges = WedgeGeometry.build_with_size(lanes) if self._options.diffraction else None
         # Evaluated arrays, so that the first interaction runs the kernel of all others.
         dr.make_opaque(origin, direction, active, enabled, wedges)
         bounces = []
@@ -324,11 +326,6 @@ class Launcher:
         apart = math.sqrt(4 * math.pi / self._options.samples)
         root = 1.2207440846057596  # of x⁴ = x + 1
         return [apart * math.remainder(number / root**axis, 1.0) for axis in (1, 2, 3)]
-
-    def _no_wedges(self, samples: int) -> Any:
-        from sionna.rt.utils import WedgeGeometry
-
-        return WedgeGeometry.build_with_size(samples) if self._options.diffraction else None
 
     def _bounce(self, origin: Any, direction: Any, active: Any, enabled: Any, wedges: Any) -> tuple[Any, ...]:
         """Next interaction of all rays, and how they go on. Rules of what may follow what are Sionna RT's."""
@@ -454,17 +451,16 @@ def scattered_of(launch: Launch) -> Scattered:
     return Scattered(np.concatenate([np.zeros(0, np.int64), *rays]), depth, np.zeros((0, len(depth))))
 
 
+@dataclass(frozen=True, eq=False)
 class DrawnPoints:
-    """The points of a launch at which a ray was drawn to be scattered.
+    """The points of a launch at which a ray was drawn to be scattered."""
 
-    Args:
-        mi_scene: The Mitsuba scene.
-        launch: What the rays met.
-        found: Its scattering points.
-    """
-
-    def __init__(self, mi_scene: Any, launch: Launch, found: Scattered) -> None:
-        self._mi_scene, self._launch, self._found = mi_scene, launch, found
+    mi_scene: Any
+    """The Mitsuba scene."""
+    launch: Launch
+    """What the rays met."""
+    found: Scattered
+    """Its scattering points."""
 
     def reached(self, targets: Any) -> tuple[Int64Array, Int64Array, Float64Array]:
         """Find the receivers that points reach, on the side that was lit.
@@ -475,13 +471,13 @@ class DrawnPoints:
         Returns:
             Points and receivers of the pairs, and 0 as probability: that of what was drawn.
         """
-        ray, depth = self._found.ray, self._found.depth
+        ray, depth = self.found.ray, self.found.depth
         if not len(ray):
             return ray, ray, np.zeros(0)
         parts: list[tuple[Int64Array, Int64Array]] = []
         receivers = dr.width(targets)
         per_point = dr.opaque(mi.UInt, receivers)
-        for d, bounce in enumerate(self._launch.bounces):
+        for d, bounce in enumerate(self.launch.bounces):
             first = int(np.searchsorted(depth, d + 1))
             rays = ray[first : int(np.searchsorted(depth, d + 1, side="right"))]
             if not len(rays):
@@ -494,7 +490,7 @@ class DrawnPoints:
             hit.n = dr.gather(mi.Normal3f, bounce.normal, of_ray)
             back = hit.spawn_ray_to(target)
             lit = dr.dot(mi.Vector3f(hit.n), back.d) > 0.0
-            lit &= ~self._mi_scene.ray_test(back, active=lit)
+            lit &= ~self.mi_scene.ray_test(back, active=lit)
             kept: Any = dr.compress(lit)
             lanes = kept.numpy().astype(np.int64)
             parts.append((first + lanes // receivers, lanes % receivers))
@@ -606,7 +602,9 @@ class Thinning:
         total = np.rint(weight * _UNIT).astype(np.int64).sum(0) / _UNIT
         probability = weight * (self._wanted / np.maximum(total, 1 / _UNIT))
         np.minimum(probability, 1.0, out=probability)
-        place = (ray.astype(np.uint64) * _GOLDEN + self._offset + _turned(depth)) & _WORD
+        # At each depth the sequence begins anywhere else.
+        begin = depth.astype(np.uint64) * np.uint64(0x85EBCA6B)
+        place = (ray.astype(np.uint64) * _GOLDEN + self._offset + begin) & _WORD
         kept: BoolArray = place[:, None] * 2.0**-32 < probability
         return kept, probability
 
@@ -644,11 +642,6 @@ def _at_normal(material: Any) -> float:
     loss = float(material.conductivity[0]) / (float(material.scene.angular_frequency[0]) * EPSILON_0)
     root = complex(float(material.relative_permittivity[0]), -loss) ** 0.5
     return abs((1 - root) / (1 + root)) ** 2
-
-
-def _turned(depth: Int64Array) -> UInt64Array:
-    """Offset of the sequence at each depth: anywhere else."""
-    return depth.astype(np.uint64) * np.uint64(0x85EBCA6B)
 
 
 class ChosenPoints:

@@ -21,14 +21,14 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import is_mesh_name, material_of
 from caviar_protocol.errors import AssetError, ScenarioError
-from caviar_protocol.geometry import is_mesh_name, material_of
 from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Scene
 from caviar_services.channel.sionna import mi
-from caviar_services.channel.sionna.materials import (
+from caviar_services.drjit_setup import aligned_columns
+from caviar_space.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
@@ -39,9 +39,8 @@ from caviar_services.channel.sionna.materials import (
     body_kind,
     itu_material,
 )
-from caviar_services.drjit_setup import aligned_columns
 from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
-from caviar_space.meshes import Body, Mesh, assign_bodies, unit_box
+from caviar_space.meshes import Body, Mesh, assign_bodies, coarse_centre, object_meshes, shown_asset
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
 
 
@@ -115,26 +114,6 @@ def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
             cause = str(error).strip().splitlines()[-1].rpartition("(line 1")[2]
             raise AssetError(f"{place}: {cause}; correct it") from error
     return made[name]
-
-
-def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
-    """Load the unit mesh of an asset; that of an empty one is the box.
-
-    Args:
-        asset: Name of the file.
-        assets: Files of the run by name.
-
-    Raises:
-        AssetError: There is no such file, or it is no mesh.
-    """
-    if not asset:
-        return unit_box()
-    path = assets.get(asset)
-    if path is None:
-        known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
-        raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
-    vertices, faces = read_ply(path, f"mesh {asset!r}")
-    return Mesh(vertices, faces.astype(np.int32))
 
 
 def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
@@ -240,7 +219,7 @@ def object_materials(
 
     made = {}
     for name in objects.names:
-        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        change, key = policy.changes_of(name), Place("object_materials").at(objects.key_of(name)).key
         remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
         itu: tuple[ItuMaterial, ...] = ()
         if not change.is_electric:
@@ -283,7 +262,7 @@ def set_materials(
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
             material.relative_permittivity, material.conductivity = itu.constants
-        _checked_change(material, name, policy.of(name), policy)
+        _checked_change(material, name, policy.changes_of(name), policy)
     scene.frequency = frequency_hz
 
 
@@ -304,13 +283,13 @@ def itu_materials(
     for name, material in scene.radio_materials.items():
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
-            found.append((material, itu, policy.of(name).applied(itu.constants)))
+            found.append((material, itu, policy.changes_of(name).applied(itu.constants)))
     return found
 
 
 def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
     """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
-    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+    if not hasattr(material, "itu_type") or policy.changes_of(name).is_electric or not material.is_used:
         return None
     return itu_material(name, material.itu_type, frequency_hz, policy)
 
@@ -382,21 +361,8 @@ def with_detail(
     ], effect
 
 
-# [m]; the centre is a multiple of it, so that a scene about the origin stays as it is.
-_CENTRE_STEP = 128.0
-
 # [m]; float32 has a step of 8 mm at this distance: what is farther from the centre is traced too coarsely.
 _FARTHEST = 1e5
-
-
-def near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros.
-
-    Args:
-        low, high: Corners [m], Shape ``[3]`` each.
-    """
-    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
-    return middle
 
 
 def bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
@@ -431,13 +397,14 @@ def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
     low, high = _boxes(shapes)
     # The usual scene: its middle, so that products stay what they are.
     if not len(low) or (high.max(0) - low.min(0)).max() <= 2 * _FARTHEST:
-        return near_middle(*bounds(shapes)), ""
+        lowest, highest = bounds(shapes)
+        return coarse_centre((lowest + highest) / 2), ""
     middles = (low + high) / 2
     near = np.array([((low >= m - _FARTHEST) & (high <= m + _FARTHEST)).all(1) for m in middles])
     # Where two places have as many pieces, that which is nearer to the origin counts.
     most = np.lexsort((np.abs(middles).max(1), -near.sum(1)))[0]
     kept = near[most] | (np.arange(len(near)) == most)
-    centre = near_middle(low[kept].min(0), high[kept].max(0))
+    centre = coarse_centre((low[kept].min(0) + high[kept].max(0)) / 2)
     reach = np.maximum(np.abs(low - centre), np.abs(high - centre)).max(1)
     far, step = int(reach.argmax()), np.spacing(np.float32(reach.max()))
     pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
@@ -514,7 +481,7 @@ class BodyPool:
         self._objects = objects
         self._own_materials = own
         self._later = _LaterMeshes()
-        units = {asset: unit_mesh(asset, assets) for asset in pool}
+        units = object_meshes(assets)
         # Each material of bodies is a shape of its own, with a pool of its own.
         kinds = {(asset, m): body_kind(asset, m) for m in ("", *materials) for asset in sorted(pool)}
         self._keys = {kind: keys.get(asset, "") for (asset, _), kind in kinds.items()}
@@ -567,7 +534,7 @@ class BodyPool:
             AssetError: A file is no mesh.
         """
         self._later = _LaterMeshes(
-            meshes={name: unit_mesh(name, meshes) for name in sorted(meshes)},
+            meshes=object_meshes(meshes),
             materials=own_materials(meshes),
             changed=True,
         )
@@ -633,10 +600,10 @@ class BodyPool:
     def _body_of(self, scene: Scene, i: int) -> tuple[str, str]:
         """Mesh and material of the body of an object of a scene; the box for a mesh that is not there."""
         asset = scene.assets[i]
-        if is_mesh_name(asset) and asset not in self._later.meshes and asset not in self._first.meshes:
-            asset = ""
+        if asset not in self._later.meshes:
+            asset = shown_asset(asset, self._first.meshes)
         own = self._later.materials.get(asset) or self._own_materials.get(asset, "")
-        return asset, self._objects.of(scene.names[i], scene.classes[i]) or own
+        return asset, self._objects.material_for(scene.names[i], scene.classes[i]) or own
 
     def assign(self, objects: Iterable[tuple[str, str]]) -> dict[str, Body]:
         """Choose a body for each object, as `assign_bodies` does.

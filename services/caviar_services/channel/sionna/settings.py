@@ -28,7 +28,8 @@ from caviar_services.channel.propagation.attenuation import (
     check_screens,
 )
 from caviar_services.channel.propagation.utd import slab
-from caviar_services.channel.sionna.materials import (
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
+from caviar_space.materials import (
     DRAWN,
     OTHER_MATERIALS,
     MaterialSettings,
@@ -36,7 +37,6 @@ from caviar_services.channel.sionna.materials import (
     SurfaceMaterial,
     UsedSurfaces,
 )
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
 from caviar_space.mesh_detail import DetailSettings
 from caviar_space.mitsuba_xml import ITU_MATERIALS
 

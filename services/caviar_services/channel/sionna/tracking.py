@@ -18,7 +18,6 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
-from caviar_services.channel.paths import Rows
 from caviar_services.channel.sionna import mi
 from caviar_services.channel.sionna.candidates import MANY_RAYS, Candidates, Chains, Met, Offer, chains_of
 from caviar_services.channel.sionna.ray_launcher import (
@@ -33,6 +32,7 @@ from caviar_services.channel.sionna.ray_launcher import (
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions
+from caviar_space.vectors import Rows
 
 # [m] A transmitter that has moved farther since the frame before is looked for anew.
 _JUMP = 20.0
@@ -347,7 +347,7 @@ class Following:
         self._followed.clear()
         self._placed = None
 
-    def of(self, transmitter: str) -> Followed:
+    def chains_from(self, transmitter: str) -> Followed:
         """The chains of a transmitter.
 
         Args:

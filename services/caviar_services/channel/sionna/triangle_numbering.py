@@ -4,11 +4,7 @@ A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape an
 triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
 in a plane of it.
 
-Coplanar faces of bodies that touch or overlap one another or scenery are one surface (`CoplanarFaces`). Two
-lorries side by side with flush walls, or a kiosk flush with a façade, reflect as one wall does. Taken for two
-planes, a wave would be reflected by each where both overlap, and by the one or the other, at random, where a
-ray meets what coincides. So in each frame such faces are joined: they have one number, by which chains of
-planes go, and one id.
+Coplanar faces of bodies that touch or overlap one another or scenery are one surface (`CoplanarFaces`).
 
 The geometry of scenery may give other fields than its author expects, which is warned of once, before the
 run. Of faces of two materials in one plane (`coinciding_materials`) waves meet one. Of a closed thin wall
@@ -21,7 +17,6 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +27,8 @@ from caviar_services.channel.sionna.scene_loading import Shape
 from caviar_space.meshes import Body, Mesh
 from caviar_space.obstacles import Surfaces
 from caviar_space.planes import (
+    CoplanarFaces,
+    JoinedFaces,
     PlaneTable,
     is_closed,
     plane_numbers,
@@ -39,184 +36,7 @@ from caviar_space.planes import (
     shared_planes,
     two_sided_planes,
 )
-from caviar_space.vectors import cross, ranges
-
-COPLANAR = 1e-5
-"""[m]; faces are in one plane to this, and `COPLANAR_RELATIVE` of their coordinates: about what float32 tells
-apart. One that stands farther behind another is hidden by it where they overlap."""
-
-COPLANAR_RELATIVE = 1.2e-7
-
-# [rad]; between the normals of coplanar faces, at most.
-_ANGLE = 3e-5
-
-# [m]; boxes around faces that are nearer touch.
-_TOUCHING = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class JoinedFaces:
-    """The faces of a frame that are one surface."""
-
-    label: Int64Array
-    """Of each plane, the number of the surface that it is of: that of its first plane, Shape ``[P]``."""
-    groups: tuple[Int64Array, ...] = ()
-    """Planes of each surface that is more than one, in ascending order: those of scenery come first."""
-    scenery: dict[int, int] = field(default_factory=dict)
-    """By label, the first triangle of scenery that a face touches, for surfaces that scenery is a part of."""
-
-
-class CoplanarFaces:
-    """Finds the faces of bodies that are one surface with others.
-
-    Args:
-        table: Planes of scenery, and after them those of bodies, body after body.
-        first: Number of the first plane of a body.
-        sizes: How many planes each body has, Shape ``[V]``.
-        two_sided: Of each plane of a body, whether both of its sides reflect, Shape ``[P − first]``; of
-            others that face away from each other one at most is seen.
-    """
-
-    def __init__(self, table: PlaneTable, first: int, sizes: Int64Array, two_sided: BoolArray) -> None:
-        self._table, self._first, self._sizes, self._two_sided = table, first, sizes, two_sided
-        self._begin = first + np.cumsum(sizes) - sizes
-        # Random weights: planes that differ hardly ever have the same sum. The seed is fixed, as is the
-        # order.
-        rng = np.random.default_rng(0)
-        self._direction = rng.standard_normal(4)
-        self._direction /= np.abs(self._direction).sum()
-        self._reach = float(np.abs(table.origin[:first]).max(initial=1.0))
-        still = np.flatnonzero((table.normal[:first] != 0).any(1))
-        order = np.argsort(self._projected(still))
-        self._still, self._keys = still[order], self._projected(still)[order]
-        self.none = JoinedFaces(np.arange(len(table.normal)))
-
-    def find(self) -> JoinedFaces:
-        """Faces that are one surface as the table stands."""
-        table = self._table
-        moving = np.arange(self._first, len(table.normal))
-        moving = moving[(table.normal[moving] != 0).any(1)]
-        one, other = self._of_bodies()
-        together = self._coplanar(one, other)
-        one, other = one[together], other[together]
-        body, still = self._with_scenery(moving)
-        together = self._coplanar(body, still)
-        body, still = body[together], still[together]
-        triangle = self._touched(body, still)
-        touching = triangle >= 0
-        body, still, triangle = body[touching], still[touching], triangle[touching]
-        if not len(one) + len(body):
-            return self.none
-        pairs = np.column_stack([np.append(other, still), np.append(one, body)])
-        return self._joined(pairs, still, triangle)
-
-    def _joined(self, pairs: Int64Array, still: Int64Array, triangle: Int64Array) -> JoinedFaces:
-        """Surfaces of planes that are one, pair by pair, and the triangles of planes of scenery that these
-        touch."""
-        label = self.none.label.copy()
-        members = np.unique(pairs)
-        while True:
-            # Labels spread along the pairs until none changes.
-            least = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
-            before = label[members].copy()
-            for side in (0, 1):
-                np.minimum.at(label, pairs[:, side], least)
-            if (label[members] == before).all():
-                break
-        groups = tuple(members[label[members] == first] for first in np.unique(label[members]))
-        # Descending: of equal labels the dictionary keeps the last, the lowest triangle.
-        order = np.argsort(-triangle)
-        touched = dict(zip(label[still[order]].tolist(), triangle[order].tolist(), strict=True))
-        return JoinedFaces(label, groups, touched)
-
-    def _of_bodies(self) -> tuple[Int64Array, Int64Array]:
-        """Planes of one body and of another whose boxes touch, that may be coplanar."""
-        none = np.zeros(0, np.int64)
-        if len(self._sizes) < 2:
-            return none, none
-        table, begin = self._table, self._begin - self._first
-        flat = (table.normal[self._first :] != 0).any(1)[:, None]
-        low = np.minimum.reduceat(np.where(flat, table.low[self._first :], np.inf), begin)
-        high = np.maximum.reduceat(np.where(flat, table.high[self._first :], -np.inf), begin)
-        some = np.flatnonzero(np.isfinite(low).all(1))
-        # Sorted along x, only bodies whose extents overlap there are compared.
-        some = some[np.argsort(low[some, 0], kind="stable")]
-        last = np.searchsorted(low[some, 0], high[some, 0] + _TOUCHING, side="right")
-        place, behind = ranges(np.arange(len(some)) + 1, np.maximum(last - np.arange(len(some)) - 1, 0))
-        one, other = some[place], some[behind]
-        touch = ((low[one] <= high[other] + _TOUCHING) & (low[other] <= high[one] + _TOUCHING)).all(1)
-        one, other = one[touch], other[touch]
-        if not len(one):
-            return none, none
-        pair, first = ranges(self._begin[one], self._sizes[one])
-        row, second = ranges(self._begin[other[pair]], self._sizes[other[pair]])
-        one, other = first[row], second
-        touch = (
-            (table.low[one] <= table.high[other] + _TOUCHING)
-            & (table.low[other] <= table.high[one] + _TOUCHING)
-        ).all(1)
-        one, other = one[touch], other[touch]
-        same = np.einsum("nc,nc->n", table.normal[one], table.normal[other])
-        seen = (same > 0) | self._two_sided[one - self._first] | self._two_sided[other - self._first]
-        kept = seen & (np.abs(same) > 0.5)
-        return one[kept], other[kept]
-
-    def _with_scenery(self, moving: Int64Array) -> tuple[Int64Array, Int64Array]:
-        """Planes of bodies and of scenery whose normals and offsets agree, about."""
-        reach = 2.0 * _ANGLE
-        found = [np.zeros((0, 2), np.int64)]
-        for sign in (1.0, -1.0):
-            key = sign * self._projected(moving)
-            first = np.searchsorted(self._keys, key - reach)
-            own, place = ranges(first, np.searchsorted(self._keys, key + reach, side="right") - first)
-            found.append(np.column_stack([moving[own], self._still[place]]))
-        body, still = np.concatenate(found).T
-        table = self._table
-        touch = (
-            (table.low[body] <= table.high[still] + _TOUCHING)
-            & (table.low[still] <= table.high[body] + _TOUCHING)
-        ).all(1)
-        return body[touch], still[touch]
-
-    def _projected(self, planes: Int64Array) -> Float64Array:
-        """Normals and offsets of planes as one number each, of opposite sign for the opposite normal: what
-        hardly differs stands near in the order of these."""
-        normal = self._table.normal[planes]
-        offset = np.einsum("nc,nc->n", normal, self._table.origin[planes]) / self._reach
-        projected: Float64Array = normal @ self._direction[:3] + offset * self._direction[3]
-        return projected
-
-    def _touched(self, body: Int64Array, still: Int64Array) -> Int64Array:
-        """First triangle of scenery, for pairs of planes, whose box the body's face touches; −1: none."""
-        triangles, sizes = self._table.triangles_of(still)
-        own = np.repeat(np.arange(len(still)), sizes)
-        corners = self._table.corners_of(triangles)
-        plane = body[own]
-        touch = (corners.min(1) <= self._table.high[plane] + _TOUCHING) & (
-            self._table.low[plane] <= corners.max(1) + _TOUCHING
-        )
-        hits = touch.all(1)
-        found = np.full(len(body), np.iinfo(np.int64).max)
-        np.minimum.at(found, own[hits], triangles[hits])
-        return np.where(found < np.iinfo(np.int64).max, found, -1)
-
-    def _coplanar(self, one: Int64Array, other: Int64Array) -> BoolArray:
-        """Mask of pairs of planes of which all corners of the one are in the other."""
-        if not len(one):
-            return np.zeros(0, np.bool_)
-        table = self._table
-        across = np.abs(cross(table.normal[one], table.normal[other])).max(1)
-        within: BoolArray = across <= _ANGLE
-        rows = np.flatnonzero(within)
-        triangles, sizes = table.triangles_of(one[rows])
-        own = np.repeat(rows, sizes)
-        places = table.corners_of(triangles)
-        height = np.einsum("ntc,nc->nt", places - table.origin[other[own]][:, None], table.normal[other[own]])
-        slack = COPLANAR + COPLANAR_RELATIVE * np.abs(places).max((1, 2))
-        off = np.abs(height).max(1) > slack
-        within[own[off]] = False
-        return within
-
+from caviar_space.vectors import cross
 
 # [m]; what overlaps, or stands out, by less does not.
 _NEAR = 1e-3
@@ -394,26 +214,24 @@ class NumberedTriangles:
         self._number_shapes(shapes, ids, moving)
         corners = np.array([len(mesh.vertices) for mesh in meshes])
         before = self._first_vertices = np.cumsum(corners) - corners
-        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
-        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
+        self.vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        """All vertices as they stand [m], Shape ``[V, 3]``."""
+        faces = [mesh.faces + begin for mesh, begin in zip(meshes, before, strict=True)]
+        self.triangle_vertices = np.concatenate(faces)
+        """Vertices of each triangle, Shape ``[F, 3]``."""
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
         # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
-        self._relative = self._corners - centre
+        self._relative = self.vertices - centre
         self.joined: JoinedFaces
         """Which faces are one surface."""
         material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])
         self._number_planes(meshes, material, unit_meshes)
         last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
-        self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
-        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
-        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        self._vertices = self.vertices[len(self.vertices) - sum(len(mesh.vertices) for mesh in last) :]
+        self._first_moving = len(self.triangle_vertices) - sum(len(mesh.faces) for mesh in last)
+        self.surfaces = Surfaces(self.vertices[self.triangle_vertices], self._points_outside)
         """All triangles, in world coordinates."""
-
-    @property
-    def moving_vertices(self) -> Float64Array:
-        """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
-        return self._vertices.copy()
 
     def count_from(self, centre: Float64Array) -> None:
         """Move everything to stand about another centre as it stood about the last.
@@ -421,10 +239,10 @@ class NumberedTriangles:
         Args:
             centre: [m], Shape ``[3]``.
         """
-        self._corners += centre - self.centre
+        self.vertices += centre - self.centre
         self.centre = centre
         self.version += 1
-        self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
+        self.surfaces.move(np.arange(len(self.triangle_vertices)), self.vertices[self.triangle_vertices])
 
     def move(self, vertices: Float64Array) -> bool:
         """Move the bodies.
@@ -440,25 +258,21 @@ class NumberedTriangles:
             return False
         self._vertices[:] = vertices
         self.version += 1
-        first = len(self._corners) - len(vertices)
+        first = len(self.vertices) - len(vertices)
         self._relative[first:][changed] = vertices[changed] - self.centre
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
-        moved = changed[self._faces[self._first_moving :] - first].any(1)
+        moved = changed[self.triangle_vertices[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
         # Boxes of joined surfaces are around all of their planes: they are made anew.
         joined = np.array([group[0] for group in self.joined.groups], np.int64)
         self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
-        self._join()
-        self.surfaces.move(triangles, self._corners[self._faces[triangles]])
-        return True
-
-    def _join(self) -> None:
-        """Find the faces that are one surface now."""
-        before, now = self.joined, self._coplanar.find()
-        self.joined = now
-        self.plane_table.join(now.groups)
-        if before.groups or now.groups:
+        # Find the faces that are one surface now.
+        before, self.joined = self.joined, self._coplanar.find()
+        self.plane_table.join(self.joined.groups)
+        if before.groups or self.joined.groups:
             self.surface_of = self.joined.label[self.plane_of]
+        self.surfaces.move(triangles, self.vertices[self.triangle_vertices[triangles]])
+        return True
 
     def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
         """Name surfaces so that paths by way of them are known in other frames.
@@ -490,16 +304,6 @@ class NumberedTriangles:
             numbers[its] = -len(known)
         return numbers, tuple(known)
 
-    @property
-    def vertices(self) -> Float64Array:
-        """All vertices as they stand [m], Shape ``[V, 3]``."""
-        return self._corners
-
-    @property
-    def triangle_vertices(self) -> Int32Array:
-        """Vertices of each triangle, Shape ``[F, 3]``."""
-        return self._faces
-
     def begin_of(self, piece: int) -> tuple[int, int]:
         """Numbers of the first vertex and the first triangle of a piece.
 
@@ -507,11 +311,6 @@ class NumberedTriangles:
             piece: Its number.
         """
         return int(self._first_vertices[piece]), int(self._first_triangles[piece])
-
-    @property
-    def first_moving_plane(self) -> int:
-        """Number of the first plane of a body; those of scenery come before."""
-        return int(self._moving_plane)
 
     @property
     def first_body_piece(self) -> int:
@@ -522,8 +321,8 @@ class NumberedTriangles:
     def scenery_digest(self) -> bytes:
         """Digest of all triangles at rest and of their planes."""
         digest = hashlib.blake2b(digest_size=20)
-        faces = self._faces[: self._first_moving]
-        still = self._corners[: len(self._corners) - len(self._vertices)]
+        faces = self.triangle_vertices[: self._first_moving]
+        still = self.vertices[: len(self.vertices) - len(self._vertices)]
         for part in (still - self.centre, faces, self.plane_of[: self._first_moving]):
             digest.update(np.ascontiguousarray(part).tobytes())
         return digest.digest()
@@ -543,7 +342,7 @@ class NumberedTriangles:
             asset: It has one body at least.
         """
         piece = self.first_body_piece + int(self.bodies_of(asset)[0])
-        ends = np.append(self._first_triangles, len(self._faces))
+        ends = np.append(self._first_triangles, len(self.triangle_vertices))
         return self._face_of[ends[piece] : ends[piece + 1]]
 
     def piece_of(self, triangles: Int64Array) -> Int64Array:
@@ -613,7 +412,7 @@ class NumberedTriangles:
         """
         number = self._offsets[self._where(shapes)] + primitives
         # The number of no shape is beyond all others and must not lead out of the table.
-        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        clipped: Int64Array = np.clip(number, 0, len(self.triangle_vertices) - 1)
         return clipped
 
     def corners(self, triangles: Int64Array) -> Float64Array:
@@ -622,7 +421,7 @@ class NumberedTriangles:
         Args:
             triangles: Numbers, of any Shape.
         """
-        corners: Float64Array = self._corners[self._faces[triangles]]
+        corners: Float64Array = self.vertices[self.triangle_vertices[triangles]]
         return corners
 
     def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
@@ -709,7 +508,7 @@ class NumberedTriangles:
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
         before = np.cumsum(counts) - counts
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
-        faces = self._faces.astype(np.int64)
+        faces = self.triangle_vertices.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
         apart.update(self._relative)
         self.part_of = parts.astype(np.int64)
@@ -717,13 +516,14 @@ class NumberedTriangles:
         shared = shared_planes(apart, np.repeat(material[:still], counts[:still]))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
-        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.first_moving_plane = int(len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum()))
+        """Number of the first plane of a body; those of scenery come before."""
         self.plane_table = PlaneTable(self.plane_of, faces)
         self.plane_table.update(self._relative)
         two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
         sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
         self._coplanar = CoplanarFaces(
-            self.plane_table, int(self._moving_plane), counts[still:], np.concatenate(sides)
+            self.plane_table, self.first_moving_plane, counts[still:], np.concatenate(sides)
         )
         self.joined = self._coplanar.none
         self.surface_of = self.plane_of
@@ -735,13 +535,13 @@ class NumberedTriangles:
 
         Scenery has faces of either sense, so their order of corners says nothing.
         """
-        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        piece = int(self.piece_of(np.array(triangle)))
         if triangle < self._first_moving and abs(normal[2]) > _LYING:
             return bool(normal[2] > 0)
-        ends = [*self._first_triangles.tolist(), len(self._faces)]
-        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        ends = [*self._first_triangles.tolist(), len(self.triangle_vertices)]
+        corners = self.vertices[self.triangle_vertices[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
         middle = (corners.min(0) + corners.max(0)) / 2
-        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+        return bool((self.vertices[self.triangle_vertices[triangle, 0]] - middle) @ normal >= 0)
 
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)

@@ -293,14 +293,25 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     # --- the product -----------------------------------------------------------------------------------
 
     def _channel(self, ends: _Ends, waves: Waves, sight: Sight) -> Channel:
-        constant = self._constant(tuple(sight.free), tuple(sight.near), ends)
+        key = tuple(sight.free), tuple(sight.near), len(ends.rx)
+        constant = self._constants.get(key)
+        if constant is None:
+            if len(self._constants) >= KEPT_CONSTANTS:
+                self._constants.clear()
+            shape = len(ends.tx), len(ends.rx)
+            constant = self._constants[key] = _Constant.of(key[0], key[1], self._ids, shape)
         a = np.array(waves.amplitude, np.complex128)
         pairs = [
             PairWaves(line.tx, line.rx, line.tx_pose, line.rx_pose, mine)
             for line, mine in zip(sight.lines, constant.rows, strict=True)
         ]
         if self.has_path_gain:
-            a *= self._path_gain(waves, pairs)
+            patterns = np.ones(len(waves.tau))
+            for pair in pairs:
+                patterns[pair.mine] = self.pattern_gain(
+                    pair.tx.array, pair.departures(waves), pair.rx.array, pair.arrivals(waves)
+                )
+            a *= self.path_gain(np.array(waves.length), patterns, np.array(waves.tau))
         # One array, cut up: making an array costs more than its numbers.
         both, count = waves.departure + waves.arrival, len(waves.tau)
         seen = [x for wave in both for x in angles(wave)]
@@ -329,25 +340,6 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             taps=wideband.taps,
         )
 
-    def _constant(self, free: tuple[bool, ...], near: tuple[bool, ...], ends: _Ends) -> _Constant:
-        key = free, near, len(ends.rx)
-        known = self._constants.get(key)
-        if known is None:
-            if len(self._constants) >= KEPT_CONSTANTS:
-                self._constants.clear()
-            shape = len(ends.tx), len(ends.rx)
-            known = self._constants[key] = _Constant.of(free, near, self._ids, shape)
-        return known
-
-    def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
-        """Path gain of all waves, Shape ``[C, P]``."""
-        patterns = np.ones(len(waves.tau))
-        for pair in pairs:
-            patterns[pair.mine] = self.pattern_gain(
-                pair.tx.array, pair.departures(waves), pair.rx.array, pair.arrivals(waves)
-            )
-        return self.path_gain(np.array(waves.length), patterns, np.array(waves.tau))
-
     def pattern_gain(
         self, tx: AntennaArray, departures: Float64Array, rx: AntennaArray, arrivals: Float64Array
     ) -> Float64Array:
@@ -362,8 +354,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         Returns:
             Shape ``[...]``.
         """
-        sent = self.patterns.of(tx).amplitude(departures.reshape(-1, 3))
-        sent *= self.patterns.of(rx).amplitude(arrivals.reshape(-1, 3))
+        sent = self.patterns.element(tx).amplitude(departures.reshape(-1, 3))
+        sent *= self.patterns.element(rx).amplitude(arrivals.reshape(-1, 3))
         return sent.reshape(departures.shape[:-1])
 
     def path_gain(self, length: Float64Array, patterns: Float64Array, tau: Float64Array) -> Float64Array:
