@@ -104,6 +104,7 @@ class LeftoverProcesses:
                     process.pid != os.getpid()
                     and process.environ().get(MARKER) == self.session
                     and process.status() != psutil.STATUS_ZOMBIE
+                    and process.name() != "nursery"  # tests/unit/forked.py: it ends with this process
                     and not any("resource_tracker" in word for word in process.cmdline())
                 ):
                     found.append(process)
