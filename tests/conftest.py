@@ -104,6 +104,7 @@ class LeftoverProcesses:
                     process.pid != os.getpid()
                     and process.environ().get(MARKER) == self.session
                     and process.status() != psutil.STATUS_ZOMBIE
+                    and process.name() != "nursery"  # tests/unit/forked.py: it ends with this process
                     and not any("resource_tracker" in word for word in process.cmdline())
                 ):
                     found.append(process)
@@ -158,6 +159,10 @@ class FrozenHeap:
         self.modules = 0
 
     def pytest_runtest_teardown(self) -> None:
+        self.freeze()
+
+    def freeze(self) -> None:
+        """Do so where modules were loaded since the last time."""
         if len(sys.modules) > self.modules + 50:
             self.modules = len(sys.modules)
             gc.collect()

@@ -188,7 +188,9 @@ for _key in registered():
 del _tests  # pytest would collect it by this name, too
 
 
-@pytest.mark.parametrize("key", FOLLOWING)
+@pytest.mark.parametrize(
+    "key", [pytest.param("channel:adaptive", marks=pytest.mark.exhaustive), "channel:sionna-rt"]
+)
 def test_what_is_followed_goes_on_in_another_process(key: str, tmp_path: Path) -> None:
     """In the registry's tests each frame stands on its own; here none does."""
     pytest.importorskip("sionna")

@@ -296,9 +296,8 @@ ALL_ON: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(
-    "settings", [pytest.param({}, marks=pytest.mark.exhaustive), ALL_ON], ids=["specular", "all-on"]
-)
+@pytest.mark.parametrize("settings", [{}, ALL_ON], ids=["specular", "all-on"])
+@pytest.mark.exhaustive  # test_channel_same_paths has the short form
 def test_two_processes_make_equal_products(tmp_path: Path, settings: dict[str, Any]) -> None:
     """Bit-equal payloads of this process, where much came before, and of one of its own, with diffraction and
     diffuse scattering too: the solver returns those in another order each time, the product does not."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 import select
@@ -11,19 +10,27 @@ import subprocess
 import sys
 import time
 import uuid
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import pytest
+from forked import Forked
 
 ROOT = Path(__file__).parents[2]
 SCENARIOS = ROOT / "deploy" / "caviar_scenarios"
 HERE = Path(__file__).parent
 MARK = "CAVIAR_TEST_RUN"
 PATIENCE = 4
+PRELOAD = (
+    "caviar_clients.cli.main",
+    "caviar_clients.cli.run",
+    "caviar_clients.cli.launch",
+    "caviar_clients.cli.recordings",
+    "caviar_clients.session.embedded",
+)
+"""What the command imports in most runs."""
 
 
 @dataclass
@@ -42,43 +49,29 @@ def environment(mark: str, **extra: str) -> dict[str, str]:
     return os.environ | {MARK: mark, "PYTHONPATH": path, "COLUMNS": "200"} | extra
 
 
-def caviar(*arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:
+def caviar(*arguments: str | Path, timeout: float = 120.0, **extra: str) -> Finished:
     """Run ``caviar`` with these arguments, and find out what it left behind."""
-    if arguments[0] in ("keys", "inspect"):  # start no process: half a second of CPU less each
-        return _in_this_process(*arguments, **extra)
     mark = uuid.uuid4().hex
-    command = [sys.executable, "-m", "caviar_clients", *map(str, arguments)]
-    done = subprocess.run(
-        command,
-        env=environment(mark, **extra),
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=ROOT,
-        check=False,
-    )
-    return Finished(done.returncode, done.stdout + done.stderr, Path(), marked(mark))
-
-
-def _in_this_process(*arguments: str | Path, **extra: str) -> Finished:
-    from caviar_clients.cli.main import main
-
-    output, status = io.StringIO(), 0
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(output):
-        patch.chdir(ROOT)
-        patch.setattr(sys, "argv", ["caviar", *map(str, arguments)])
-        patch.setattr(warnings, "showwarning", warnings.showwarning)
-        for name, value in ({"COLUMNS": "200"} | extra).items():
-            patch.setenv(name, value)
+    with started("caviar_clients", *arguments, mark=mark, stderr=subprocess.PIPE, **extra) as process:
         try:
-            main()
-        except SystemExit as ended:
-            status = int(ended.code or 0)
+            said, errors = process.communicate(timeout=timeout)
         finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-    return Finished(status, output.getvalue(), Path())
+            process.kill()
+    return Finished(process.returncode, said + errors, Path(), marked(mark))
+
+
+def started(
+    *words: str | Path, mark: str, stderr: int = subprocess.STDOUT, **extra: str
+) -> subprocess.Popen[str]:
+    """Start ``python -m`` with these words in the checkout.
+
+    It is a fork of a process that has imported the command. Where its environment has something of its own,
+    which may be read when it is loaded, it is a new interpreter.
+    """
+    command = [sys.executable, "-m", *map(str, words)]
+    given: dict[str, Any] = {"env": environment(mark, **extra), "stdout": subprocess.PIPE, "stderr": stderr}
+    given |= {"text": True, "cwd": ROOT}
+    return subprocess.Popen(command, **given) if extra else Forked(command, PRELOAD, **given)
 
 
 def run_as_printed(command: Sequence[str | Path], folder: Path) -> str:
@@ -124,7 +117,7 @@ def _shown(line: str) -> re.Pattern[str]:
     return re.compile(r"\s+".join(words))
 
 
-def run(scenario: Path, out: Path, *arguments: str | Path, timeout: float = 60.0, **extra: str) -> Finished:
+def run(scenario: Path, out: Path, *arguments: str | Path, timeout: float = 120.0, **extra: str) -> Finished:
     """``caviar run`` into an empty folder; the run's own directory is found there."""
     finished = caviar("run", scenario, "--out", out, *arguments, timeout=timeout, **extra)
     finished.directory = next(iter(sorted(out.glob("*/"))), Path())
@@ -137,15 +130,7 @@ def running(
 ) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """``caviar run`` as a process that can be disturbed, and the mark of its descendants."""
     mark = uuid.uuid4().hex
-    command = [sys.executable, "-m", "caviar_clients", "run", str(scenario), "--out", str(out), *arguments]
-    process = subprocess.Popen(
-        command,
-        env=environment(mark, **extra),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=ROOT,
-    )
+    process = started("caviar_clients", "run", scenario, "--out", out, *arguments, mark=mark, **extra)
     try:
         yield process, mark
     finally:

@@ -115,6 +115,7 @@ def test_an_environment_beside_the_experiment_is_trained_in_every_process(tmp_pa
         assert [policy is not None for _, policy in sorted(found.items())] == [is_exported] * 2
 
 
+@pytest.mark.exhaustive
 def test_ctrl_c_ends_all_seeds_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     file = written(tmp_path, steps=2000)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from broker_harness import MS, PAIR, PATIENCE_S, Serving, plan, serving
+from forked import Forked
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
@@ -25,6 +26,8 @@ from caviar_protocol.digest import payload_digest
 
 M = TypeVar("M", bound=m.Message)
 CAVIAR = Subprotocol("caviar.v1")
+GATEWAY = ("caviar_broker.http.app", "caviar_broker.http.gateway", "caviar_broker.http.server")
+"""What the process imports that serves HTTP."""
 START_S = 60.0
 """[s] that the HTTP process may take to start: on a busy machine its libraries take long to load."""
 
@@ -89,7 +92,7 @@ def site(
     waits = {"connect": int(START_S * 1000) * MS} | (limits or {})
     planned = plan(*(services or PAIR), limits=waits, **run)
     with serving(planned, tmp_path, desk=tmp_path) as broker:
-        process = subprocess.Popen(command, stderr=subprocess.PIPE)
+        process = Forked(command, GATEWAY, stderr=subprocess.PIPE)
         try:
             yield Site(broker, process, port_of(tmp_path, process), tmp_path)
         finally:

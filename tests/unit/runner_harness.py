@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 import zmq
+from forked import Forked
 
 from caviar_protocol import messages as m
 from caviar_protocol.codec import check_parts, decode_message, encode_message
@@ -148,8 +149,13 @@ def service(
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     if cache is not None:
         environment["XDG_CACHE_HOME"] = str(cache)
-    process = subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    process = Forked(
+        command,
+        ("caviar_services.runner",),
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     with process:
         try:

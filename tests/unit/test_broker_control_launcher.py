@@ -170,7 +170,7 @@ def test_a_launcher_that_does_not_read_slows_nothing_down(tmp_path: Path, pipe: 
         for _ in range(2000):
             world.answer()
         sensors.answer()
-        thread.join(10)
+        thread.join(60)
     assert not thread.is_alive()
     assert server.statistics.frames == 2000
     found: list[dict[str, Any]] = []
@@ -178,7 +178,7 @@ def test_a_launcher_that_does_not_read_slows_nothing_down(tmp_path: Path, pipe: 
     reader.start()
     reporter.finished(digest="abc")
     os.close(pipe[1])
-    reader.join(10)
+    reader.join(60)
     told = [
         line["frame"] for line in found if line["event"] == "notice" and line["kind"] in ("miss", "skipped")
     ]

@@ -73,10 +73,10 @@ def test_questions_and_orders(tmp_path: Path) -> None:
         assert http.process.wait(PATIENCE_S) == 0, "it ends with the broker"
 
 
-@pytest.mark.parametrize("path", ["/step?frames=0", "/step?frames=x", "/step?frames=1e9", "/stop?reason="])
-def test_an_order_that_makes_no_sense_is_refused(tmp_path: Path, path: str) -> None:
+def test_an_order_that_makes_no_sense_is_refused(tmp_path: Path) -> None:
     with site(tmp_path) as http:
-        assert http.post(path).status == 422
+        for path in ("/step?frames=0", "/step?frames=x", "/step?frames=1e9", "/stop?reason="):
+            assert http.post(path).status == 422, path
         assert http.get("/status").json["state"] == "joining"
 
 

@@ -186,8 +186,12 @@ def sources() -> Iterator[tuple[str, str]]:
             yield ".".join(parts).removesuffix(".__init__"), file.read_text()
 
 
-def test_the_examples_of_docstrings_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_of_docstrings_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, pytestconfig: pytest.Config
+) -> None:
     monkeypatch.chdir(folder)
+    heap = pytestconfig.pluginmanager.get_plugin("frozen-heap")
+    assert heap is not None
     finder, runner = doctest.DocTestFinder(exclude_empty=True), doctest.DocTestRunner(verbose=False)
     ran = set()
     for name in [name for name, text in sources() if ">>> " in text]:
@@ -196,6 +200,7 @@ def test_the_examples_of_docstrings_run(folder: Path, monkeypatch: pytest.Monkey
                 test.globs = {**test.globs, **GIVEN.get(test.name, dict)()}
                 assert not runner.run(test, out=sys.stdout.write).failed, f"the example of {test.name}"
                 ran.add(test.name)
+        heap.freeze()
     assert "caviar_protocol.recording" in ran
 
 

@@ -76,7 +76,7 @@ def fly(made: FlightWorld, command: Command | None, frames: int, first: int = 1)
 
 
 @given(points, st.floats(0.5, 30.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_a_waypoint_is_reached_without_passing_it_or_any_limit(target: Vector, speed: float) -> None:
     """The way there is straight: no place is farther from the target than the one before."""
     made = world()

@@ -545,7 +545,8 @@ def moved(scene: Scene, before: Scene) -> Iterator[tuple[float, float]]:
 @pytest.mark.parametrize(
     ("model", "person_steps"),
     [
-        ("striping", 3_000),
+        ("striping", 600),
+        pytest.param("striping", 3_000, marks=pytest.mark.exhaustive),
         pytest.param("striping", 41_000, marks=pytest.mark.exhaustive),
         pytest.param("jupedsim", 41_000, marks=pytest.mark.exhaustive),
         pytest.param("nonInteracting", 41_000, marks=pytest.mark.exhaustive),
