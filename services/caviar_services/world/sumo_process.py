@@ -44,7 +44,7 @@ def load_libsumo() -> ModuleType:
     try:
         with redirect_stdout(
             sys.stderr
-        ):  # it prints a remark beside a pyarrow; standard output is for results
+        ):  # it may print a remark about pyarrow
             import libsumo
     except ImportError as error:
         raise SetupError(
