@@ -42,9 +42,7 @@ def load_libsumo() -> ModuleType:
         SetupError: It is not installed; says the command that installs it.
     """
     try:
-        with redirect_stdout(
-            sys.stderr
-        ):  # it may print a remark about pyarrow
+        with redirect_stdout(None):  # a remark about pyarrow, which only its outputs would need
             import libsumo
     except ImportError as error:
         raise SetupError(
