@@ -13,7 +13,7 @@ import zmq
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.geometry import GEOMETRY, has_capability
+from caviar_broker.core.mesh_changes import GEOMETRY, has_capability
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
@@ -169,7 +169,7 @@ class AssetExchange:
         self.note(service, f"is ready, but {len(owed)} files of its scenery are due, {owed[0].name!r} first")
 
     def holds_back(self, event: ev.DoneReceived) -> bool:
-        """Whether a DONE of a world has to wait for the meshes that it, or the one before, announces.
+        """Return whether a DONE of a world has to wait for the meshes that it, or the one before, announces.
 
         Args:
             event: With the DONE. It is fed to the clock once the meshes are here.
@@ -186,7 +186,7 @@ class AssetExchange:
         return True
 
     def _may_announce(self, service: str, message: m.Done) -> bool:
-        """Whether meshes of a DONE may be used; else the clock says why not."""
+        """Return whether meshes of a DONE may be used; else the clock says why not."""
         member = self.clock.member(service)
         return (
             member is not None
@@ -219,7 +219,7 @@ class AssetExchange:
         self._answers.pop(service, None)
 
     def handle_error(self, service: str, error: m.Error) -> bool:
-        """Whether an ERROR says that a world does not have what it offered; then the run ends."""
+        """Return whether an ERROR says that a world does not have what it offered; then the run ends."""
         for asset in self._owed(service):
             if asset.digest == error.subject:
                 text = f"offered {asset.name!r} and cannot deliver it: {error.message}"

@@ -1,6 +1,6 @@
 """Connections of a run: whose each one is, and the answer to those who have no place in it.
 
-The one ROUTER port of a broker: parts in, parts out, and never a wait of more than a millisecond.
+`Router` is the one ROUTER port of a broker: parts in, parts out, and never a wait of more than a millisecond.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def free_endpoints(endpoint: str) -> Iterator[str]:
 
 
 def is_assigned(route: bytes) -> bool:
-    """Whether a routing id is ROUTER's choice, and not the peer's: a zero byte and four others.
+    """Return whether a routing id is ROUTER's choice, and not the peer's: a zero byte and four others.
 
     libzmq counts these from a random number, so a peer does not hit upon another's.
     """
@@ -143,7 +143,7 @@ class Router:
 
     @property
     def readable(self) -> bool:
-        """Whether a message is here; cheaper than `receive` where there is none."""
+        """True if a message is here; cheaper than `receive` where there is none."""
         # 2.8 µs. Asking for EVENTS takes 4.4 µs, since pyzmq makes an enumeration of each option's number; an
         # exception of `receive` takes 7.6 µs.
         return bool(zmq_poll(self._polled, 0))

@@ -206,7 +206,7 @@ class Standby:
 
     @property
     def calling(self) -> bool:
-        """Whether nothing may be called: a call is under way, or the standby runs a turn."""
+        """True if nothing may be called: a call is under way, or the standby runs a turn."""
         # A call may end while the standby is in a turn. One that it made itself then would give the loop back
         # to the leader, and never end: the leader calls nothing before it knows what came of that call.
         return self.calling_since is not None or self._relieved

@@ -289,7 +289,7 @@ class JournalFile:
 
     @property
     def is_long(self) -> bool:
-        """Whether it is time to compact."""
+        """True if it is time to compact."""
         return self.size >= max(COMPACT_BYTES + self._compacted_size, 2 * self._compacted_size)
 
     def compact(self, snapshot: Snapshot) -> None:
@@ -445,7 +445,7 @@ class JournalWriter:
 
     @property
     def wants_snapshot(self) -> bool:
-        """Whether the journal is to be compacted."""
+        """True if the journal is to be compacted."""
         return self._file.is_long
 
     def write(

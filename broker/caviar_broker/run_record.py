@@ -191,7 +191,7 @@ if TYPE_CHECKING:
 
 
 def has_recording(directory: Path) -> bool:
-    """Whether there is a file of a recording."""
+    """Return whether there is a file of a recording."""
     return bool(RunDirectory(directory).segments())
 
 

@@ -35,7 +35,7 @@ class LocalProcess:
 
     @property
     def stopped(self) -> bool:
-        """Whether it is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+        """True if it is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
         return is_stopped(self.pid)
 
     def close(self) -> None:
@@ -60,7 +60,7 @@ def watch(pid: int) -> LocalProcess | None:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
+    """Return whether a process is stopped by a signal (SIGSTOP, SIGTSTP), so that it cannot answer."""
     fields = _stat(pid)
     return fields is not None and fields[0] == "T"
 

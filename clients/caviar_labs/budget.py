@@ -20,7 +20,8 @@ from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan, ServicePlan, plan_run
 from caviar_broker.core.transitions import RunState
-from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, timings_of
+from caviar_clients.replay.recorded import RecordedRun
+from caviar_labs.latencies import Timing, measured_rate, timings_of
 from caviar_protocol import messages as m
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import RunError

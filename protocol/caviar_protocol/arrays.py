@@ -44,7 +44,7 @@ MAX_DIMENSIONS = 6
 
 
 class ArrayField(msgspec.Struct, frozen=True):
-    """What an array field of a payload promises.
+    """Promise of an array field of a payload.
 
     Args:
         dtype: Element type as it stands in a header, a key of `WIRE_DTYPES`.

@@ -74,7 +74,7 @@ class AssetStore:
             ) from error
 
     def holds(self, asset: Asset) -> bool:
-        """Whether the whole file is here, with the size and content of its description.
+        """Return whether the whole file is here, with the size and content of its description.
 
         Args:
             asset: Description of the file.
@@ -309,7 +309,7 @@ def mesh_name(content: bytes) -> str:
 
 
 def is_mesh_name(name: str) -> bool:
-    """Whether a name is that of a mesh that a world announces while the run goes on.
+    """Return whether a name is that of a mesh that a world announces while the run goes on.
 
     Args:
         name: Of an asset.

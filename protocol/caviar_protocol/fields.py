@@ -117,7 +117,7 @@ Policy = Literal["wait", "hold", "drop", "abort"]
 
 # Members are strings, so that they stand on the wire and in texts as they are.
 class Status(StrEnum):
-    """What became of a product (contract, clauses 9 to 12)."""
+    """Fate of a product (contract, clauses 9 to 12)."""
 
     FRESH = "fresh"
     """Computed for the frame it is used in."""

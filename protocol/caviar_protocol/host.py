@@ -209,7 +209,7 @@ _MODULES = {
 
 
 def has_extra(extra: str) -> bool:
-    """Whether the libraries of an extra can be imported; they are not imported for that.
+    """Return whether the libraries of an extra can be imported; they are not imported for that.
 
     Args:
         extra: Name of an extra: ``channel``, ``sensors``, ``world``, ``datasets``, ``learning``, ``plot``,

@@ -94,7 +94,7 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     """Of the token's text; the token itself is written nowhere."""
 
     def may(self, role: str) -> bool:
-        """Whether the token is good for what a viewer, a trainer or an operator does.
+        """Return whether the token is good for what a viewer, a trainer or an operator does.
 
         Args:
             role: `VIEWER`, `TRAINER` or `OPERATOR`.
@@ -103,7 +103,7 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
 
     @property
     def of_service(self) -> bool:
-        """Whether a service takes part with it."""
+        """True if a service takes part with it."""
         return self.role in ROLES
 
 

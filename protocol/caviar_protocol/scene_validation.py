@@ -39,7 +39,7 @@ SAME_ROTATION = 1e-6
 
 
 class SceneRules(msgspec.Struct, frozen=True, kw_only=True):
-    """What the run says about the scenes of its worlds; what is not known is not checked.
+    """Rules for the scenes of the run's worlds; what is not known is not checked.
 
     Example:
         >>> from caviar_protocol.recording import Recording
@@ -60,7 +60,8 @@ class SceneRules(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def numbers_are_right(scene: Scene) -> bool:
-    """Whether `wrong_number` would find nothing, for a few microseconds; True is certain, False is not.
+    """Return whether `wrong_number` would find nothing, for a few microseconds; True is certain, False is
+    not.
 
     A sum of squares bounds every term of it, and is no number where one of them is none.
 

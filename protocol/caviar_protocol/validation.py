@@ -3,10 +3,8 @@
 The broker never looks into a payload, and a decoder checks types and shapes only. What a service
 consumes therefore passes through one `ContentCheck` before the service sees it: a product with a
 quaternion of norm 2, a negative dimension, a name twice or a number that is none is refused in the first
-frame, and the error names the service that made it. `scene_validation` looks at scenes, `part_validation` at
+frame, and the error names the service that made it. `scene_validation` looks at scenes, `PartCheck` at
 the parts that were asked for.
-
-Validation of the parts of products: whether those are there that consumers asked for, in the right shape.
 
 A producer computes a part where a consumer asks for it (contract, clause 5). Nothing but `PartCheck` notices
 one that leaves a part out, or that fills it for another numerology or other arrays.
@@ -174,7 +172,7 @@ def _undelivered(part: str) -> str:
 
 
 def _has_shape(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    """Whether a shape is as expected, as far as that is known."""
+    """Return whether a shape is as expected, as far as that is known."""
     return len(shape) == len(expected) and all(b in (a, None) for a, b in zip(shape, expected, strict=True))
 
 
@@ -198,7 +196,7 @@ _MAX_TAP = 2**53
 
 
 class ContentRules(SceneRules, frozen=True, kw_only=True):
-    """What the run says about products, beside scenes; what is not known is not checked."""
+    """Rules for products, beside scenes; what is not known is not checked."""
 
     carriers: tuple[Carrier, ...] = ()
     """Of the scenario."""
@@ -251,7 +249,7 @@ class ContentCheck:
         )
 
     def is_due(self, entry: GrantInput) -> bool:
-        """Whether this consumer has to look at a product."""
+        """Return whether this consumer has to look at a product."""
         return not (entry.frame in self._derived and entry.topic == "scene" and self._is_familiar(entry))
 
     def digest(self, entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
@@ -430,7 +428,7 @@ def wrong_action(action: Action) -> str:
 
 @cache
 def _has_numbers(cls: type[msgspec.Struct]) -> bool:
-    """Whether a command has more than names and indices, as that for a beam has not."""
+    """Return whether a command has more than names and indices, as that for a beam has not."""
     return any(hint not in (str, int, bool) for hint in get_type_hints(cls).values())
 
 

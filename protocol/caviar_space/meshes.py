@@ -16,7 +16,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -124,12 +124,16 @@ def object_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
         ['', 'objects/box.ply']
     """
     meshes = {"": unit_box()}
-    for name in sorted(files):
-        if PurePosixPath(name).match("objects/*.ply"):
-            vertices, faces = read_ply(files[name], f"mesh {name!r}")
-            check_unit_box(vertices, f"mesh {name!r}")
-            meshes[name] = Mesh(vertices, faces.astype(np.int32))
+    for name in filter(is_object_mesh, sorted(files)):
+        vertices, faces = read_ply(files[name], f"mesh {name!r}")
+        check_unit_box(vertices, f"mesh {name!r}")
+        meshes[name] = Mesh(vertices, faces.astype(np.int32))
     return meshes
+
+
+def is_object_mesh(name: str) -> bool:
+    """Test whether an asset is the mesh of an object, by its name."""
+    return name.startswith("objects/") and name.endswith(".ply")
 
 
 def shown_asset(asset: str, meshes: Container[str]) -> str:

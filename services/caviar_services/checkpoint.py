@@ -22,7 +22,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class _Envelope(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What stands around a state."""
+    """Envelope around a state."""
 
     format: Literal["caviar-state-1"]
     implementation: str
@@ -38,7 +38,7 @@ class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     """An array inside a state, C order.
 
     Example:
-        >>> Packed.of(np.array([1.0, 2.0]), "<f8").array(np.float64).tolist()
+        >>> Packed.pack(np.array([1.0, 2.0]), "<f8").array(np.float64).tolist()
         [1.0, 2.0]
     """
 
@@ -47,7 +47,7 @@ class Packed(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields
     data: bytes
 
     @classmethod
-    def of(cls, array: NDArray[Any], dtype: Literal["<f8", "<i8", "<i4"]) -> Packed:
+    def pack(cls, array: NDArray[Any], dtype: Literal["<f8", "<i8", "<i4"]) -> Packed:
         """Pack an array.
 
         Args:

@@ -258,7 +258,7 @@ class Connection:
         self._context.term()
 
     def _next(self) -> tuple[m.Message, Sequence[zmq.Frame]] | None:
-        """What comes within `POLL_MS`, unless it is nothing, or nonsense, which is answered."""
+        """Message that comes within `POLL_MS`, unless it is nothing, or nonsense, which is answered."""
         receive = self._socket.recv
         try:
             part = receive(0, False)

@@ -129,7 +129,7 @@ def run_info(
 
 
 def is_needed(service: Service[Any], order: m.Prepare) -> bool:
-    """Whether a consumer wants what the service makes, or the service is there for its own sake.
+    """Return whether a consumer wants what the service makes, or the service is there for its own sake.
 
     Args:
         service: The service.
@@ -441,7 +441,7 @@ class Answers:
         self._bytes, self._newest = 0, newest
 
     def is_new(self, frame: int) -> bool:
-        """Whether a frame comes after all that were answered.
+        """Return whether a frame comes after all that were answered.
 
         Args:
             frame: Number of the frame.

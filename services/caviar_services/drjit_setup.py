@@ -1,4 +1,4 @@
-"""What Dr.Jit, the compiler of the ray tracer, needs: an LLVM library, threads, and aligned arrays.
+"""Needs of Dr.Jit, the compiler of the ray tracer: an LLVM library, threads, and aligned arrays.
 
 Without a CUDA device Dr.Jit needs a libLLVM shared library, which pip does not bring. Left alone it takes
 the first that it finds; with versions before 16 the process aborts at its first kernel on machines with

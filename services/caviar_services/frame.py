@@ -58,7 +58,7 @@ class FrameInput:
 
     @property
     def present(self) -> bool:
-        """Whether there is a payload: fresh, held or late."""
+        """True if there is a payload: fresh, held or late."""
         return self.provenance.status is not _ABSENT
 
     @property
@@ -214,7 +214,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StepResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a service made of a frame.
+    """Result of a service's step in a frame.
 
     Example:
         >>> StepResult(counts={"users-without-path": 2}, fidelity="ray-traced").end_episode

@@ -80,7 +80,7 @@ class PatternTable:
 
     @property
     def is_field(self) -> bool:
-        """Whether the values are fields."""
+        """True if the values are fields."""
         return self.values.ndim == 3
 
     @property

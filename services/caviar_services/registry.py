@@ -325,7 +325,7 @@ def _describe(definition: dict[str, Any], cls: type[msgspec.Struct]) -> None:
 def _conditions(
     definition: Mapping[str, Any], by_implementation: Mapping[tuple[str, str], Any]
 ) -> list[dict[str, Any]]:
-    """What ``use`` may name for each role, and the keys of ``settings`` for each implementation.
+    """Names that ``use`` may have for each role, and the keys of ``settings`` for each implementation.
 
     A table without ``role``, such as a rung of the adaptive channel, uses channel models.
     """

@@ -81,7 +81,7 @@ class Replayer(Service[ReplaySettings]):
 
     @classmethod
     def changes_geometry_with(cls, settings: Mapping[str, object]) -> bool:
-        """Whether meshes came while the run went on.
+        """Return whether meshes came while the run went on.
 
         Args:
             settings: As they stand in the scenario.
@@ -109,7 +109,7 @@ class Replayer(Service[ReplaySettings]):
         return Prepared(notes=(f"as recorded in {recording.path}",), seed=wished)
 
     def step(self, frame: Frame) -> StepResult:
-        """What the service made of this frame. `RecordingError` where the frame was not recorded."""
+        """Give what the service made of this frame. `RecordingError` where the frame was not recorded."""
         # The recording ends with the last frame; the agent's extra grant after it was not recorded.
         if frame.final:
             # Seed that the agents of the recorded run chose; −1 where the one before went on.

@@ -24,7 +24,7 @@ from caviar_services.service import Service
 
 
 class FetchedFile(NamedTuple):
-    """What came of a file."""
+    """Outcome of the fetch of a file."""
 
     digest: str
     path: Path | None
@@ -89,7 +89,7 @@ class AssetFetcher:
 
     @property
     def name(self) -> str:
-        """What the file that is fetched is called in errors: ``asset 'scenery/town.xml'``."""
+        """Name of the fetched file in errors: ``asset 'scenery/town.xml'``."""
         return str(self._waiting[0])
 
     def fetch(self, files: Sequence[str | m.Asset], fetched: Fetched, now: float) -> None:
@@ -169,7 +169,7 @@ class AssetFetcher:
 
 
 class AnnouncedMeshes:
-    """What a world announced last.
+    """Meshes that a world announced last.
 
     Args:
         store: Where the files go, for the broker to fetch.
@@ -191,7 +191,7 @@ class AnnouncedMeshes:
         self._known.clear()
 
     def change(self, frame: int, result: StepResult) -> m.GeometryChange | None:
-        """What DONE says of meshes; None where the step said nothing.
+        """Change of meshes for DONE; None where the step said nothing.
 
         Args:
             frame: That was computed.
@@ -224,7 +224,7 @@ class _Order:
 
 
 class FollowedMeshes:
-    """Which meshes a service uses, and which it has been sent for later frames.
+    """Meshes that a service uses, and those sent to it for later frames.
 
     Args:
         store: Where the files are.

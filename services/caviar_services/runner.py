@@ -110,7 +110,7 @@ class Runner:
 
     @property
     def failed(self) -> bool:
-        """Whether the service failed itself, and said so with a FAULT."""
+        """True if the service failed itself, and said so with a FAULT."""
         return self._session.failed
 
     def run(self) -> int:

@@ -70,7 +70,7 @@ def no_orders() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
-    """What a service knows about the run it is part of.
+    """Facts about the run that a service is part of.
 
     In a run the runner makes it of WELCOME; a test of a service makes its own.
 
@@ -110,7 +110,7 @@ class RunInfo:
 
     @property
     def settings_place(self) -> Place:
-        """Where the service's settings stand, for errors; the broker adds file and line."""
+        """Place of the service's settings, for errors; the broker adds file and line."""
         return (
             Place(self.settings_key) if self.settings_key else Place("services").at(self.name).at("settings")
         )
@@ -118,7 +118,8 @@ class RunInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class Preparation:
-    """What a service learns before its first frame: which of its products are wanted, and where files are.
+    """Facts that a service learns before its first frame: which of its products are wanted, and where files
+    are.
 
     Example:
         >>> preparation = Preparation(demand={"channel": frozenset({"h"})})
@@ -140,7 +141,7 @@ class Preparation:
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """What a service declares once it is prepared. The runner adds the digest of the geometry for READY.
+    """Declaration of a service once it is prepared. The runner adds the digest of the geometry for READY.
 
     Example:
         >>> Prepared(actuators=("beam:car.*",), notes=("model of 2026-11",)).prefixes
@@ -245,7 +246,7 @@ class Service(ABC, Generic[S]):
 
     @classmethod
     def computes_batches(cls, settings: Mapping[str, object]) -> bool:
-        """Whether many episodes can be computed at once by this implementation (`batches`).
+        """Return whether many episodes can be computed at once by this implementation (`batches`).
 
         Args:
             settings: As they stand in the scenario: some of an implementation may be left to single episodes.
@@ -255,7 +256,7 @@ class Service(ABC, Generic[S]):
 
     @classmethod
     def changes_geometry_with(cls, settings: Mapping[str, object]) -> bool:
-        """Whether a world may announce meshes while the run goes on.
+        """Return whether a world may announce meshes while the run goes on.
 
         Args:
             settings: As they stand in the scenario: not every world of a class does.
@@ -264,7 +265,7 @@ class Service(ABC, Generic[S]):
 
     @classmethod
     def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
-        """What the implementation consumes beside `inputs`, by its settings.
+        """Inputs of the implementation beside `inputs`, by its settings.
 
         Args:
             settings: As they stand in the scenario.
@@ -273,7 +274,7 @@ class Service(ABC, Generic[S]):
 
     @property
     def needs_assets(self) -> bool:
-        """Whether the assets of the run are fetched before `prepare`: where the class uses scenery, or what
+        """True if the assets of the run are fetched before `prepare`: where the class uses scenery, or what
         it is to do in this run needs files."""
         return self.uses_scenery
 
@@ -412,7 +413,7 @@ T = TypeVar("T")
 
 
 def returned(cls: type[T], value: object, service: object, method: str) -> T:
-    """What a method of a service returned, where it is what it has to be.
+    """Check that a method of a service returned what it has to, and give it.
 
     Args:
         cls: What it has to be.

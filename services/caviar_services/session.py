@@ -151,7 +151,7 @@ class ServiceSession:
 
     @property
     def joined(self) -> bool:
-        """Whether WELCOME came."""
+        """True if WELCOME came."""
         return bool(self._identity)
 
     @property
@@ -162,7 +162,7 @@ class ServiceSession:
 
     @property
     def deadline(self) -> float | None:
-        """When `expire` is due, on the clock of ``now`` [s]; None while nothing is awaited."""
+        """Time at which `expire` is due, on the clock of ``now`` [s]; None while nothing is awaited."""
         both = (self._scenery.deadline, self._files.deadline)
         return min((due for due in both if due is not None), default=None)
 

@@ -113,4 +113,4 @@ def test_a_world_passes_where_its_meshes_are_announced_and_can_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: type[Engine], outcome: str
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert judged(EngineWorld.of(engine()), "run-time-meshes") == {"run-time-meshes": outcome}
+    assert judged(EngineWorld.for_engine(engine()), "run-time-meshes") == {"run-time-meshes": outcome}

@@ -12,9 +12,10 @@ import pytest
 from recording_builders import record_run
 from rich.console import Console
 
-from caviar_clients.replay.recorded import RecordedRun, Timing, measured_rate, outcomes_of, timings_of
+from caviar_clients.replay.recorded import RecordedRun
 from caviar_labs.budget import forecast, rounded_up
 from caviar_labs.cli.measure import budget_run, forecast_lines
+from caviar_labs.latencies import Timing, measured_rate, outcomes_of, timings_of
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import Recording

@@ -16,7 +16,7 @@ PLACE = Place("services.link.settings.traffic[1]")
 
 def test_constant_traffic_sends_each_packet_as_soon_as_it_is_whole() -> None:
     """0.3 packets a slot, of a size at which sums of floats miss whole numbers."""
-    offered = Offered.of(Traffic(model="constant", rate_bit_s=3e6, packet_bits=10_000))
+    offered = Offered.for_traffic(Traffic(model="constant", rate_bit_s=3e6, packet_bits=10_000))
     found = arrivals(offered, 0, 100_000, 1e-3, None)
     whole = (3 * np.arange(1, 100_001)) // 10
     assert (np.cumsum(found) == whole).all()
@@ -24,7 +24,7 @@ def test_constant_traffic_sends_each_packet_as_soon_as_it_is_whole() -> None:
 
 
 def test_poisson_traffic_has_its_mean_and_variance() -> None:
-    offered = Offered.of(Traffic(model="poisson", rate_bit_s=24e6, packet_bits=12_000))
+    offered = Offered.for_traffic(Traffic(model="poisson", rate_bit_s=24e6, packet_bits=12_000))
     found = arrivals(offered, 0, 200_000, 1e-3, np.random.default_rng(1))
     assert found.mean() == pytest.approx(2.0, rel=0.01)
     assert found.var() == pytest.approx(2.0, rel=0.02)
@@ -34,7 +34,7 @@ def test_alternating_traffic_begins_dense_and_changes_every_period() -> None:
     traffic = Traffic(
         model="alternating", rate_bit_s=9e6, light_rate_bit_s=1e6, period_s=0.5, packet_bits=1000
     )
-    offered = Offered.of(traffic)
+    offered = Offered.for_traffic(traffic)
     instants = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 100.0, 100.25])
     expected = [0.0, 2250.0, 4500.0, 4750.0, 5000.0, 9500.0, 500_000.0, 502_250.0]
     np.testing.assert_allclose(offered.packets(instants), expected, rtol=1e-12)
@@ -49,7 +49,7 @@ def written(folder: Path, text: str) -> str:
 
 def test_a_trace_holds_each_rate_until_the_next(tmp_path: Path) -> None:
     file = written(tmp_path, "# of a camera\nt_s,rate_bit_s\n1, 2e3\n\n2.5,0\n4,1000\n")
-    offered = Offered.of(Traffic(model="trace", file=file, packet_bits=1000))
+    offered = Offered.for_traffic(Traffic(model="trace", file=file, packet_bits=1000))
     expected = [0.0, 0.0, 1.0, 3.0, 3.0, 3.0, 9.0]
     assert offered.packets(np.array([0.0, 1.0, 1.5, 2.5, 3.0, 4.0, 10.0])).tolist() == expected
     assert arrivals(offered, 0, 5, 1.0, None).tolist() == [0, 2, 1, 0, 1]

@@ -25,7 +25,7 @@ class Older(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 NUMBERS = np.array([[1.5, -0.0, np.inf], [1e-310, 2.0**0.5, -7.0]])
-STATE = Kept(numbers=Packed.of(NUMBERS, "<f8"), order={"b": 2, "a": 1})
+STATE = Kept(numbers=Packed.pack(NUMBERS, "<f8"), order={"b": 2, "a": 1})
 
 
 def pilot(name: str = "pilot", speed: float = 6.0, **run: Any) -> WaypointsAgent:
@@ -44,7 +44,7 @@ def test_what_was_saved_comes_back_bit_by_bit() -> None:
 
 def test_equal_states_give_equal_bytes() -> None:
     """Whatever order a mapping was filled in."""
-    other = Kept(numbers=Packed.of(np.asfortranarray(NUMBERS), "<f8"), order={"a": 1, "b": 2})
+    other = Kept(numbers=Packed.pack(np.asfortranarray(NUMBERS), "<f8"), order={"a": 1, "b": 2})
     assert saved(pilot(), 1, other) == saved(pilot(), 1, STATE)
 
 

@@ -62,7 +62,7 @@ class Yard(Engine):
 
 def world(engine: Engine, max_faces: int = 100, **run: Any) -> EngineWorld:
     """A world in its first episode."""
-    made = EngineWorld.of(engine)(WorldSettings(), RunInfo(name="world", **run))
+    made = EngineWorld.for_engine(engine)(WorldSettings(), RunInfo(name="world", **run))
     made.scenery()
     made.prepare(Preparation(demand={}, max_faces=max_faces))
     made.reset(0, 7, 5_000_000_000)

@@ -57,7 +57,7 @@ class LogFile:
 
     @property
     def failed(self) -> bool:
-        """Whether it takes no more lines."""
+        """True if it takes no more lines."""
         return bool(self._error)
 
     @property
@@ -152,7 +152,7 @@ class Outbox:
 
     @property
     def waiting(self) -> bool:
-        """Whether something has not been taken yet."""
+        """True if something has not been taken yet."""
         return bool(self._pending) or self._behind is not None
 
     def notice(self, line: Line) -> None:

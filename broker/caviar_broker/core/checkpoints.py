@@ -63,7 +63,7 @@ class CheckpointHistory:
         self.size += sum(payload_size(product.payload) for product in grant.order.products)
 
     def is_due(self, period: int) -> bool:
-        """Whether it is time to save the state, at the latest after ``period`` frames."""
+        """Return whether it is time to save the state, at the latest after ``period`` frames."""
         # The second bound is for large products: what is granted again is kept in memory until then.
         return len(self.grants) >= period or self.size > MAX_HISTORY_BYTES
 
@@ -154,7 +154,7 @@ class Checkpoints:
     # --- saving --------------------------------------------------------------------------------------
 
     def is_due(self, member: Member) -> bool:
-        """Whether a service shall save its state before it is granted anything more."""
+        """Return whether a service shall save its state before it is granted anything more."""
         history = self.histories.get(member.name)
         return history is not None and history.is_due(self._run.plan.checkpoint_frames)
 
@@ -187,7 +187,7 @@ class Checkpoints:
         return True
 
     def concerns(self, member: Member, fault: Fault) -> bool:
-        """Whether a FAULT answers CHECKPOINT or RESTORE, and not a grant."""
+        """Return whether a FAULT answers CHECKPOINT or RESTORE, and not a grant."""
         history = self.histories.get(member.name)
         if history is None or fault.episode != self._run.episode:
             return False

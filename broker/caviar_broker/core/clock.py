@@ -166,7 +166,7 @@ class FrameClock:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended, although services may still be leaving."""
+        """True if the run has ended, although services may still be leaving."""
         return self._run.over
 
     @property
@@ -203,7 +203,7 @@ class FrameClock:
 
     @property
     def waits_for_journal(self) -> bool:
-        """Whether a grant waits for the journal to be written."""
+        """True if a grant waits for the journal to be written."""
         dispatcher = self._episodes.dispatcher
         return dispatcher is not None and dispatcher.waits_for_journal
 

@@ -1,6 +1,5 @@
-"""The table of an episode's decisions: each made once, in order, and entered in the journal.
-
-Budgets of an episode: when one is up, and what follows from that.
+"""The table of an episode's decisions, each made once, in order, and entered in the journal; and the budgets
+of an episode: when one is up, and what follows from that (`Deadlines`).
 """
 
 from __future__ import annotations
@@ -357,7 +356,7 @@ class Deadlines:
     # --- pace --------------------------------------------------------------------------------------
 
     def release(self, task: Task, now: int) -> bool:
-        """Whether the run is not paused, and real time has come to the task's frame (clause 8)."""
+        """Return whether the run is not paused, and real time has come to the task's frame (clause 8)."""
         if task.frame >= self._table.frames:
             return True
         if not self._gate.admits(task.frame, now):

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from caviar_broker.core.decisions import Deadlines, DecisionTable
 from caviar_broker.core.events import Product
-from caviar_broker.core.geometry import GeometryLedger
+from caviar_broker.core.mesh_changes import GeometryLedger
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import milliseconds
 from caviar_broker.core.run import Resumption, Run
@@ -215,7 +215,7 @@ class Dispatcher:
 
     @property
     def waits_for_journal(self) -> bool:
-        """Whether a service can be granted nothing before more entries of the ledger are safe."""
+        """True if a service can be granted nothing before more entries of the ledger are safe."""
         return bool(self._waiting_for_journal)
 
     def wake_for_journal(self) -> None:
@@ -314,7 +314,7 @@ class Dispatcher:
                 return
 
     def _is_turn(self, participant: Participant, frame: int) -> bool:
-        """Whether a service may have a frame; else it waits for others, or has nothing more to do.
+        """Return whether a service may have a frame; else it waits for others, or has nothing more to do.
 
         No agent runs ahead of one that may end the episode, and no recorder of what may be cut then.
         """
@@ -337,7 +337,8 @@ class Dispatcher:
         return True
 
     def _awaits_geometry(self, participant: Participant, frame: int) -> bool:
-        """Whether a frame waits until its service has loaded its meshes; one that may miss it need not."""
+        """Return whether a frame waits until its service has loaded its meshes; one that may miss it need
+        not."""
         if not participant.plan.is_indispensable:
             return False
         # One that is gone is sent the meshes again when it comes back, and its grants after them.
@@ -392,7 +393,7 @@ class Dispatcher:
 
     @property
     def finished(self) -> bool:
-        """Whether every frame is decided, final grants are answered, and no service is waited for."""
+        """True if every frame is decided, final grants are answered, and no service is waited for."""
         if not self._all_decided:
             return False
         return not any(p.outstanding and self._must_answer(p) for p in self._participants.values())
@@ -405,7 +406,7 @@ class Dispatcher:
         )
 
     def _must_answer(self, participant: Participant) -> bool:
-        """Whether the end of the episode waits for what a service still owes.
+        """Return whether the end of the episode waits for what a service still owes.
 
         After the last episode there is no RESET that it had to be ready for, so a service that the run can
         do without is not waited for.
@@ -424,7 +425,7 @@ class Dispatcher:
         return min(max(reached), self.table.frames - 1)
 
     def is_through(self, service: str) -> bool:
-        """Whether a service has nothing more to do in the episode."""
+        """Return whether a service has nothing more to do in the episode."""
         participant = self._participants[service]
         return participant.next_frame >= self.table.frames + (participant in self._agents)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from caviar_broker.core import events as ev
 from caviar_broker.core.checkpoints import Checkpoints, PayloadSize
 from caviar_broker.core.dispatch import Dispatcher
-from caviar_broker.core.geometry import GeometryLedger
+from caviar_broker.core.mesh_changes import GeometryLedger
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.errors import one_line

@@ -11,8 +11,8 @@ from collections.abc import Iterable
 
 from caviar_broker.core import events as ev
 from caviar_broker.core.episodes import Episodes
-from caviar_broker.core.geometry import GEOMETRY, GEOMETRY_SINCE, has_capability
 from caviar_broker.core.graph import build_graph, check_actuators, check_prefixes
+from caviar_broker.core.mesh_changes import GEOMETRY, GEOMETRY_SINCE, has_capability
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState
 from caviar_protocol.codec import check_version
@@ -254,7 +254,7 @@ class Registration:
             self._episodes.begin(now)
 
     def _accepted(self, member: Member, message: Ready, now: int) -> bool:
-        """Whether a READY agrees with what others hold and own; else the run ends (clauses 3 and 4)."""
+        """Return whether a READY agrees with what others hold and own; else the run ends (clauses 3, 4)."""
         # A service without geometry says none, and an empty digest is no contradiction.
         expected = geometry_digest(self._run.scenery())
         if member.role != "world" and message.geometry and message.geometry != expected:

@@ -40,7 +40,7 @@ class PauseGate:
         self.begun = -1
 
     def admits(self, frame: int, now: int) -> bool:
-        """Whether a frame may begin, or has begun, at the time ``now`` [ns]."""
+        """Return whether a frame may begin, or has begun, at the time ``now`` [ns]."""
         if self.closed and frame > self.begun:
             if not self.steps:
                 self._held_since = now if self._held_since is None else self._held_since
@@ -92,7 +92,8 @@ class Pacer:
         return slip
 
     def is_notable(self, slip: int) -> bool:
-        """Whether a slip [ns] is worth a notice of its own: more than a tenth of a period, in real time."""
+        """Return whether a slip [ns] is worth a notice of its own: more than a tenth of a period, in real
+        time."""
         return slip > self._real_ns(self._plan.sampling_period_ns) // 10
 
     def next_instant(self) -> int | None:

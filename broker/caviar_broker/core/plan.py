@@ -88,22 +88,22 @@ class ServicePlan:
 
     @cached_property
     def waits_for_answer(self) -> bool:
-        """Whether frames wait for it after its deadline."""
+        """True if frames wait for it after its deadline."""
         return self.policy == "wait"
 
     @cached_property
     def ends_run_when_late(self) -> bool:
-        """Whether the run ends at its deadline."""
+        """True if the run ends at its deadline."""
         return self.policy == "abort"
 
     @cached_property
     def is_indispensable(self) -> bool:
-        """Whether no frame goes on without its answer."""
+        """True if no frame goes on without its answer."""
         return self.waits_for_answer or self.ends_run_when_late
 
     @cached_property
     def holds_last_product(self) -> bool:
-        """Whether its newest product is held for frames that it misses."""
+        """True if its newest product is held for frames that it misses."""
         return self.policy == "hold"
 
 
@@ -165,11 +165,11 @@ class RunPlan:
 
     @property
     def remembers(self) -> bool:
-        """Whether services save their state."""
+        """True if services save their state."""
         return self.checkpoint_frames > 0 and not self.ephemeral
 
     def is_warm_up(self, service: ServicePlan, episode: int, frame: int) -> bool:
-        """Whether a service still compiles in a frame, which waits for it without a miss.
+        """Return whether a service still compiles in a frame, which waits for it without a miss.
 
         It is the run's first one, under ``wait``.
         """

@@ -90,7 +90,7 @@ class Member:
 
     @property
     def present(self) -> bool:
-        """Whether messages can reach it."""
+        """True if messages can reach it."""
         return self.state in PRESENT
 
     def __str__(self) -> str:
@@ -263,7 +263,7 @@ class Run:
             self._wished = before.wish[0], self.members[before.wish[1]]
 
     def takes_part(self, member: Member) -> bool:
-        """Whether the run needs a service: all until the graph is known, then those in it (clause 5)."""
+        """Return whether the run needs a service: all until the graph is known, then its own (clause 5)."""
         return self.graph is None or member.name in self.graph.inputs
 
     def scenery(self) -> tuple[Asset, ...]:

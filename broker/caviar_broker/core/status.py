@@ -147,7 +147,7 @@ def _service(member: Member, episodes: Episodes, now: int) -> ServiceStatus:
 
 
 def _wait(run: Run, episodes: Episodes, member: Member, now: int) -> Wait | None:
-    """Whether the run waits for a service, and the words for that."""
+    """Return whether the run waits for a service, and the words for that."""
     if not run.takes_part(member):
         return None
     # First what keeps the run from its end, then services that are not there, then those at work.

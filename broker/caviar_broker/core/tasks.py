@@ -162,7 +162,7 @@ class Participant:
         return found
 
     def has_decided(self, edge: Edge, frame: int) -> bool:
-        """Whether it is known what a consumer gets over one of this source's edges in a frame."""
+        """Return whether it is known what a consumer gets over one of this source's edges in a frame."""
         return frame - edge.lag < self.next_frame or frame < edge.lag
 
 

@@ -192,14 +192,14 @@ def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> Fas
 
     @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
     async def healthz() -> Any:
-        """Whether the broker answers. Needs no token."""
+        """Return whether the broker answers. Needs no token."""
         # Of `why` and not of `status`, which computes quantiles for every service.
         await ask(do="why")
         return {"ok": True}
 
     @app.get("/readyz", responses=_example("readyz") | _unready("services are missing or prepare"))
     async def readyz() -> Any:
-        """Whether all services are there and ready. Needs no token."""
+        """Return whether all services are there and ready. Needs no token."""
         state = (await ask(do="why"))["why"]["state"]
         return JSONResponse({"ready": state in READY}, 200 if state in READY else 503)
 

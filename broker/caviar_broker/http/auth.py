@@ -28,7 +28,7 @@ class Tokens:
 
     @property
     def exist(self) -> bool:
-        """Whether a token is asked for; from the first one on always, also when all are revoked."""
+        """True if a token is asked for; from the first one on always, also when all are revoked."""
         self._read()
         return self._stamp is not None
 
@@ -39,7 +39,7 @@ class Tokens:
         return self._by_digest.get(hashlib.sha256(text.encode()).hexdigest())
 
     def holds(self, token: Token) -> bool:
-        """Whether a token was not revoked."""
+        """Return whether a token was not revoked."""
         self._read()
         return self._by_digest.get(token.sha256) == token
 
@@ -106,7 +106,7 @@ def http_address(text: str, keys: Path | None) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address always means this machine.
+    """Return whether a host name or address always means this machine.
 
     Names are deliberately not resolved, other than ``localhost``: what a name stands for may change
     between this check and the bind, or be decided by who runs the name server, and then HTTP without
@@ -166,7 +166,7 @@ def token_of(headers: Mapping[str, str], tokens: Tokens, subprotocols: Iterable[
 
 
 def token_shown(headers: Mapping[str, str], subprotocols: Iterable[str]) -> bool:
-    """Whether a request shows a token, valid or not.
+    """Return whether a request shows a token, valid or not.
 
     Example:
         >>> token_shown({"authorization": "Bearer abc"}, []), token_shown({}, ["caviar"])

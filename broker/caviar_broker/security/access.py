@@ -31,7 +31,7 @@ LOOPBACK_INTERFACE = "lo"
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only processes of this machine can connect to what is bound to a ZeroMQ address.
+    """Return whether only processes of this machine can connect to what is bound to a ZeroMQ address.
 
     ``ipc://`` and ``inproc://`` are local, of ``tcp://`` the loopback addresses of IPv4 and IPv6, the
     loopback interface, and names of which every address is one of these. What cannot be resolved is not.

@@ -324,7 +324,7 @@ class PeerGuard:
         return found
 
     def _has_more(self, peer: _Peer) -> bool:
-        """Whether time has brought a peer new credit; otherwise it is cut off."""
+        """Return whether time has brought a peer new credit; otherwise it is cut off."""
         if peer.cut:
             return False
         if not peer.service:

@@ -16,10 +16,10 @@ from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 from caviar_clients.cli.shared import progress_bar
 from caviar_clients.files import file_in, make_folder_of, require_folder
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
-from caviar_clients.plots.map import MapData, Mark, View, chosen_beam, draw_map, receiver_mark, view_of
+from caviar_clients.plots.map import MapData, Mark, chosen_beam, draw_map, receiver_mark, view_of
 from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.packets import draw_traffic, packet_series
-from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, rays, scale, with_boxes
+from caviar_clients.plots.rays import Footprints, View, footprints, obstacle_boxes, rays, scale, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_grid, draw_scan, draw_view
 from caviar_clients.plots.style import common_prefix
 from caviar_clients.plots.user_curves import (

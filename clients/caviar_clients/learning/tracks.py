@@ -190,7 +190,7 @@ class _Reader:
         channel = next(iter(products.values()))
         self._scene = self._scene or scene
         figure, temperature = settings.noise_figure_db, settings.temperature_k
-        budget = LinkBudget.of(scene, channel.carriers, figure, temperature)
+        budget = LinkBudget.for_scene(scene, channel.carriers, figure, temperature)
         channels = channels_of(channel, budget.users)
         swept = dict[int, Float64Array]()
         for group in sweep_users(budget.users, channels.h):

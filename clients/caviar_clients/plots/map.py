@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.rays import OUTLINE, Footprints, Rays, from_above, rays, scale
+from caviar_clients.plots.rays import OUTLINE, Footprints, Rays, View, from_above, rays, scale, view_around
 from caviar_clients.plots.style import (
     BLACK,
     GREY,
@@ -33,9 +33,6 @@ from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Link, Scene
 from caviar_protocol.topics.channel import Interaction
-
-View = tuple[tuple[float, float], tuple[float, float]]
-"""Limits of x and of y [m]."""
 
 BeamGain = Callable[[AntennaArray, int, Float64Array], Float64Array]
 """``gain(array, beam, directions)``: amplitude of a codebook beam towards unit vectors in device
@@ -128,11 +125,7 @@ def view_of(data: MapData, beam: Beam | None) -> View:
         reach = 0.25 * float((high - low).max())
         points = np.clip(data.channel.points[used][:, :2], low - reach, high + reach)
         low, high = np.min([low, *points], axis=0), np.max([high, *points], axis=0)
-    centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.08 + 5.0, 20.0)
-    half = np.maximum(half, half.max() * np.array([0.9, 0.4]))  # neither a tower nor a strip
-    left, bottom = (centre - half).tolist()
-    right, top = (centre + half).tolist()
-    return (left, right), (bottom, top)
+    return view_around(low, high, 5.0, 20.0, (0.9, 0.4), scale=1.08)
 
 
 def draw_scenery(

@@ -18,7 +18,6 @@ from caviar_clients.plots.map import (
     Beam,
     MapData,
     Mark,
-    View,
     chosen_beam,
     draw_antennas,
     draw_beam,
@@ -26,7 +25,7 @@ from caviar_clients.plots.map import (
     draw_rays,
     draw_scenery,
 )
-from caviar_clients.plots.rays import Footprints, rays
+from caviar_clients.plots.rays import Footprints, View, rays
 from caviar_clients.plots.sensors import SKY_GREY
 from caviar_clients.plots.style import BLACK, BLUE, GREY, LIGHT_GREY, ORANGE, SKY, VERMILION, Labels, styled
 from caviar_clients.plots.user_curves import UserSeries, curves, shade

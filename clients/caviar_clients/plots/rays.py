@@ -116,6 +116,34 @@ def _straight(
     return result
 
 
+View = tuple[tuple[float, float], tuple[float, float]]
+"""Limits of x and of y [m]."""
+
+
+def view_around(
+    low: Float64Array,
+    high: Float64Array,
+    margin_m: float,
+    least_m: float,
+    shape: tuple[float, float],
+    scale: float = 1.0,
+) -> View:
+    """Choose the limits of what lies between two corners.
+
+    Args:
+        low: Corner, x and y [m].
+        high: The opposite corner.
+        margin_m: Room beside it [m].
+        least_m: Half the width and the height at least [m].
+        shape: Least width and height, as shares of the greater of both: neither a tower nor a strip.
+        scale: Of its size.
+    """
+    centre, half = (low + high) / 2, np.maximum((high - low) / 2 * scale + margin_m, least_m)
+    half = np.maximum(half, half.max() * np.array(shape))
+    (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
+    return (left, right), (bottom, top)
+
+
 OUTLINE = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
 """Corners of an object's box from above, of its length and width."""
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.plots.rays import OUTLINE, from_above
+from caviar_clients.plots.rays import OUTLINE, View, from_above, view_around
 from caviar_clients.plots.style import BLACK, LIGHT_GREY, ORANGE, figure, legend_below
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from caviar_protocol.space.coordinates import rotation_matrix
@@ -78,17 +78,14 @@ def draw_grid(grid: OccupancyGrid, title: str, file: Path) -> None:
         legend_below(drawn, axes)
 
 
-def _view(scan: LidarScan) -> tuple[tuple[float, float], tuple[float, float]]:
+def _view(scan: LidarScan) -> View:
     """Choose limits of x and y [m]: the sensor and nearly all hits; at least 20 m."""
     # Nearly: one hit on a distant tower would make the rest a dot.
     around = np.array([scan.position[:2]])
     if len(scan.range):
         around = np.vstack([around, np.percentile(scan.in_world()[:, :2], [0.2, 99.8], axis=0)])
     low, high = around.min(axis=0), around.max(axis=0)
-    half = np.maximum((high - low) / 2 + 3.0, 10.0)
-    half = np.maximum(half, half.max() * 0.25)
-    (left, bottom), (right, top) = ((low + high) / 2 - half).tolist(), ((low + high) / 2 + half).tolist()
-    return (left, right), (bottom, top)
+    return view_around(low, high, 3.0, 10.0, (0.25, 0.25))
 
 
 def _draw_above(drawn: Any, axes: Any, scan: LidarScan, moving: BoolArray, scene: Scene | None) -> None:

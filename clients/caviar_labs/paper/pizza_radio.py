@@ -88,7 +88,7 @@ def radio_table(scenario: str | Path, cell_m: float) -> RadioTable:
     if channel is None:
         raise RunError("the channel service gave no channel for the grid of receivers")
     settings = BeamLinkSettings()
-    budget = LinkBudget.of(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
+    budget = LinkBudget.for_scene(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
     channels = channels_of(channel, budget.users)
     swept = np.zeros((len(places), beam_count(budget.users[0].tx.array)))
     for group in sweep_users(budget.users, channels.h):

@@ -40,7 +40,7 @@ _COLUMNS = 64
 
 
 class Totals(NamedTuple):
-    """What became of the packets of each buffer since it was empty, Shape ``[N]`` each."""
+    """Packets of each buffer since it was empty, by what became of them, Shape ``[N]`` each."""
 
     arrived: Int64Array
     """[bit]; what found the buffer full counts too."""

@@ -34,7 +34,7 @@ class Traffic(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     Example:
         >>> voice = Traffic(users=("car.*",), model="constant", rate_bit_s=24_000.0, packet_bits=240)
-        >>> Offered.of(voice).packets(np.array([0.0, 0.5])).tolist()
+        >>> Offered.for_traffic(voice).packets(np.array([0.0, 0.5])).tolist()
         [0.0, 50.0]
     """
 
@@ -104,7 +104,8 @@ class Offered(msgspec.Struct, frozen=True):
     """Packets that were offered up to any instant: piecewise linear, and periodic after the last piece.
 
     Example:
-        >>> Offered.of(Traffic(model="poisson", rate_bit_s=1e6, packet_bits=1000)).packets(np.array([2.0]))
+        >>> traffic = Traffic(model="poisson", rate_bit_s=1e6, packet_bits=1000)
+        >>> Offered.for_traffic(traffic).packets(np.array([2.0]))
         array([2000.])
     """
 
@@ -116,7 +117,7 @@ class Offered(msgspec.Struct, frozen=True):
     """After which the pieces begin again [s]."""
 
     @staticmethod
-    def of(traffic: Traffic, place: Place | None = None) -> Offered:
+    def for_traffic(traffic: Traffic, place: Place | None = None) -> Offered:
         """Packets that traffic offers over time.
 
         Args:
@@ -224,7 +225,7 @@ def arrivals(
         Shape ``[slots]``.
 
     Example:
-        >>> steady = Offered.of(Traffic(model="constant", rate_bit_s=3000.0, packet_bits=1000))
+        >>> steady = Offered.for_traffic(Traffic(model="constant", rate_bit_s=3000.0, packet_bits=1000))
         >>> arrivals(steady, 0, 4, 0.5, None).tolist()  # 1.5 packets a slot
         [1, 2, 1, 2]
     """

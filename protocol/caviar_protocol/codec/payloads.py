@@ -310,7 +310,8 @@ def _encoded_once(convert: Convert) -> Convert:
 
 
 def _is_immutable(hint: Any) -> bool:
-    """Whether values of a type cannot change, and hold no array, which would have a place in the body."""
+    """Return whether values of a type cannot change, and hold no array, which would have a place in the
+    body."""
     hint = _without_alias(hint)
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:

@@ -51,7 +51,7 @@ __all__ = [
 
 
 def is_feedback(name: str) -> bool:
-    """Whether a part is read from the link of the frame before alone, and from nothing of the scene.
+    """Return whether a part is read from the link of the frame before alone, and from nothing of the scene.
 
     Args:
         name: Of the part, as in `PARTS`.

@@ -29,7 +29,8 @@ P = TypeVar("P", bound=Payload)
 
 
 class ObservedFrame(Protocol):
-    """What is read of a frame: `caviar_services.service.Frame` in a run, products of one in a recording."""
+    """Parts of a frame that are read: `caviar_services.service.Frame` in a run, products of one in a
+    recording."""
 
     def payloads(self, topic: str, cls: type[P]) -> Mapping[str, P]:
         """Payloads of a topic that are present, by source."""
@@ -45,8 +46,8 @@ class Bounds(NamedTuple):
 
 
 class LinkFigures(Protocol):
-    """What is read of a link: a `Link`, with one number for each user, or a link of many episodes, with a row
-    of users for each of them."""
+    """Figures of a link that are read: a `Link`, with one number for each user, or a link of many episodes,
+    with a row of users for each of them."""
 
     @property
     def tx(self) -> tuple[str, ...]:
@@ -323,7 +324,7 @@ class _OfPackets(OfLink):
 
 
 class Buffered(_OfPackets):
-    """What waits in the buffer after the frame before [Mbit], all carriers together; 0 in frame 0. Shape
+    """Bits that wait in the buffer after the frame before [Mbit], all carriers together; 0 in frame 0. Shape
     ``[U]``."""
 
     field, unit = "buffered", 1e6
@@ -340,14 +341,14 @@ class Waiting(_OfPackets):
 
 
 class LastThroughput(_OfPackets):
-    """What came through in the frame before [Mbit/s], on all carriers together; 0 in frame 0. Shape
+    """Throughput in the frame before [Mbit/s], on all carriers together; 0 in frame 0. Shape
     ``[U]``."""
 
     field, unit = "throughput", 1e6
 
 
 class _OfSensor(Part):
-    """What one sensor sees; of a sensor that is on several objects, what that of each user's object sees, and
+    """Product of one sensor; of a sensor that is on several objects, that of each user's object, and
     zeros for a user without."""
 
     def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:

@@ -16,7 +16,7 @@ from caviar_protocol.topics import AntennaArray, Scene
 
 
 class KnownScenario(Protocol):
-    """What is known of a scenario: a `Scenario`, or what a run says to its agents about it."""
+    """Facts of a scenario: a `Scenario`, or what a run says to its agents about it."""
 
     @property
     def devices(self) -> Sequence[DeviceSpec]:
@@ -117,7 +117,7 @@ class Users:
         return len(self.places)
 
     def on_objects_of(self, sensor: DeviceSpec) -> bool:
-        """Whether a receiver that is served may be on an object that carries a device.
+        """Return whether a receiver that is served may be on an object that carries a device.
 
         Args:
             sensor: The device, on a pattern of objects.

@@ -60,7 +60,7 @@ METADATA_NAME = "caviar"
 
 
 class RecordingMetadata(msgspec.Struct, frozen=True, kw_only=True):
-    """What stands once in every segment: how the run was made.
+    """Metadata that stand once in every segment: how the run was made.
 
     Example:
         >>> from caviar_protocol.recording import Recording
@@ -95,7 +95,7 @@ class RecordingMetadata(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FrameEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a recording says about one frame beside its products; msgpack on the wire.
+    """Record of one frame beside its products; msgpack on the wire.
 
     Example:
         >>> from caviar_protocol.recording import Recording

@@ -354,7 +354,7 @@ class TopicArrays(Generic[P, K]):
 
     @property
     def present(self) -> BoolArray:
-        """Whether the frame's product has the row. Shape ``[F, rows]``."""
+        """True if the frame's product has the row. Shape ``[F, rows]``."""
         found = np.zeros((len(self), len(self.keys)), dtype=bool)
         for at, payload in enumerate(self):
             if payload is not None:

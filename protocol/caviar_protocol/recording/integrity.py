@@ -115,7 +115,7 @@ class RecordedSegments:
         return self.path.parent if self.path.is_file() else self.path
 
     def _has_changed(self) -> bool:
-        """Whether the manifest is another one than when it was read."""
+        """Return whether the manifest is another one than when it was read."""
         try:
             return read_manifest(self._folder) != self._on_disk
         except RecordingError:
@@ -272,7 +272,7 @@ def _opened(file: Path) -> Segment:
 
 
 def follows(earlier: tuple[int, int], later: tuple[int, int]) -> bool:
-    """Whether no frame is between two (episode, frame), by their numbers: episodes may end early."""
+    """Return whether no frame is between two (episode, frame), by their numbers: episodes may end early."""
     return later in ((earlier[0], earlier[1] + 1), (earlier[0] + 1, 0))
 
 

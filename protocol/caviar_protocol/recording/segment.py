@@ -161,7 +161,7 @@ class Segment:
         )
 
     def damaged(self, chunk: Chunk) -> bool:
-        """Whether the chunk's CRC-32 differs from the one recorded with it."""
+        """Return whether the chunk's CRC-32 differs from the one recorded with it."""
         return bool(chunk.crc) and zlib.crc32(self._content(chunk)) != chunk.crc
 
     def altered(self, expected: int | None = None) -> list[tuple[int, int]]:
@@ -258,7 +258,7 @@ class Segment:
         return ""
 
     def _summary_is_whole(self, data_end: int) -> bool:
-        """Whether the summary begins after the data and has the CRC-32 that the footer says."""
+        """Return whether the summary begins after the data and has the CRC-32 that the footer says."""
         footer = len(self) - len(MAGIC) - _FOOTER_CONTENT.size
         if footer < data_end:
             return False
@@ -388,7 +388,7 @@ EXPANSION = 1000
 
 
 def may_expand(size: int, expanded: int) -> bool:
-    """Whether data of ``size`` bytes may declare that they expand to ``expanded`` bytes."""
+    """Return whether data of ``size`` bytes may declare that they expand to ``expanded`` bytes."""
     return expanded <= max(FREE_SIZE, EXPANSION * size)
 
 

@@ -53,7 +53,7 @@ class Source(msgspec.Struct, frozen=True, kw_only=True):
         return None
 
     def holds(self, key: str) -> bool:
-        """Whether the file has this very key, or one below it.
+        """Return whether the file has this very key, or one below it.
 
         Args:
             key: Dotted: ``devices[0].array``.

@@ -224,7 +224,7 @@ def resolved(scenario: Scenario, settings: Mapping[str, msgspec.Struct] | None =
 
 
 def patterns_overlap(a: str, b: str) -> bool:
-    """Whether some name matches both patterns, in which ``*`` is any text and ``?`` any character.
+    """Return whether some name matches both patterns, in which ``*`` is any text and ``?`` any character.
 
     Args:
         a: A pattern.

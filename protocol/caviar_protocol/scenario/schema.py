@@ -44,7 +44,7 @@ LONGEST_S = 1e8
 
 
 class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How long the broker waits for what."""
+    """Times for which the broker waits."""
 
     connect_s: Annotated[float, quantity("s", "wait for HELLO of every service", gt=0, le=LONGEST_S)] = 30.0
     ready_s: Annotated[float, quantity("s", "wait for READY", gt=0, le=LONGEST_S)] = 120.0
@@ -71,7 +71,7 @@ class Timeouts(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What one peer may use of the broker; a peer that exceeds a limit is disconnected and named."""
+    """Shares of the broker that one peer may use; a peer that exceeds a limit is disconnected and named."""
 
     connections: Annotated[int, quantity("1", "open connections in all", ge=1, le=1_000_000)] = 4096
     connections_before_hello: Annotated[
@@ -213,12 +213,12 @@ class ServiceSpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def remote(self) -> bool:
-        """Whether the user starts this service, and not `caviar run`."""
+        """True if the user starts this service, and not `caviar run`."""
         return self.use == REMOTE
 
 
 class ReplaySpec(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a run repeats of a recorded one; `caviar replay` writes it."""
+    """Parts of a recorded run that a run repeats; `caviar replay` writes it."""
 
     recording: Annotated[str, Meta(min_length=1)]
     """Directory of the recorded run."""
@@ -261,7 +261,7 @@ _HEIGHT = {"centre": 0.0, "roof": 0.5, "floor": -0.5}
 
 
 def carries(spec: DeviceSpec, name: str) -> bool:
-    """Whether a device may be mounted on an object.
+    """Return whether a device may be mounted on an object.
 
     Args:
         spec: The device of the scenario.
@@ -276,7 +276,7 @@ def carries(spec: DeviceSpec, name: str) -> bool:
 
 
 def is_made_by(spec: DeviceSpec, name: str) -> bool:
-    """Whether a device of a scene is one that the scenario says is made by ``spec``.
+    """Return whether a device of a scene is one that the scenario says is made by ``spec``.
 
     Args:
         spec: The device of the scenario.
@@ -415,7 +415,7 @@ def _device(spec: DeviceSpec, name: str, parent: str, height: float) -> Device:
 
 
 def owned_by(patterns: Iterable[str], name: str) -> bool:
-    """Whether one of the patterns matches a name (contract, clause 17).
+    """Return whether one of the patterns matches a name (contract, clause 17).
 
     Args:
         patterns: Names with ``*`` and ``?``.

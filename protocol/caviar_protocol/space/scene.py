@@ -215,7 +215,7 @@ class Pair:
         return sent * taken
 
     def uses(self, carrier: str) -> bool:
-        """Whether both ends use a carrier.
+        """Return whether both ends use a carrier.
 
         Args:
             carrier: Name of the carrier.
@@ -245,7 +245,7 @@ def pairs_of(scene: Scene) -> list[Pair]:
 
 
 def share_carrier(tx: Sequence[str], rx: Sequence[str]) -> bool:
-    """Whether two devices have a carrier in common.
+    """Return whether two devices have a carrier in common.
 
     Args:
         tx: Carriers of the one, by name; empty: all of the run.

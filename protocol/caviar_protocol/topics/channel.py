@@ -30,7 +30,7 @@ PLANE_WAVES = ("free-space", "geometric", "siso-rt")
 
 # Numbers are on the wire (`Channel.interactions`): existing ones keep their meaning.
 class Interaction(IntEnum):
-    """What a path does at one of its points."""
+    """Interaction of a path at one of its points."""
 
     NONE = 0
     REFLECTION = 1
@@ -285,7 +285,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     pair is no user and has no matrix, response and taps, and ``a`` is 0; one that uses none has no paths."""
 
     def uses(self, carrier: int, tx: int, rx: int) -> bool:
-        """Whether both ends of a pair use a carrier.
+        """Return whether both ends of a pair use a carrier.
 
         Args:
             carrier: Index into ``carriers``.
@@ -325,7 +325,7 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Cause(Enum):
-    """Why no path reaches a user; of several causes the one that stands first."""
+    """Cause for which no path reaches a user; of several causes the one that stands first."""
 
     NOT_FINITE = "not finite"
     """The paths that were found have values that are not finite, and were dropped: a defect of the model."""

@@ -68,12 +68,13 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
 
     @property
     def polarizations(self) -> tuple[str, ...]:
-        """Those of the elements at one place, first port first: one, or the two of a dual polarization."""
+        """Polarizations of the elements at one place, first port first: one, or the two of a dual
+        polarization."""
         return DUAL_POLARIZATIONS.get(self.polarization) or (self.polarization,)
 
     @property
     def is_uniform(self) -> bool:
-        """Whether the array is one panel of one polarization, where the device itself is."""
+        """True if the array is one panel of one polarization, where the device itself is."""
         return not self.panels and self.polarization not in DUAL_POLARIZATIONS
 
     @property
@@ -86,7 +87,7 @@ class AntennaArray(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
 
 # A private base: devices are distinguished by their tag on the wire, never by inheritance.
 class _Device(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What all devices share.
+    """Fields that all devices share.
 
     The pose is relative to the parent's pose (centre of its bounding box, body axes), or to
     the world where ``parent`` is empty. `caviar_protocol.space.scene.device_pose` composes the two.
@@ -120,7 +121,7 @@ class AntennaDevice(_Device, frozen=True, kw_only=True, omit_defaults=True, tag=
     """Names of the carriers that it sends and receives on; empty: all of the run."""
 
     def uses(self, carrier: str) -> bool:
-        """Whether it sends or receives on a carrier.
+        """Return whether it sends or receives on a carrier.
 
         Args:
             carrier: Name of the carrier.

@@ -129,7 +129,7 @@ class Intrinsics(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 # Optics and pose travel with each picture, so that it is read without its scenario.
 class _Image(Payload, frozen=True, kw_only=True, omit_defaults=True):
-    """Which sensor, with which optics, from where."""
+    """Sensor of an image, its optics and its pose."""
 
     sensor: str
     """Name of the device."""

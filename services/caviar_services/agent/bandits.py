@@ -66,14 +66,14 @@ class Feedbacks:
             numbers = zip(link.tx_beam.tolist(), link.rx_beam.tolist(), values.tolist(), strict=True)
             self._found |= dict(zip(names, numbers, strict=True))
 
-    def of(self, carrier: str, tx: str, rx: str) -> tuple[int, int, float] | None:
+    def feedback(self, carrier: str, tx: str, rx: str) -> tuple[int, int, float] | None:
         """TX and RX beam that served a user, and what it fed back; None where it was not served."""
         found = self._found.get((carrier, tx, rx))
         return None if found is None or found[0] < 0 else found
 
 
 class Bandit:
-    """What is known of the pairs of one user or cell.
+    """Statistics of the pairs of one user or cell.
 
     Args:
         arms: Number of pairs.
@@ -104,7 +104,7 @@ class Bandit:
 
 
 class Context(NamedTuple):
-    """What a bandit is of."""
+    """Subject of a bandit."""
 
     carrier: str
     tx: str
@@ -157,7 +157,7 @@ class BanditAgent(Agent[BanditSettings]):
     def checkpoint(self) -> bytes:
         """All bandits, and which of them chose last."""
         bandits = tuple(
-            _Saved(context, Packed.of(b.plays, "<f8"), Packed.of(b.sums, "<f8"), b.highest)
+            _Saved(context, Packed.pack(b.plays, "<f8"), Packed.pack(b.sums, "<f8"), b.highest)
             for context, b in sorted(self._bandits.items())
         )
         asked = tuple(_Asked(user, context) for user, context in sorted(self._asked.items()))
@@ -215,7 +215,7 @@ class BanditAgent(Agent[BanditSettings]):
     def _learn(self, frame: Frame) -> None:
         feedbacks = Feedbacks(frame, self.settings.feedback)
         for user, context in self._asked.items():
-            found = feedbacks.of(*user)
+            found = feedbacks.feedback(*user)
             if found is not None:
                 tx_beam, rx_beam, value = found
                 arm = tx_beam * context.rx_beams + rx_beam

@@ -145,7 +145,7 @@ class Agent(Service[S]):
             yield command
 
     def serves(self, rx: str) -> bool:
-        """Whether this agent serves a receiver.
+        """Return whether this agent serves a receiver.
 
         Args:
             rx: Name of the receiver.

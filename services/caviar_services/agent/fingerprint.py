@@ -51,7 +51,7 @@ class FingerprintSettings(PilotSettings, frozen=True, kw_only=True, forbid_unkno
 
 
 class Codebooks(NamedTuple):
-    """What a fingerprint is of: a transmitter that stands still, a carrier, and beams of both ends."""
+    """Subject of a fingerprint: a transmitter that stands still, a carrier, and beams of both ends."""
 
     tx: str
     carrier: str
@@ -61,8 +61,8 @@ class Codebooks(NamedTuple):
     rx_codebook: str = DFT
 
     @classmethod
-    def of(cls, pair: Pair, carrier: str) -> Codebooks:
-        """Those of a pair of a scene."""
+    def for_pair(cls, pair: Pair, carrier: str) -> Codebooks:
+        """Codebooks of a pair of a scene."""
         return cls(pair.tx.name, carrier, *pair.beams, pair.tx.array.codebook, pair.rx.array.codebook)
 
 
@@ -90,7 +90,7 @@ class Fingerprints:
 
     @property
     def codebooks(self) -> tuple[Codebooks, ...]:
-        """What there are fingerprints of, sorted."""
+        """Codebooks of which there are fingerprints, sorted."""
         return tuple(sorted(self._seen))
 
     @property
@@ -111,7 +111,7 @@ class Fingerprints:
         for u, (tx, rx, carrier) in enumerate(zip(link.tx, link.rx, link.carrier, strict=True)):
             if not link.has_path[u] or tx not in sizes or rx not in sizes:
                 continue
-            key = Codebooks.of(Pair(sizes[tx], sizes[rx]), carrier)
+            key = Codebooks.for_pair(Pair(sizes[tx], sizes[rx]), carrier)
             cell = self._cell(device_pose(scene, sizes[rx]).position)
             pairs = self._seen[key].setdefault(cell, {})
             for rank, ((tx_beam, rx_beam), gain) in enumerate(zip(beams[u], power[u], strict=True)):
@@ -218,7 +218,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         return Prepared(actuators=prepared.actuators, notes=(*prepared.notes, note))
 
     def _is_here(self, known: Codebooks) -> bool:
-        """Whether the scenario has such a transmitter and carrier. Receivers come and go."""
+        """Return whether the scenario has such a transmitter and carrier. Receivers come and go."""
         if all(carrier.name != known.carrier for carrier in self.run.carriers):
             return False
         return any(
@@ -231,7 +231,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         """The best of the first few pairs of each user's cell."""
         for index, user in enumerate(sounding.users):
             position = device_pose(sounding.scene, user.rx).position
-            pairs = self._table.pairs(Codebooks.of(user, user.carrier.name), position)
+            pairs = self._table.pairs(Codebooks.for_pair(user, user.carrier.name), position)
             if not pairs:
                 sounding.note(UNKNOWN)
                 at_tx, at_rx = directions(sounding.scene, [user])

@@ -40,7 +40,7 @@ _EPSILON = 1e-8
 
 
 class PerceptronState(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What a `Perceptron` learnt."""
+    """Weights that a `Perceptron` learnt."""
 
     updates: int
     parameters: tuple[Packed, ...]
@@ -125,11 +125,11 @@ class Perceptron:
             parameter -= rate * (mean / first) / (np.sqrt(square / second) + _EPSILON)
 
     def state(self) -> PerceptronState:
-        """What it learnt, to be saved."""
+        """State that it learnt, to be saved."""
         return PerceptronState(
             self.updates,
             *(
-                tuple(Packed.of(array, "<f8") for array in arrays)
+                tuple(Packed.pack(array, "<f8") for array in arrays)
                 for arrays in (self._parameters, self._means, self._squares)
             ),
         )
@@ -248,14 +248,14 @@ class Model:
         self.network.learn(self._features[rows], self._pairs[rows], self._worth[rows] / scale, rate)
 
     def state(self, beams: tuple[int, int]) -> _ModelState:
-        """All of it, to be saved."""
+        """State of all of it, to be saved."""
         count = min(self.seen, len(self._pairs))
         return _ModelState(
             beams=beams,
             network=self.network.state(),
-            features=Packed.of(self._features[:count], "<f8"),
-            pairs=Packed.of(self._pairs[:count], "<i8"),
-            worth=Packed.of(self._worth[:count], "<f8"),
+            features=Packed.pack(self._features[:count], "<f8"),
+            pairs=Packed.pack(self._pairs[:count], "<i8"),
+            worth=Packed.pack(self._worth[:count], "<f8"),
             seen=self.seen,
             highest=self.highest,
         )
@@ -346,7 +346,7 @@ class LearnerAgent(Agent[LearnerSettings]):
                 chosen = int(draws.integers(beams[0] * beams[1]))
             else:
                 chosen = int(self._model(beams, len(features)).network.values(features[None])[0].argmax())
-            asked.append(_Asked(pair.tx.name, pair.rx.name, beams, chosen, Packed.of(features, "<f8")))
+            asked.append(_Asked(pair.tx.name, pair.rx.name, beams, chosen, Packed.pack(features, "<f8")))
             tx_beam, rx_beam = divmod(chosen, beams[1])
             yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
         self._asked = tuple(asked)
@@ -355,7 +355,7 @@ class LearnerAgent(Agent[LearnerSettings]):
         settings = self.settings
         feedbacks = Feedbacks(frame, settings.feedback)
         for asked in self._asked:
-            found = [feedbacks.of(carrier.name, asked.tx, asked.rx) for carrier in self.run.carriers]
+            found = [feedbacks.feedback(carrier.name, asked.tx, asked.rx) for carrier in self.run.carriers]
             # A pair that served is not always the one that was chosen: an agent may have come late.
             worth = [f[2] for f in found if f and f[0] * asked.beams[1] + f[1] == asked.pair]
             if worth:

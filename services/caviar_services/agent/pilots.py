@@ -1,4 +1,4 @@
-"""What agents share that measure beam pairs with pilots: the measurements, and the air time that they take.
+"""Base of agents that measure beam pairs with pilots: the measurements, and the air time that they take.
 
 A *pilot* is one beam pair of a transmitter and its receivers, tried once. The transmitters of a carrier send
 their pilots one after the other, since they would disturb each other; carriers sound at the same time. All

@@ -42,7 +42,7 @@ MAX_REASON = 500
 
 
 class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
-    """What a policy observes, what it was trained for, and how it came about.
+    """Card of a policy: what it observes, what it was trained for, and how it came about.
 
     Example:
         >>> card = PolicyCard(observe=("aoa", "last_abs_y"), codebooks=((64, 1),))
@@ -207,7 +207,8 @@ class PolicyAgent(Agent[PolicySettings]):
 
     @classmethod
     def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
-        """What the policy's sensors need, where its file is on this machine or ``observe`` names them."""
+        """Inputs that the policy's sensors need, where its file is on this machine or ``observe`` names
+        them."""
         observe = settings.get("observe")
         file = Path(str(settings.get("file", "")).removeprefix("file:"))
         if not observe and file.is_file():
@@ -385,7 +386,7 @@ def _check_action(action: NDArray[np.int64], places: Sequence[Place], called: st
 
 
 def _reason(text: str) -> str:
-    """What a refusal says: its text has what stands in the file, which may be anything of any length."""
+    """Text of a refusal: its text has what stands in the file, which may be anything of any length."""
     line = "".join(c if c.isprintable() else "?" for c in text.partition("\n")[0][: MAX_REASON + 1])
     return line if len(line) <= MAX_REASON else line[:MAX_REASON] + "…"
 

@@ -121,7 +121,7 @@ class LastSweepAgent(PilotAgent[LastSweepSettings]):
         self._swept, self._kept = -1, {}
 
     def checkpoint(self) -> bytes:
-        """What the last sweep found, and when it was."""
+        """State of the last sweep: what it found, and when it was."""
         kept = tuple(_Kept(*key, *beams) for key, beams in sorted(self._kept.items()))
         return saved(self, 1, _LastSweepState(self._swept, kept))
 
@@ -132,7 +132,7 @@ class LastSweepAgent(PilotAgent[LastSweepSettings]):
         self._kept = {(k.carrier, k.tx, k.rx): (k.tx_beam, k.rx_beam) for k in found.kept}
 
     def select(self, sounding: Sounding) -> Iterator[Measured]:
-        """What the last sweep found, or finds now."""
+        """Select what the last sweep found, or finds now."""
         users, frame = sounding.users, sounding.frame.number
         if self._swept < 0 or frame - self._swept >= self.settings.period:
             # Of users that left nothing is kept; one without a path now has no pair that is worth keeping.

@@ -423,8 +423,10 @@ class _Ends:
         channel = self._channel
         names = channel.tx[t], channel.rx[r]
         start, end = (self._position(name) for name in names)
-        around = [self._enclosing(name) for name in names]  # of both, since both are to be named
-        if any(around):
+        for name in names:  # of both, since both are to be named
+            if name not in self._around:
+                self._around[name] = self._surroundings.enclosing(self._position(name))
+        if any(self._around[name] for name in names):
             return Cause.INSIDE
         if np.linalg.norm(end - start) < self._wavelength:
             return Cause.TOO_CLOSE
@@ -437,11 +439,6 @@ class _Ends:
         if name not in self._positions:
             self._positions[name] = np.array(device_pose(self._scene, self._devices[name]).position)
         return self._positions[name]
-
-    def _enclosing(self, name: str) -> str:
-        if name not in self._around:
-            self._around[name] = self._surroundings.enclosing(self._position(name))
-        return self._around[name]
 
     def _is_beside(self, position: Float64Array) -> bool:
         """Test whether a place is beside the scenery or below it; above it, the sky goes on."""

@@ -395,25 +395,20 @@ class PathModel(ChannelModel[S]):
         if np.abs(channel.a).max(initial=0.0) > 1:
             _refuse_amplified(channel)
         done = time.perf_counter_ns()
+        # Births and deaths of paths are no part of the product, which follows from its frame alone. Only two
+        # frames of this model in a row are compared: another process may have made one between.
+        turnover: dict[str, int] = {}
+        before, self._before = self._before, (frame.episode, frame.number, channel)
+        if before is not None and before[:2] == (frame.episode, frame.number - 1):
+            changed = changes(before[2], channel)
+            turnover = {"births": changed.births, "deaths": changed.deaths}
         return Modelled(
             channel=channel,
-            counts={**self._turnover(frame, channel), **found.counts},
+            counts={**turnover, **found.counts},
             measured={"paths": traced - begin, "assemble": done - traced},
             split_nmse=found.split_nmse,
             dropped_pairs=dropped,
         )
-
-    def _turnover(self, frame: Frame, channel: Channel) -> dict[str, int]:
-        """Births and deaths of paths since the frame before; nothing where this model did not make it.
-
-        They are no part of the product, which follows from its frame alone.
-        """
-        # Two frames of this model in a row are compared, and nothing else: another process may have made one.
-        before, self._before = self._before, (frame.episode, frame.number, channel)
-        if before is None or before[:2] != (frame.episode, frame.number - 1):
-            return {}
-        turnover = changes(before[2], channel)
-        return {"births": turnover.births, "deaths": turnover.deaths}
 
 
 class SceneAt(NamedTuple):

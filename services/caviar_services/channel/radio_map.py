@@ -35,7 +35,6 @@ from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.ray_launcher import spread_directions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.scene_loading import Shape, mi_mesh
-from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.drjit_setup import aligned_columns, aligned_indices
 from caviar_space.meshes import Mesh
 
@@ -460,6 +459,10 @@ def radio_map(
     finally:
         rt.tune(0)
     power_dbm = np.array([device.power_dbm for device in devices])
+    notes: tuple[str, ...] = ()
+    if s.diffraction:
+        left_out = s.edges_within_m is not None
+        notes = (_ALL_EDGES,) * left_out if surface.is_level else (_NO_DIFFRACTION,)
     return RadioMap(
         surface=surface,
         names=tuple(device.name for device in devices),
@@ -474,17 +477,8 @@ def radio_map(
         beam=np.stack(chosen),
         rays=np.stack(rays),
         shooting=shooting,
-        notes=_left_out(s, surface),
+        notes=notes,
     )
-
-
-def _left_out(settings: SionnaSettings, surface: MeasurementSurface) -> tuple[str, ...]:
-    """Notes on settings that a map of this surface leaves out."""
-    if not settings.diffraction:
-        return ()
-    if not surface.is_level:
-        return (_NO_DIFFRACTION,)
-    return (_ALL_EDGES,) * (settings.edges_within_m is not None)
 
 
 def _served(found: CellGains, beams: range) -> tuple[Float64Array, Int32Array]:

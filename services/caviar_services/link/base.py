@@ -1,4 +1,4 @@
-"""What every link shares: base class, users of a frame, their channels, and the beams chosen for them.
+"""Base of all links: base class, users of a frame, their channels, and the beams chosen for them.
 
 A *user* is a pair of devices on one carrier: one transmitter can serve a receiver on two carriers with
 different beams, and each is scored for itself. To add a link, subclass `LinkModel` and register the class.
@@ -211,7 +211,7 @@ def require_channel(frame: Frame) -> Channel:
 
 
 class UserChannels(msgspec.Struct, frozen=True):
-    """What the channel product says about each user, Shape ``[U]`` each."""
+    """Channels of the users by the channel product, Shape ``[U]`` each."""
 
     unknown: int
     """Users that the channel does not cover: a held channel has no device that came later."""
@@ -389,7 +389,7 @@ class _FrameCommands:
     def _first_wins(
         self, index: int, previous: tuple[str, BeamChoice], action: GrantInput, command: BeamChoice
     ) -> bool:
-        """Whether the earlier choice stays: one that names a carrier beats one that does not."""
+        """Return whether the earlier choice stays: one that names a carrier beats one that does not."""
         first_agent, first = previous
         if first_agent == action.source and bool(first.carrier) != bool(command.carrier):
             return bool(first.carrier)

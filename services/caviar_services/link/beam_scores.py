@@ -1,6 +1,6 @@
 """Scores of the chosen beam pairs of a frame: |y|, SNR, spectral efficiency, bit rate and reward.
 
-Every beam pair of every user is swept (`beam_sweep`), so that the chosen pair stands beside the best one
+Every beam pair of every user is swept (`sweep_users`), so that the chosen pair stands beside the best one
 (paper, eq. 2) and beside the pair along the straight line (the baseline of section 4).
 
 Sweep of DFT codebooks, and what beam pairs get over the band.
@@ -241,7 +241,7 @@ class SweepingLink(LinkModel[B]):
 
     def _budget_of(self, scene: Scene, channel: Channel) -> LinkBudget:
         settings = self.settings
-        return LinkBudget.of(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
+        return LinkBudget.for_scene(scene, channel.carriers, settings.noise_figure_db, settings.temperature_k)
 
     def counts(self, scored: Scored) -> dict[str, int]:
         """Events of a frame by name, those that did not happen too."""
@@ -400,7 +400,7 @@ def amplitudes(
 
 @dataclass(frozen=True, eq=False)
 class Interferers:
-    """Which users hear the transmitters of which others, while the same users are there; K pairs of these."""
+    """Users that hear the transmitters of others, while the same users are there; K pairs of these."""
 
     victims: Int64Array
     """The user that hears, Shape ``[K]``."""
@@ -412,8 +412,8 @@ class Interferers:
     """A number for each user, the same for those of one transmitter and carrier, Shape ``[U]``."""
 
     @classmethod
-    def of(cls, users: Users) -> Interferers:
-        """Of the users of a scene.
+    def for_users(cls, users: Users) -> Interferers:
+        """Make it for the users of a scene.
 
         Args:
             users: All of them.
@@ -421,7 +421,7 @@ class Interferers:
         Example:
             >>> from caviar_services.link.base import users_of
             >>> from caviar_services.testing.samples import CARRIERS, scene
-            >>> len(Interferers.of(users_of(scene(0), CARRIERS)).victims)  # one base station
+            >>> len(Interferers.for_users(users_of(scene(0), CARRIERS)).victims)  # one base station
             0
         """
         names = [(user.tx.name, user.rx.name, user.carrier.name) for user in users]

@@ -62,7 +62,7 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
 
     @classmethod
     def computes_batches(cls, settings: Mapping[str, object]) -> bool:
-        """Whether many episodes can be computed at once: without interference."""
+        """Return whether many episodes can be computed at once: without interference."""
         return super().computes_batches(settings) and not settings.get("interference", False)
 
     def batch(
@@ -94,7 +94,7 @@ class BeamLink(SweepingLink[BeamLinkSettings]):
         """Put the SINR into the fields, and what follows from it."""
         users, choices, budget = scored.budget.users, scored.choices, scored.budget
         if self._interferers is None or self._interferers[0] is not users:
-            self._interferers = users, Interferers.of(users)
+            self._interferers = users, Interferers.for_users(users)
         rise = self._interferers[1].noise_rise(
             scored.swept, budget.power_over_noise, choices.tx_beam, choices.rx_beam
         )
@@ -190,7 +190,7 @@ class BeamBatch(LinkBatch):
     def _sweep_from(self, number: int) -> _Ahead:
         first = self._scene_at(number)
         figure, temperature = self._settings.noise_figure_db, self._settings.temperature_k
-        budget = LinkBudget.of(first.scene, self._carriers, figure, temperature)
+        budget = LinkBudget.for_scene(first.scene, self._carriers, figure, temperature)
         elements = max((user.beam_pairs for user in budget.users), default=1)
         each = self._channels.width(len(self._members)) * len(self._carriers) * elements
         count = max(1, min(self._channels.reach(number), self._frames - number, HELD // each))

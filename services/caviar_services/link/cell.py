@@ -59,7 +59,7 @@ from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepR
 
 @dataclass(frozen=True, eq=False)
 class _Played:
-    """What the slots of a frame gave each terminal, Shape ``[T]`` each."""
+    """Results of a frame's slots for each terminal, Shape ``[T]`` each."""
 
     blocks: Int64Array
     errors: Int64Array
@@ -69,7 +69,7 @@ class _Played:
 
 @dataclass(frozen=True, eq=False)
 class _Serving:
-    """Who serves whom, while that and the users stay the same."""
+    """Assignment of users to transmitters, while that and the users stay the same."""
 
     layout: Layout
     transmitters: Int64Array
@@ -80,7 +80,7 @@ class _Serving:
     """Terminals of each transmitter and carrier, Shape ``[G, T]``."""
 
     @classmethod
-    def of(cls, layout: Layout, transmitters: Int64Array) -> _Serving:
+    def for_layout(cls, layout: Layout, transmitters: Int64Array) -> _Serving:
         users = layout.rows[np.arange(len(transmitters)), transmitters]
         groups = layout.carrier[users] * len(layout.transmitters) + transmitters
         numbers = np.array(list(dict.fromkeys(groups.tolist())), np.int64)
@@ -173,7 +173,7 @@ class CellLink(SweepingLink[CellSettings]):
             self._add_rates(scored, fields)
         layout = self._layout
         if layout is None or layout.users is not scored.budget.users:
-            layout = self._layout = Layout.of(scored.budget.users)
+            layout = self._layout = Layout.for_users(scored.budget.users)
         terminals, counts["bits-of-users-that-left"] = self._terminals_of(layout)
         before = terminals.buffers.totals
         # Traffic goes on in frames that were not granted; nothing is served then.
@@ -238,7 +238,7 @@ class CellLink(SweepingLink[CellSettings]):
         changed = terminals.serve_by([layout.transmitters[x] for x in found.tolist()])
         terminals.lost[changed] = settings.handover_slots
         if before is None or before.layout is not layout or (before.transmitters != found).any():
-            before = self._serving = _Serving.of(layout, found)
+            before = self._serving = _Serving.for_layout(layout, found)
         return before, int(changed.sum())
 
     def _rates(
@@ -342,7 +342,7 @@ class CellLink(SweepingLink[CellSettings]):
     def _schedule(
         self, terminals: Terminals, eligible: BoolArray, members: BoolArray, carried: Int64Array
     ) -> BoolArray:
-        """Which terminals are served in the slot, Shape ``[T]``."""
+        """Choose the terminals that are served in the slot, Shape ``[T]``."""
         match self.settings.scheduler:
             case "round-robin":
                 priority = round_robin(terminals.turns)

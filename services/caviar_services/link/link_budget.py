@@ -1,7 +1,7 @@
 """Link budget: transmit power over thermal noise, of which the SNR of a beam pair follows.
 
 The SNR of a user is transmit power · |y|² / (k·T·B·F), with |y| of its beam pair (`beam_sweep`). What it
-carries follows from the SNR: `caviar_protocol.cell.rates`.
+carries follows from the SNR: `caviar_protocol.cell.link_adaptation`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class LinkBudget:
 
     Example:
         >>> from caviar_services.testing.samples import CARRIERS, scene
-        >>> budget = LinkBudget.of(scene(0), CARRIERS, 9.0, 290.0)
+        >>> budget = LinkBudget.for_scene(scene(0), CARRIERS, 9.0, 290.0)
         >>> budget.rx, f"{10 * np.log10(budget.power_over_noise[0]):.1f} dB"
         (('car.1/rx', 'truck.2/rx'), '115.0 dB')
     """
@@ -87,7 +87,7 @@ class LinkBudget:
     """Beams of the receivers, Shape ``[U]``."""
 
     @classmethod
-    def of(
+    def for_scene(
         cls, scene: Scene, carriers: tuple[Carrier, ...], noise_figure_db: float, temperature_k: float
     ) -> LinkBudget:
         """Compute the link budget of each user of a scene.

@@ -192,7 +192,7 @@ def load_blocks(
 
 
 class Adaptation(NamedTuple):
-    """What link adaptation remembers of each terminal, Shape ``[T]``; changed in place."""
+    """State of link adaptation for each terminal, Shape ``[T]``; changed in place."""
 
     offset_db: Float64Array
     """Of the outer loop."""

@@ -1,4 +1,4 @@
-"""What slots carry for the terminals that they serve: SINR with interference, and rate models.
+"""Bits that slots carry for the terminals that they serve: SINR with interference, and rate models.
 
 Channels at the instants of slots and over the band, for chosen beams, from the paths of a channel product.
 
@@ -6,7 +6,7 @@ Channels at the instants of slots and over the band, for chosen beams, from the 
 
     y(Δf, Δt) = Σ_p (w* r_p) · (t_pᵀ f) · a_p · exp(j2π(ν_p·Δt − Δf·(τ_p − Δt·ν_p/f_c)))
 
-with the phases r_p and t_p of the elements on path p (`beam_sweep`): Doppler shifts ν turn the phases of the
+with the phases r_p and t_p of the elements on path p (`beam_scores`): Doppler shifts ν turn the phases of the
 paths against each other within a frame, delays τ over the band.
 
 Association: which transmitter serves a receiver, and what it costs to change.
@@ -38,7 +38,7 @@ AssociationRule = Literal["best", "sticky", "agent"]
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which users are of which terminal and transmitter, while the same users are there."""
+    """Assignment of users to terminals and transmitters, while the same users are there."""
 
     users: Users
     names: tuple[tuple[str, str], ...]
@@ -53,8 +53,8 @@ class Layout:
     """A number for the carrier of each user, Shape ``[U]``."""
 
     @classmethod
-    def of(cls, users: Users) -> Layout:
-        """Of the users of a scene.
+    def for_users(cls, users: Users) -> Layout:
+        """Make it for the users of a scene.
 
         Args:
             users: All of them.
@@ -62,7 +62,7 @@ class Layout:
         Example:
             >>> from caviar_services.link.base import users_of
             >>> from caviar_services.testing.samples import CARRIERS, scene
-            >>> Layout.of(users_of(scene(0), CARRIERS)).names
+            >>> Layout.for_users(users_of(scene(0), CARRIERS)).names
             (('car.1/rx', 'mmwave'), ('truck.2/rx', 'mmwave'))
         """
         names = {name: t for t, name in enumerate(dict.fromkeys((u.rx.name, u.carrier.name) for u in users))}
@@ -116,7 +116,7 @@ def associate(
     Example:
         >>> from caviar_services.link.base import users_of
         >>> from caviar_services.testing.samples import CARRIERS, scene
-        >>> layout = Layout.of(users_of(scene(0), CARRIERS))
+        >>> layout = Layout.for_users(users_of(scene(0), CARRIERS))
         >>> nowhere, power = np.array([-1, -1]), np.array([1e-9, 2e-9])
         >>> associate(layout, nowhere, power, power > 0, "best", 0.0)
         array([0, 0])
@@ -308,12 +308,12 @@ class SlotSinr:
 
     @property
     def varies(self) -> bool:
-        """Whether the SNR of one slot is not that of all."""
+        """True if the SNR of one slot is not that of all."""
         return len(self._snr) > 1
 
     @property
     def is_disturbed(self) -> bool:
-        """Whether who is served changes the SINR of others."""
+        """True if who is served changes the SINR of others."""
         return self._noise_rise is not None or (self.at_once > 1 and not self.in_band)
 
     def alone(self, slot: int) -> Float64Array:
@@ -347,7 +347,7 @@ class SlotSinr:
 
 
 class Carried(NamedTuple):
-    """What a slot carries, Shape ``[T]`` each; of terminals that it does not serve, anything."""
+    """Bits that a slot carries, Shape ``[T]`` each; of terminals that it does not serve, anything."""
 
     bits: Int64Array
     """That come through."""
@@ -374,7 +374,8 @@ class SlotRates(ABC):
 
     @abstractmethod
     def carried(self, slot: int, served: BoolArray, waiting: Int64Array) -> Carried:
-        """What a slot carries for the terminals that it serves; `offered` was asked for the slot before.
+        """Compute what a slot carries for the terminals that it serves; `offered` was asked for the slot
+        before.
 
         Args:
             slot: Number of the slot in the frame.

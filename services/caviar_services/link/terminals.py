@@ -165,7 +165,7 @@ def check_cell_settings(settings: CellSettings, place: Place) -> None:
 
 
 def _is_given(settings: CellSettings, key: str, place: Place) -> bool:
-    """Whether a key stands in the file; of settings made in Python, whether it is not its default."""
+    """Return whether a key stands in the file; of settings made in Python, whether it is not its default."""
     return place.source.holds(place.at(key).key) or getattr(settings, key) != getattr(_DEFAULTS, key)
 
 
@@ -182,7 +182,7 @@ _NO_TRAFFIC = Traffic(model="constant", rate_bit_s=0.0)
 
 
 class TerminalState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What terminals know from earlier frames."""
+    """Memory of terminals from earlier frames."""
 
     names: tuple[Terminal, ...]
     buffers: dict[str, Packed]
@@ -209,7 +209,7 @@ class Terminals:
         self._settings, self._slot_s = settings, slot_s
         self._traffic = [_traffic_of(rx, settings.traffic) for rx, _ in self.names]
         # By the entry: most terminals share one.
-        self._offered = {id(entry): Offered.of(entry) for entry in self._traffic if entry.model != "full"}
+        self._offered = {id(t): Offered.for_traffic(t) for t in self._traffic if t.model != "full"}
         self.is_full: BoolArray = np.array([entry.model == "full" for entry in self._traffic], np.bool_)
         """Which always have something to send, Shape ``[T]``."""
         self.has_full = bool(self.is_full.any())
@@ -305,17 +305,17 @@ class Terminals:
         return self._drawn[1][within * slots : (within + 1) * slots]
 
     def state(self) -> TerminalState:
-        """What outlives the frame."""
+        """State that outlives the frame."""
         return TerminalState(
             names=self.names,
-            buffers={name: Packed.of(array, "<i8") for name, array in self.buffers.state().items()},
-            turns=Packed.of(self.turns, "<i8"),
+            buffers={name: Packed.pack(array, "<i8") for name, array in self.buffers.state().items()},
+            turns=Packed.pack(self.turns, "<i8"),
             turn=self.turn,
             servers=self.servers,
-            lost=Packed.of(self.lost, "<i8"),
-            offset_db=Packed.of(self.adaptation.offset_db, "<f8"),
-            rise=Packed.of(self.adaptation.rise, "<f8"),
-            average=Packed.of(self.average, "<f8"),
+            lost=Packed.pack(self.lost, "<i8"),
+            offset_db=Packed.pack(self.adaptation.offset_db, "<f8"),
+            rise=Packed.pack(self.adaptation.rise, "<f8"),
+            average=Packed.pack(self.average, "<f8"),
         )
 
     @classmethod

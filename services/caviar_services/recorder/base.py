@@ -1,4 +1,4 @@
-"""What all recorders share.
+"""Base of all recorders.
 
 A recorder takes every product of a frame, with every decision about it, and creates no demand
 (contract, clause 5). Its DONE says that the frame is in the hands of the operating system, so
@@ -56,7 +56,7 @@ class Recorder(Service[S], Generic[S]):
 
     @property
     def parts(self) -> Mapping[str, frozenset[str]]:
-        """Those that ``run.record`` of the scenario names."""
+        """Parts that ``run.record`` of the scenario names."""
         run = self.run.scenario.get("run", {})
         found: dict[str, frozenset[str]] = {}
         for entry in run.get("record", ()) if isinstance(run, Mapping) else ():
@@ -106,7 +106,7 @@ class RunTime:
 
 
 class StoredProducts:
-    """Which products of the episode are in the recording already: their bytes are stored once.
+    """Products of the episode that are in the recording already: their bytes are stored once.
 
     Example:
         >>> stored = StoredProducts()
@@ -132,7 +132,7 @@ class StoredProducts:
             self._episode = episode
 
     def is_new(self, entry: GrantInput) -> bool:
-        """Whether the bytes of a product have to be stored; from then on they count as stored.
+        """Return whether the bytes of a product have to be stored; from then on they count as stored.
 
         Args:
             entry: Provenance of the product.
@@ -187,7 +187,7 @@ read: choose another directory with --out
 
 
 def machine() -> dict[str, str]:
-    """What a reader of performance figures asks first: system, CPU, memory, GPU.
+    """Machine, as a reader of performance figures needs it: system, CPU, memory, GPU.
 
     Example:
         >>> sorted({"cpu", "cpu_count", "memory_gib", "platform"} - machine().keys())

@@ -317,7 +317,7 @@ class McapRecorder(Recorder[McapSettings]):
 
 @dataclass
 class _Continuation:
-    """What an earlier process recorded, up to the frame that is granted next.
+    """Recording of an earlier process, up to the frame that is granted next.
 
     Args:
         folder: Directory of the run.
@@ -422,12 +422,12 @@ _END = (sys.maxsize, 0)
 
 
 def _is_whole(segment: Segment, frames: list[int]) -> bool:
-    """Whether a segment can stay as it is, with these of its frames."""
+    """Return whether a segment can stay as it is, with these of its frames."""
     return segment.finished and not segment.damage and len(frames) == len(segment.chunks)
 
 
 def _announced(keep: list[tuple[Segment, list[int]]], found: RecordedSegments) -> Iterator[SegmentRecord]:
-    """What the manifest says of segments that are taken over; those to be written anew are open."""
+    """Records in the manifest of segments that are taken over; those to be written anew are open."""
     for segment, frames in keep:
         known = found.record(segment) if _is_whole(segment, frames) else None
         entry = segment.entries[frames[0]]
@@ -479,7 +479,7 @@ def _versions(scenario: Mapping[str, Any], *, used_only: bool) -> dict[str, str]
 
 
 def _without_folders(value: Any) -> Any:
-    """What a scenario says, with ``file:NAME`` in place of the absolute path of a file or folder."""
+    """Scenario as it was written, with ``file:NAME`` in place of the absolute path of a file or folder."""
     if isinstance(value, str) and value.startswith("/"):
         return f"{FILE}{Path(value).name}"
     if isinstance(value, Mapping):

@@ -30,7 +30,7 @@ _OPCODE_MESSAGE, _OPCODE_CHUNK, _OPCODE_INDEX = 5, 6, 7
 
 
 class Stream(Protocol):
-    """What the file is written to."""
+    """Stream to which the file is written."""
 
     def write(self, data: bytes, /) -> int:
         """Write all of it."""

@@ -1,4 +1,4 @@
-"""What a run follows from beside its scenario: versions of packages, and code of classes that are not ours.
+"""Provenance of a run beside its scenario: versions of packages, and code of classes that are not ours.
 
 A package counts where a service of the scenario computes with it (`Service.packages`): what else is installed
 changes neither a product nor a reproducible recording. CAVIAR itself counts by its version.

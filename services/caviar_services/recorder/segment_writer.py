@@ -47,7 +47,7 @@ _FRAME_SCHEMA = (
 
 
 class _ChecksummedStream:
-    """What `McapFile` writes to; nothing reaches the system before `hand_over`."""
+    """Stream to which `McapFile` writes; nothing reaches the system before `hand_over`."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -103,7 +103,7 @@ class SegmentWriter:
 
     @property
     def removed(self) -> bool:
-        """Whether the file has no name any more: what is written to it is lost."""
+        """True if the file has no name any more: what is written to it is lost."""
         # Of the descriptor, not the path: another file may stand under that name by now.
         return os.fstat(self._file.fileno()).st_nlink == 0
 

@@ -43,7 +43,7 @@ Encoded = dict[str, tuple[bytes, bytes]]
 
 @dataclass
 class Played:
-    """What a service did in one life: prepared, played episodes, was closed.
+    """Life of a service: prepared, played episodes, was closed.
 
     Example:
         >>> from caviar_services.agent.baselines import RandomAgent

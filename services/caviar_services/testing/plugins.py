@@ -1,7 +1,4 @@
-"""Conformance tests of codebooks.
-
-Conformance tests of noise models of sensors (`caviar_services.sensors.noise`).
-"""
+"""Conformance tests of codebooks, and of noise models of sensors (`caviar_services.sensors.noise`)."""
 
 from __future__ import annotations
 
@@ -105,7 +102,7 @@ class CodebookConformance:
                 assert np.allclose(beam_gains(h, tx.array, rx.array), expected, rtol=1e-9, atol=1e-9)
 
     def test_the_beam_towards_a_direction_has_the_largest_gain(self, codebooks: list[Codebook]) -> None:
-        """Of its subarray: |c_k* a(k̂)|, the same as `Codebook.gain` times sqrt(N)."""
+        """Gain of its subarray: |c_k* a(k̂)|, the same as `Codebook.gain` times sqrt(N)."""
         random = np.random.default_rng(2)
         for codebook in codebooks:
             for direction in random.normal(size=(20, 3)):

@@ -243,7 +243,7 @@ class SensorConformance(ServiceConformance):
                     assert getattr(image, _PIXELS[topic]).shape[:2] == (device.height, device.width)
 
     def test_depth_and_segmentation_agree_on_what_is_there(self, played: Played) -> None:
-        """Where something has a depth, it has a name, a material and a normal of length 1."""
+        """Pixels that have a depth have a name, a material and a normal of length 1."""
         if not {"depth", "segmentation"} <= set(self.service_class.outputs):
             pytest.skip("sees no images")
         products = zip(
@@ -408,7 +408,7 @@ class RecorderConformance(ServiceConformance):
             assert not products
 
     def test_a_frame_is_on_disk_when_its_step_returns(self, tmp_path: Path) -> None:
-        """What is read without the recorder being closed is what a killed process leaves."""
+        """A file that is read before the recorder is closed is what a killed process leaves."""
         with self.at_start(tmp_path) as service:
             for frame in self.frames_of(service, 0)[:2]:
                 service.step(frame)

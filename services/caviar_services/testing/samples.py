@@ -170,7 +170,7 @@ def scene(frame: int) -> Scene:
 
 @cache
 def product(topic: str, frame: int) -> Payload:
-    """What the street's services publish on a topic in a frame; the same bytes at every call.
+    """Product of the street's services on a topic in a frame; the same bytes at every call.
 
     Args:
         topic: Name of the topic.

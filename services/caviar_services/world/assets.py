@@ -1,6 +1,5 @@
-"""Meshes that a world brings while its run goes on: which there are in a frame.
-
-Files that a world brings beside scenery: meshes of moving objects, and element patterns of antennas.
+"""Files that a world brings beside scenery: meshes of moving objects, also while its run goes on, and element
+patterns of antennas.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every virtual world does: names, mounted devices, scenery, and the ``scene`` payload.
+"""Base of all virtual worlds: names, mounted devices, scenery, and the ``scene`` payload.
 
 To add a world, such as a traffic model or a game engine, subclass `World`, say in `objects_at` where things
 are, and register the class.
@@ -131,7 +131,7 @@ class World(Service[W]):
 
     @classmethod
     def placements(cls, settings: W) -> Iterable[tuple[str, str, Sequence[Vector]]]:
-        """Where settings put objects, for a warning of implausible positions before the run.
+        """Places where settings put objects, for a warning of implausible positions before the run.
 
         Args:
             settings: The settings of the world.
@@ -153,7 +153,7 @@ class World(Service[W]):
 
     @abstractmethod
     def prefixes(self) -> tuple[str, ...]:
-        """What the names of this world's objects begin with; whole names where they are known.
+        """Beginnings of the names of this world's objects; whole names where they are known.
 
         The broker refuses a run in which two worlds share a prefix (contract, clause 3).
         """
@@ -344,7 +344,7 @@ class World(Service[W]):
 
 
 def _may_begin(on: str, prefix: str) -> bool:
-    """Whether a name, or one that a pattern matches, may begin with a prefix."""
+    """Return whether a name, or one that a pattern matches, may begin with a prefix."""
     literal = re.split(r"[*?[]", on)[0]
     return literal.startswith(prefix) or (literal != on and prefix.startswith(literal))
 
@@ -395,7 +395,7 @@ def _is_row(value: object, field: str) -> bool:
 
 
 class Mounts:
-    """Which devices exist in a frame, and where they are mounted.
+    """Devices that exist in a frame, and where they are mounted.
 
     A pattern with ``count`` devices gives them to the objects that came first. An object that has one
     keeps it, since all that came earlier have one too or have left.
@@ -515,7 +515,7 @@ def turning(rate: float) -> float:
 
 
 def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> float:
-    """How fast the horizontal course of a velocity turns: dψ/dt = (vₓ·a_y − v_y·aₓ)/(vₓ² + v_y²).
+    """Rate at which the horizontal course of a velocity turns: dψ/dt = (vₓ·a_y − v_y·aₓ)/(vₓ² + v_y²).
 
     Args:
         velocity: [m/s]
@@ -535,7 +535,7 @@ def course_rate(velocity: Sequence[float], acceleration: Sequence[float]) -> flo
 
 
 def reverses(velocity: Sequence[float], acceleration: Sequence[float]) -> bool:
-    """Whether a course bends more tightly than a vehicle turns: its radius is v³ / |v × a|.
+    """Return whether a course bends more tightly than a vehicle turns: its radius is v³ / |v × a|.
 
     Args:
         velocity: [m/s]

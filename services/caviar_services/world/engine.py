@@ -73,7 +73,7 @@ class Engine(ABC):
         ...     def step(self, t, previous, commands):
         ...         at, level, velocity = (10 * t, 0.0, 0.75), (1.0, 0.0, 0.0, 0.0), (10.0, 0.0, 0.0)
         ...         yield ObjectState("car", "car", at, level, velocity, (4.6, 1.9, 1.5))
-        >>> world = EngineWorld.of(Street())(WorldSettings(), RunInfo(name="world"))
+        >>> world = EngineWorld.for_engine(Street())(WorldSettings(), RunInfo(name="world"))
         >>> world.reset(0, 1, 0)
         >>> world.step(Frame(episode=0, number=2, t_ns=200_000_000)).products["scene"].position.tolist()
         [[2.0, 0.0, 0.75]]
@@ -174,7 +174,7 @@ class Engine(ABC):
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
         _log.info("%s: waiting for the broker at %s", name, endpoint)
         try:
-            cls = EngineWorld.of(self)
+            cls = EngineWorld.for_engine(self)
             runner = Runner(name, cls, type(self).__name__, endpoint, termination=SignalTermination())
             status = runner.run()
         except CaviarError as error:
@@ -186,7 +186,7 @@ class Engine(ABC):
 
 
 class _State(msgspec.Struct, frozen=True, array_like=True):
-    """What outlives a frame."""
+    """State that outlives a frame."""
 
     elapsed_ns: int
     arrived: tuple[str, ...]
@@ -207,7 +207,7 @@ class EngineWorld(World[WorldSettings]):
     engine: ClassVar[Engine]
 
     @classmethod
-    def of(cls, engine: Engine) -> type[EngineWorld]:
+    def for_engine(cls, engine: Engine) -> type[EngineWorld]:
         """Make the class of an engine's world.
 
         Args:
@@ -231,7 +231,7 @@ class EngineWorld(World[WorldSettings]):
         self._refused: dict[str, int] = {}
 
     def prefixes(self) -> tuple[str, ...]:
-        """Those of the engine."""
+        """Prefixes of the engine."""
         prefixes = self._engine.prefixes
         if isinstance(prefixes, str):
             author = f"{type(self._engine).__name__}.prefixes"
@@ -243,7 +243,7 @@ class EngineWorld(World[WorldSettings]):
         return ()
 
     def scenery(self) -> Mapping[str, Path | bytes]:
-        """What the engine offers while it is prepared, and the files that the scenario names."""
+        """Files that the engine offers while it is prepared, and the files that the scenario names."""
         if self._files is None:
             self._files = {}
             self._engine.prepare()

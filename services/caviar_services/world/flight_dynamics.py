@@ -72,7 +72,7 @@ _REST: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What an object may do.
+    """Limits of an object's motion.
 
     Example:
         >>> Limits(speed=10.0, acceleration=8.0, clearance=1.0, low=(-9.0,) * 3, high=(9.0,) * 3).kept
@@ -95,7 +95,7 @@ class Limits:
         return self.clearance + self.acceleration * _H**2 / 8
 
     def excess(self, place: Vector) -> float:
-        """How far a place is beyond the bound that it exceeds most [m]; 0 and less: it is inside.
+        """Distance of a place beyond the bound that it exceeds most [m]; 0 and less: it is inside.
 
         Args:
             place: [m]
@@ -330,11 +330,11 @@ class Flyer:
         return _Piece(position, velocity, _scaled(change, most / size), size / most, after)
 
     def _stop(self, position: Vector, velocity: Vector) -> Vector:
-        """Where an object comes to rest that brakes as hard as it can [m]."""
+        """Place where an object comes to rest that brakes as hard as it can [m]."""
         return _sum(position, velocity, math.hypot(*velocity) / (2 * self.limits.acceleration))
 
     def _in_the_way(self, places: list[Vector]) -> tuple[Vector, str]:
-        """What is in the way of straight lines to and between places: a unit vector away from it,
+        """Find what is in the way of straight lines to and between places: a unit vector away from it,
         and the event that it makes; empty where there is nothing."""
         here = self.state.begin[0]
         for place in places:
@@ -401,7 +401,7 @@ def _scaled(v: Vector, factor: float) -> Vector:
 
 
 def motion_of(agent: str, command: MotionCommand) -> Motion:
-    """What a point is commanded.
+    """Motion that a point is commanded.
 
     Args:
         agent: Which commands it.
@@ -422,7 +422,7 @@ def motion_of(agent: str, command: MotionCommand) -> Motion:
 
 
 def order_of(agent: str, command: MotionCommand) -> Order:
-    """What a quadrotor is commanded.
+    """Order that a quadrotor is commanded.
 
     Args:
         agent: Which commands it.

@@ -91,14 +91,14 @@ class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class _Kind(NamedTuple):
-    """What does not change while an object is there."""
+    """Class and size of an object, which do not change while it is there."""
 
     class_: str
     dimensions: Vector
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a simulation stands.
+    """State of a simulation.
 
     SUMO's own snapshots do not lead back there: what it reads of route files while it goes on from one
     moves its generator of random numbers, and makes flows anew (measured with 1.28, and its issue 16989).
@@ -291,7 +291,7 @@ class SumoWorld(World[SumoSettings]):
         ]
 
     def checkpoint(self) -> bytes:
-        """How far it went, and where that led."""
+        """State: how far it went, and where that led."""
         state = _State(
             steps=self._steps,
             arrived=self._mounts.arrived,

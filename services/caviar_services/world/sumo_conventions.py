@@ -2,12 +2,9 @@
 
 SUMO gives the centre of the front bumper on the ground, a heading in degrees clockwise from north, and a
 slope in degrees, positive uphill; a scene has the centre of the bounding box and angles counter-clockwise
-from +x.
+from +x. Steps of SUMO fit the sampling period of a run and the spacing of its episodes.
 
-Steps of SUMO that fit the sampling period of a run and the spacing of its episodes.
-
-Smooth motion of people who are moved by SUMO's models of pedestrians.
-
+`People` smooths the motion of people who are moved by SUMO's models of pedestrians.
 These models are made for flows of people, not for bodies that reflect and block waves. ``striping`` moves a
 person at junctions by up to some 3.5 m in a step of 0.1 s, ``nonInteracting`` by more; ``jupedsim`` turns
 people about from one step to the next; and the speed that SUMO states is not that with which the position
@@ -92,7 +89,7 @@ def check_spacing(between_episodes_s: float, step_ms: int) -> None:
 
 
 class Placement(NamedTuple):
-    """How the road network lies in the scene: turned about its origin, then shifted.
+    """Placement of the road network in the scene: turned about its origin, then shifted.
 
     Example:
         >>> Placement((100.0, 0.0, 0.0)).yaw
@@ -106,7 +103,7 @@ class Placement(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """Where a body on the road points [rad].
+    """Direction in which a body on the road points [rad].
 
     Example:
         >>> Heading(0.0, 0.0).forward
@@ -316,7 +313,7 @@ class People:
         self._counts: Counter[str] = Counter()
 
     def __contains__(self, name: str) -> bool:
-        """Whether a person is to be seen."""
+        """Return whether a person is to be seen."""
         return name in self._walks
 
     def clear(self) -> None:
@@ -335,7 +332,7 @@ class People:
             del self._walks[name]
 
     def taken_counts(self) -> dict[str, int]:
-        """What SUMO did, since this was last asked for, that no person does."""
+        """Counts, since they were last asked for, of what SUMO did that no person does."""
         counts = dict(self._counts)
         self._counts.clear()
         return counts

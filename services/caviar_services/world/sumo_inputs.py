@@ -1,4 +1,4 @@
-"""What SUMO is given: its options as it understands them, and its files, checked before it starts.
+"""Inputs of SUMO: its options as it understands them, and its files, checked before it starts.
 
 SUMO leaves out traffic that is out of order, draws random numbers by the clock where an option says so, and
 writes and reads where a configuration or an additional file says. What of this breaks a promise of a run is
@@ -119,7 +119,7 @@ def merged_options(arguments: tuple[str, ...]) -> Options:
 
 
 class Inputs(NamedTuple):
-    """What a simulation starts with, once it has been checked."""
+    """Inputs of a simulation, once they have been checked."""
 
     files: Mapping[str, Sequence[str]]
     """Paths by option of the command line, also those that a configuration names."""

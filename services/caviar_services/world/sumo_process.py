@@ -1,9 +1,8 @@
-"""The SUMO simulation in this process: starting, stepping, and saying what is wrong.
+"""The SUMO simulation in this process, and saved states of a traffic that episodes share.
 
 libsumo is one simulation per process and prints what it warns of, so that its output is caught.
 
-States of SUMO at the beginnings of episodes that share one traffic, saved by one pass through it.
-
+`TrafficStates` are those at the beginnings of episodes that share one traffic.
 Episode e of such a run begins e·(time between episodes) after the first. To get there anew SUMO would pass
 through all that comes before: 62,580 s for the last of 2,086 episodes that are 30 s apart. One pass saves its
 state at the beginning of each episode, and every episode starts from its saved state, wherever and in
@@ -211,7 +210,7 @@ class TrafficStates:
         return self._folder / _name(episode)
 
     def missing(self, episodes: int) -> bool:
-        """Whether the state of one of the first episodes has to be made.
+        """Return whether the state of one of the first episodes has to be made.
 
         Args:
             episodes: Their number.

@@ -35,7 +35,7 @@ Length = Annotated[float, quantity("m", "side of a bounding box", gt=0)]
 
 
 class NamedObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a scenario says of each object by name, whatever moves it."""
+    """Object that a scenario names, whatever moves it."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100, pattern=PRINTABLE)]
     """Unique among the objects of the run; where agents fly the object, its actuator is ``motion:<name>``."""
@@ -98,7 +98,7 @@ class TrajectoryWorld(World[TrajectorySettings]):
 
     @classmethod
     def known_objects(cls, settings: TrajectorySettings) -> Mapping[str, str] | None:
-        """All of them, with the prefix."""
+        """Names of all objects, with the prefix."""
         return {(settings.prefix or "") + thing.name: thing.kind for thing in settings.objects}
 
     def prefixes(self) -> tuple[str, ...]:
@@ -161,7 +161,7 @@ def unique_name(settings: WorldSettings, thing: NamedObject, taken: Container[st
 
 
 class Waypoint(NamedTuple):
-    """Where an object is when."""
+    """Place of an object at an instant."""
 
     t: float
     """[s]"""

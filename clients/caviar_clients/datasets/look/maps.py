@@ -10,8 +10,8 @@ import numpy as np
 
 from caviar_clients.datasets.look.data import Scan, UserColumns
 from caviar_clients.datasets.look.figures import Draw, Theme, legend_of_all, plain
-from caviar_clients.plots.map import View, colour_limits, draw_scenery
-from caviar_clients.plots.rays import Footprints
+from caviar_clients.plots.map import colour_limits, draw_scenery
+from caviar_clients.plots.rays import Footprints, View, view_around
 from caviar_clients.plots.style import VERMILION, legend_square
 from caviar_protocol.arrays import BoolArray, Float64Array
 
@@ -51,12 +51,8 @@ def map_of(
     reach = max(40.0, float((high - low).max()))
     near = np.clip(fixed, low - reach, high + reach)
     low, high = np.min([low, *near], axis=0), np.max([high, *near], axis=0)
-    centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.06 + 4.0, 20.0)
-    half = np.maximum(half, half.max() * np.array([0.9, 0.35]))  # neither a tower nor a strip
-    (left, bottom), (right, top) = (centre - half).tolist(), (centre + half).tolist()
-    return MapOf(
-        _within(footprints, left, right, bottom, top), fixed, ((left, right), (bottom, top)), _dots(users)
-    )
+    view = view_around(low, high, 4.0, 20.0, (0.9, 0.35), scale=1.06)
+    return MapOf(_within(footprints, view), fixed, view, _dots(users))
 
 
 def _dots(users: UserColumns) -> Float64Array | None:
@@ -75,10 +71,9 @@ def _dots(users: UserColumns) -> Float64Array | None:
     return np.column_stack([x[order][starts], y[order][starts], median])
 
 
-def _within(
-    footprints: Footprints | None, left: float, right: float, bottom: float, top: float
-) -> Footprints | None:
+def _within(footprints: Footprints | None, view: View) -> Footprints | None:
     """The part of a town's scenery that lies in the view."""
+    (left, right), (bottom, top) = view
     if footprints is None:
         return None
 
@@ -293,6 +288,4 @@ def _scan_view(scan: Scan) -> View:
         # Nearly: one hit on a distant tower would make the rest a dot.
         around = np.vstack([around, np.percentile(scan.points[:, :2], [0.5, 99.5], axis=0)])
     low, high = around.min(axis=0), around.max(axis=0)
-    half = max(float((high - low).max()) / 2 * 1.05, 10.0)
-    (x, y) = ((low + high) / 2).tolist()
-    return (x - half, x + half), (y - half, y + half)
+    return view_around(low, high, 0.0, 10.0, (1.0, 1.0), scale=1.05)

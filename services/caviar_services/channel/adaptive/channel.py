@@ -118,19 +118,25 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return Prepared(notes=tuple(notes))
 
     def _time_rungs(self) -> list[str]:
-        """Try every rung on the scenario's antennas in traffic, and begin to predict from how long it took.
-
-        Bodies drive, and each time a rung forgets what it traced before, as it would have to in a run.
-        """
-        room = self._room()
+        """Try every rung on the scenario's antennas in traffic, among bodies that drive, and begin to predict
+        from how long it took."""
+        extents = [rung.model.extent for rung in self._every]
+        ground = min((float(extent[0][2]) for extent in extents if extent is not None), default=0.0)
         scenes = [
-            rehearsal_scene(self.run.devices, room, self._ground_m(), self._is_free, step)
+            rehearsal_scene(self.run.devices, self._room(), ground, self._is_free, step)
             for step in range(TIMINGS + 1)
         ]
         timings = []
         for rung in self._every:
             self.run.progress(f"timing rung {rung.label}", _TIMING_GRACE_S)
-            timings.append([self._timed(rung, number, scene) for number, scene in enumerate(scenes)][1:])
+            taken = []
+            for number, scene in enumerate(scenes):
+                # A rung forgets what it traced before, as it would have to in a run.
+                rung.model.reset(0, self.run.seed, 0)
+                frame = Frame(episode=0, number=number, t_ns=0, service=self.run.name, seed=self.run.seed)
+                devices = antennas(scene, "tx"), antennas(scene, "rx")
+                taken.append(self._modelled(rung, frame, scene, devices)[1])
+            timings.append(taken[1:])
             # Nothing of the rehearsal may follow into the run: products depend on its frames alone.
             rung.model.reset(0, self.run.seed, 0)
         timings = timings[: len(self.rungs)]
@@ -143,23 +149,12 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
             for rung, taken in zip(self.rungs, timings, strict=True)
         ]
 
-    def _timed(self, rung: Rung, number: int, scene: Scene) -> int:
-        """Duration of a rung for a scene that it has not seen [ns]."""
-        rung.model.reset(0, self.run.seed, 0)
-        frame = Frame(episode=0, number=number, t_ns=0, service=self.run.name, seed=self.run.seed)
-        return self._modelled(rung, frame, scene, (antennas(scene, "tx"), antennas(scene, "rx")))[1]
-
     def _room(self) -> Mapping[str, int]:
         """Objects of each mesh that every model has room for."""
         # A scene of the rehearsal must fit every rung: some hold fewer bodies than others.
         rooms = [rung.model.room for rung in self._every if rung.model.room]
         shared = set.intersection(*map(set, rooms)) if rooms else set()
         return {asset: min(room[asset] for room in rooms) for asset in sorted(shared)}
-
-    def _ground_m(self) -> float:
-        """Height of the lowest point of the scenery [m]."""
-        extents = [rung.model.extent for rung in self._every]
-        return min((float(extent[0][2]) for extent in extents if extent is not None), default=0.0)
 
     def _is_free(self, place: Vector) -> bool:
         """Test whether a point is in the open."""

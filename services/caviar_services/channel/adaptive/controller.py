@@ -325,16 +325,16 @@ class CostModel:
     def state(self) -> CostState:
         """All that was learned, and the timings that it is relative to."""
         return CostState(
-            timing=Packed.of(self._timing, "<f8"),
+            timing=Packed.pack(self._timing, "<f8"),
             pairs=self._timed.pairs,
             objects=self._timed.objects,
-            mean=Packed.of(self._mean, "<f8"),
-            covariance=Packed.of(self._covariance, "<f8"),
+            mean=Packed.pack(self._mean, "<f8"),
+            covariance=Packed.pack(self._covariance, "<f8"),
             side=self._side,
             changed=self._changed,
             rung=self._rung,
             raised=self._raised,
-            rows=Packed.of(np.array(self._rows), "<f8"),
+            rows=Packed.pack(np.array(self._rows), "<f8"),
             measured=tuple(self._measured),
             expected=tuple(self._expected),
         )

@@ -11,7 +11,7 @@ its answer is that of a neighbouring element. Paths of reflections alone are ask
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
 import numpy as np
@@ -56,6 +56,9 @@ class ElementTracer:
     """Whether straight paths count."""
     losses: Sequence[Attenuation] = ()
     """What paths lose in, of the frame: foliage, people."""
+    counts: list[Int64Array] = field(default_factory=list)
+    """Paths between elements in this frame, of each carrier and transmitter: Shape ``[M, N]``, M elements of
+    all receivers."""
 
     def __call__(
         self,
@@ -187,6 +190,8 @@ class _TracedPairs:
         for t in range(len(self._transmitters)):
             columns = self._traced(index, t)
             h = np.stack([column.summed() for column in columns], axis=1)
+            counts = [np.bincount(column.target, minlength=column.targets) for column in columns]
+            self._tracer.counts.append(np.stack(counts, axis=1))
             yield from (h[rows] for rows in self._rows)
 
     def responses(self, asked: Bins) -> Iterator[Complex64Array]:

@@ -330,7 +330,10 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeam
         its = gathered(group, pair)
         there = place < gathered(groups.size, its)
         edge = gathered(groups.edge, dr.select(there, gathered(groups.begin, its) + place, 0))
-        return there & _outside(targets, edges, beams, gathered(beam, pair), edge)
+        # The image is in front of at least one face of the edge.
+        back = gathered(beams.image, gathered(beam, pair)) - gathered(edges.a, edge)
+        one, other = dr.dot(back, gathered(edges.one, edge)), dr.dot(back, gathered(edges.other, edge))
+        return there & (dr.maximum(one, other) > -targets.slack)
 
     def within(beam: Any, edge: Any) -> Any:
         return _in_beam(targets, edges, beams, beam, edge)
@@ -352,13 +355,6 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeam
         own = (last[:, None] == edges.surfaces[at]).any(1)
         of, at = of[~own], at[~own]
     return _Lit(beams, owner, of, at)
-
-
-def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Test whether images are in front of at least one face of edges."""
-    back = gathered(beams.image, beam) - gathered(edges.a, edge)
-    one, other = dr.dot(back, gathered(edges.one, edge)), dr.dot(back, gathered(edges.other, edge))
-    return dr.maximum(one, other) > -targets.slack
 
 
 def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:

@@ -18,7 +18,6 @@ from caviar_protocol.topics import Interaction
 from caviar_services.channel.enumeration.edge_beams import EdgeTargets, edge_chains, enumerated_scenery
 from caviar_services.channel.enumeration.image_beams import SceneryViews, Targets, chain_pairs
 from caviar_services.channel.enumeration.image_paths import (
-    EdgePaths,
     ImagePaths,
     crossings,
     edge_paths,
@@ -107,7 +106,10 @@ class EnumeratedTracer:
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
         paths = paths.take(~near[paths.receiver])
         free = unhidden(scene, self._look, faces, paths, start, ends)
-        found = [self._reflected(faces, paths.take(free), start, ends)]
+        seen = paths.take(free)
+        mirrors = self._mirrors(faces, seen.chain, seen.points)
+        types = np.where(seen.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
+        found = [self._traced(seen.receiver, types, *mirrors, seen.points, start, ends)]
         if self._options.refraction:
             found.append(self._transmitted(faces, paths.take(~free), start, ends))
         if self._edges is not None and over_edges:
@@ -116,9 +118,13 @@ class EnumeratedTracer:
             bent = edge_paths(faces, edges, candidates, start, ends, self._depth)
             bent = bent.take(~near[bent.receiver])
             bent = bent.take(unhidden_over_edges(scene, self._look, faces, edges, bent, start, ends))
-            found.append(
-                self._bent(faces, edges, self._edges.triangles[edges.number[bent.edge], 0], bent, start, ends)
-            )
+            types = np.where(bent.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
+            triangles, _ = self._mirrors(faces, bent.chain, bent.points)
+            rows, edge = np.arange(len(bent.edge)), edges.number[bent.edge]
+            types[rows, bent.bend] = Interaction.DIFFRACTION
+            triangles[rows, bent.bend] = self._edges.triangles[edge, 0]
+            traced = self._traced(bent.receiver, types, triangles, None, bent.points, start, ends)
+            found.append(replace(traced, edge=edge))
         parts = []
         for traced in found:
             kept = first_of_each(traced.receiver, self._options.max_paths)
@@ -145,14 +151,6 @@ class EnumeratedTracer:
             seen = seen_planes(self._look, receivers, scenery.plane, _RAYS)
         receiver, place = np.nonzero(seen)
         return SceneryViews(np.arange(len(scenery)), pairs, receiver, place)
-
-    def _reflected(
-        self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
-    ) -> Traced:
-        used = paths.chain >= 0
-        triangles, normals = self._mirrors(faces, paths.chain, paths.points)
-        types = np.where(used, Interaction.REFLECTION, 0).astype(np.uint8)
-        return self._traced(paths.receiver, types, triangles, normals, paths.points, start, ends)
 
     def _transmitted(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
@@ -181,24 +179,6 @@ class EnumeratedTracer:
         normals[mirrors] = their_normals[path, d]
         normals[at] = self._scene.plane_table.normal[self._scene.plane_of[found.triangle]]
         return self._traced(paths.receiver, types, triangles, normals, points, start, ends)
-
-    def _bent(
-        self,
-        faces: FaceRectangles,
-        edges: EdgeTargets,
-        at_edge: Int64Array,
-        paths: EdgePaths,
-        start: Float64Array,
-        ends: Float64Array,
-    ) -> Traced:
-        """Paths over edges; ``at_edge`` is a triangle at each edge, Shape ``[P]``."""
-        types = np.where(paths.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
-        triangles, _ = self._mirrors(faces, paths.chain, paths.points)
-        rows, edge = np.arange(len(paths.edge)), edges.number[paths.edge]
-        types[rows, paths.bend] = Interaction.DIFFRACTION
-        triangles[rows, paths.bend] = at_edge
-        traced = self._traced(paths.receiver, types, triangles, None, paths.points, start, ends)
-        return replace(traced, edge=edge)
 
     def _mirrors(
         self, faces: FaceRectangles, chain: Int64Array, points: Float64Array

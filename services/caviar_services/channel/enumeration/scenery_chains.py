@@ -42,7 +42,6 @@ from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, Launch
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import positions
-from caviar_space.meshes import Mesh
 from caviar_space.planes import two_sided_planes
 from caviar_space.rectangles import FaceRectangles, narrowest_sides
 from caviar_space.vectors import ranges
@@ -74,7 +73,11 @@ class SceneFaces:
         self._along = np.zeros(len(self._body_of), np.int64)
         for asset, mesh in scene.unit_meshes.items():
             numbers = scene.face_numbers(asset)
-            both, along = two_sided_planes(mesh, numbers), _sides_of(mesh, numbers)
+            both, order = two_sided_planes(mesh, numbers), np.argsort(numbers, kind="stable")
+            # Counted from the first triangle of each plane.
+            sizes = np.bincount(numbers)
+            along = narrowest_sides(mesh.vertices[mesh.faces[order]], sizes)
+            along -= 3 * (np.cumsum(sizes) - sizes)
             for body in scene.bodies_of(asset):
                 self._two_sided[self._body_of == body] = both | inner
                 self._along[self._body_of == body] = along
@@ -127,13 +130,6 @@ def _faces_of(scene: SionnaScene, planes: Int64Array) -> FaceRectangles:
     sizes = sizes[kept]
     along = narrowest_sides(corners, sizes)
     return FaceRectangles.of(planes[kept], corners, sizes, along, table.normal[planes[kept]], both)
-
-
-def _sides_of(mesh: Mesh, numbers: Int32Array) -> Int64Array:
-    """`narrowest_sides` of the planes of a mesh, counted from the first triangle of each plane."""
-    order = np.argsort(numbers, kind="stable")
-    sizes = np.bincount(numbers)
-    return narrowest_sides(mesh.vertices[mesh.faces[order]], sizes) - 3 * (np.cumsum(sizes) - sizes)
 
 
 # [m] off its plane that a ray starts, so that it does not meet the plane.
@@ -636,7 +632,7 @@ class ChainCache:
 
     def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
         """Write the tables of a key; where that fails, a note says so."""
-        packed = tuple([Packed.of(table, "<i4") for table in tables])
+        packed = tuple([Packed.pack(table, "<i4") for table in tables])
         file = _ChainFile(format=_FORMAT, key=key, tables=packed, digest=_digest(packed))
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -172,7 +172,8 @@ def _images(
     images = [start]
     for d in range(types.shape[1]):
         last, kind = images[-1], types[:, d, None]
-        image = np.where(kind == Interaction.REFLECTION, _mirrored(last, origin[:, d], normal[:, d]), last)
+        mirrored = 2 * _onto(last, origin[:, d], normal[:, d]) - last
+        image = np.where(kind == Interaction.REFLECTION, mirrored, last)
         images.append(np.where(_is_fixed(kind), fixed[:, d], image))
     return np.array(images)
 
@@ -217,10 +218,6 @@ def _same(
 def _is_fixed(kind: UInt8Array) -> BoolArray:
     fixed: BoolArray = (kind == Interaction.SCATTERING) | (kind == Interaction.DIFFRACTION)
     return fixed
-
-
-def _mirrored(point: Float64Array, origin: Float64Array, normal: Float64Array) -> Float64Array:
-    return 2 * _onto(point, origin, normal) - point
 
 
 def _onto(point: Float64Array, origin: Float64Array, normal: Float64Array) -> Float64Array:

@@ -17,7 +17,10 @@ class _Library:
         self._name, self._keeps = name, keeps
 
     def __getattr__(self, attribute: str) -> Any:
-        value = getattr(import_module(self._name), attribute)
+        if attribute == "_module":
+            self._module = import_module(self._name)
+            return self._module
+        value = getattr(self._module, attribute)
         if self._keeps:
             setattr(self, attribute, value)
         return value

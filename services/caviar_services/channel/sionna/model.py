@@ -40,6 +40,7 @@ from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
 from caviar_space.materials import MaterialPolicy, ObjectMaterials, OutsideUse
+from caviar_space.meshes import is_object_mesh
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -217,7 +218,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         s = self.settings
         notes = self.load_scene(preparation)
         # Objects move in the run where a world has meshes of them, or devices are mounted on them.
-        meshes = any(name.startswith("objects/") for name in preparation.assets)
+        meshes = any(map(is_object_mesh, preparation.assets))
         moving = meshes or any(device.on for device in self.run.devices)
         self._enumerates = s.enumerates(moving)
         switched = self._make_finder()

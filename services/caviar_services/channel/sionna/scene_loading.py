@@ -40,7 +40,15 @@ from caviar_space.materials import (
     itu_material,
 )
 from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
-from caviar_space.meshes import Body, Mesh, assign_bodies, coarse_centre, object_meshes, shown_asset
+from caviar_space.meshes import (
+    Body,
+    Mesh,
+    assign_bodies,
+    coarse_centre,
+    is_object_mesh,
+    object_meshes,
+    shown_asset,
+)
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
 
 
@@ -426,7 +434,7 @@ def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:
     Args:
         assets: Files of the run by name.
     """
-    named = {name: material_of(file) for name, file in assets.items() if name.startswith("objects/")}
+    named = {name: material_of(file) for name, file in assets.items() if is_object_mesh(name)}
     return {name: material for name, material in named.items() if material}
 
 

@@ -38,6 +38,7 @@ from caviar_space.materials import (
     UsedSurfaces,
 )
 from caviar_space.mesh_detail import DetailSettings
+from caviar_space.meshes import is_object_mesh
 from caviar_space.mitsuba_xml import ITU_MATERIALS
 
 # Half of the smallest float32 above 0.
@@ -292,7 +293,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         Raises:
             ScenarioError: ``pool`` names another mesh.
         """
-        by_stem = {PurePosixPath(name).stem: name for name in assets if name.startswith("objects/")}
+        by_stem = {PurePosixPath(name).stem: name for name in filter(is_object_mesh, assets)}
         by_stem["box"] = ""
         for stem in sorted(self.pool.keys() - by_stem.keys()):
             known = ", ".join(sorted(by_stem))

@@ -86,7 +86,7 @@ class TableState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         Args:
             table: The chains.
         """
-        return cls(**{name: Packed.of(getattr(table, name), kind) for name, (kind, _) in _STORED.items()})
+        return cls(**{name: Packed.pack(getattr(table, name), kind) for name, (kind, _) in _STORED.items()})
 
     def table(self) -> _Table:
         """The table."""
@@ -133,9 +133,9 @@ class Followed:
             number=self._number,
             known=None if self._known is None else TableState.of(self._known),
             names=self._names,
-            came_from=Packed.of(self._from, "<f8"),
+            came_from=Packed.pack(self._from, "<f8"),
             rays=len(self._on_object),
-            on_object=Packed.of(np.flatnonzero(self._on_object), "<i4"),
+            on_object=Packed.pack(np.flatnonzero(self._on_object), "<i4"),
         )
 
     @classmethod

@@ -41,7 +41,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Airframe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a quadrotor is made of.
+    """Mass, rotors and drag of a quadrotor.
 
     The defaults have the weight (20 N), the disc area of all rotors (0.5 m²), the tip speed (120 m/s) and,
     in hover, the shaft power (168 W) of the rotary-wing UAV of Zeng, Xu and Zhang (2019), table I.
@@ -84,7 +84,7 @@ class Airframe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Body(NamedTuple):
-    """Where a rigid body is, and how it moves.
+    """Pose of a rigid body, and its motion.
 
     Example:
         >>> Body((0.0, 0.0, 30.0)).velocity

@@ -41,7 +41,7 @@ _REST: Vector = (0.0, 0.0, 0.0)
 
 
 class Battery(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the energy comes from: torque times speed at the rotors' shafts, over an efficiency.
+    """Battery, from which the energy comes: torque times speed at the rotors' shafts, over an efficiency.
 
     Example:
         >>> Battery(capacity_wh=77.0).drive_efficiency
@@ -57,7 +57,7 @@ class Battery(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a quadrotor is commanded; without a target, points or an attitude, a velocity.
+    """Order to a quadrotor; without a target, points or an attitude, a velocity.
 
     Example:
         >>> Order(target=(10.0, 0.0, 30.0), speed=5.0).velocity
@@ -149,7 +149,7 @@ class Controller(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class Attitude(NamedTuple):
-    """What the attitude loop strives for."""
+    """Set-point of the attitude loop."""
 
     orientation: UnitQuaternion
     thrust: float
@@ -180,7 +180,7 @@ def braking_speed(distance: float, gain: float, acceleration: float) -> float:
 
 
 class Autopilot:
-    """The loops of the controller, without a state: what they keep is in `quadrotor.state`.
+    """The loops of the controller, without a state: what they keep is in `QuadrotorState`.
 
     Args:
         airframe: The quadrotor.

@@ -173,7 +173,7 @@ class Quadrotor:
         return events
 
     def seen_after(self, length_ns: int, order: Order | None, number: int) -> QuadrotorState:
-        """What it will be like within a slice.
+        """Forecast of what it will be like within a slice.
 
         Args:
             length_ns: Since the end of the last slice [ns]; less than a slice.

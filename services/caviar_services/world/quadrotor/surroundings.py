@@ -1,5 +1,6 @@
-"""Wind: a mean velocity, and gusts of the Dryden spectra at low altitude.
+"""Surroundings of a quadrotor: wind, and contacts with scenery, boxes, other balls and the ground.
 
+The wind is a mean velocity, and gusts of the Dryden spectra at low altitude:
 MIL-F-8785C, "Flying Qualities of Piloted Airplanes" (1980), section 3.7.1.2 (Dryden form of the spectra) and
 section 3.7.3 (low altitude). With the height h [ft], the wind speed W₂₀ at 20 ft and spatial frequencies
 Ω [rad/m]:
@@ -15,8 +16,7 @@ the mean wind, Ω is a frequency of Ω·V. Filters of white noise with these spe
     H_u(s) = σ_u·√(2·T_u) / (1 + T_u·s),   H_v(s) = σ_v·√T_v·(1 + √3·T_v·s) / (1 + T_v·s)²,   T = L/V,
 
 are integrated in closed form over a step, so that variances do not depend on its length.
-
-Contacts of a quadrotor, as a ball, with scenery, boxes, other balls and the ground, and what follows.
+In contacts a quadrotor is a ball.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ SCENERY, GROUND = "scenery", "ground"
 
 
 class Contact(NamedTuple):
-    """Where a ball touches something.
+    """Contact of a ball with something.
 
     Example:
         >>> Contact("scenery", (0.0, 0.0, 1.0), 0.02).velocity

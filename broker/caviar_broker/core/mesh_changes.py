@@ -41,7 +41,7 @@ _IN_EPISODE = (ServiceState.ACTIVE, ServiceState.RESETTING, ServiceState.RESTORI
 
 
 def has_capability(member: Member, capability: str) -> bool:
-    """Whether a service named a capability in its HELLO."""
+    """Return whether a service named a capability in its HELLO."""
     return member.hello is not None and capability in member.hello.capabilities
 
 
@@ -172,7 +172,7 @@ class GeometryLedger:
         return ""
 
     def _takes_changes(self) -> bool:
-        """Whether every service that consumes scenes knows meshes that come while the run goes on."""
+        """Return whether every service that consumes scenes knows meshes that come while the run goes on."""
         hellos = [p.hello for p in self._run.members.values() if p.hello is not None]
         return all(
             hello.version >= GEOMETRY_SINCE
@@ -275,7 +275,7 @@ class GeometryLedger:
         return True
 
     def is_lacking(self, service: str, frame: int) -> bool:
-        """Whether a service has yet to load the meshes of a frame."""
+        """Return whether a service has yet to load the meshes of a frame."""
         awaited = self._awaited.get(service)
         return awaited is not None and any(order.frame <= frame for order in awaited)
 
