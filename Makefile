@@ -45,7 +45,7 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
 
-check: lint ## In a minute: lint, and the unit tests that are quick
+check: lint ## Lint, and the unit tests that are quick
 	@$(BIN)/pytest --quiet --numprocesses=2 --dist=loadfile -m "not slow" tests/unit tests/vectors
 
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes

@@ -194,7 +194,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     """Leave out files that are marked `slow` as a whole, whose imports take longer than all other tests."""
     if config.option.markexpr != "not slow" or collection_path.suffix != ".py":
         return None
-    return bool(re.search(r"^pytestmark = .*\bmark\.slow\b", collection_path.read_text(), re.M)) or None
+    marked = r"^pytestmark = (\[[^\]]*)?\bpytest\.mark\.slow\b"
+    return bool(re.search(marked, collection_path.read_text(), re.M)) or None
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,13 @@ from caviar_protocol.cell.link_adaptation import BlockTable, effective_sinr, out
 from caviar_services.link.nr import load_tables
 from caviar_services.service import no_progress
 
-pytestmark = pytest.mark.slow
-
-pytest.importorskip("sionna.sys")
+pytestmark = [
+    pytest.mark.slow,
+    # Not imported here: PyTorch, which it brings, takes seconds in every process that collects tests.
+    pytest.mark.skipif(
+        find_spec("sionna") is None or find_spec("sionna.sys") is None, reason="Sionna SYS is not installed"
+    ),
+]
 
 COUNTS = {400, 9505}
 SCHEMES = np.arange(2, 28)
