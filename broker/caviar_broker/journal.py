@@ -2,13 +2,12 @@
 
 `JournalFile` writes entries, puts them on the disk and compacts itself, in the thread that calls it.
 
-Writer of the journal: when entries count as handed over, and when they go to the disk.
-
-Clause 18 says that nothing relies on an entry before it is handed over: `JournalWriter.confirmed` counts
-entries for which ``write`` has returned, so that they outlive the broker's process, and that under
-``durability = "frame"`` are on the disk. Under ``periodic`` a thread puts the recording, then the journal on
-the disk twice in `SYNC_PERIOD_S`; where that takes longer, no more entries are confirmed, so that no more
-than `SYNC_PERIOD_S` of the run is in danger.
+`JournalWriter` says when entries count as handed over, and when they go to the disk. Clause 18 says that
+nothing relies on an entry before it is handed over: `JournalWriter.confirmed` counts entries for which
+``write`` has returned, so that they outlive the broker's process, and that under ``durability = "frame"``
+are on the disk. Under ``periodic`` a thread puts the recording, then the journal on the disk twice in
+`SYNC_PERIOD_S`; where that takes longer, no more entries are confirmed, so that no more than
+`SYNC_PERIOD_S` of the run is in danger.
 """
 
 from __future__ import annotations

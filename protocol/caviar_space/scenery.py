@@ -1,7 +1,8 @@
 """Scenery of a world: where its files come from, and its triangles.
 
 A source finds or makes the description, Mitsuba's XML (`caviar_space.mitsuba_xml`), which travels to the
-services with the meshes that it names. A new source of scenery is a function here, and a row in `SOURCES`.
+services with the meshes that it names. A new source of scenery is a function here, and a row in `SOURCES`;
+one of another format writes what `mitsuba_xml.scenery_files` makes of it, and finds that.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from caviar_protocol.host import install_command
 from caviar_space.mitsuba_xml import read_scenery, world_mesh
 
 
-def scenery_assets(scenery: str) -> dict[str, Path | bytes]:
+def scenery_assets(scenery: str) -> dict[str, Path]:
     """Find the files that a world's ``scenery`` setting stands for.
 
     Args:
@@ -108,7 +109,7 @@ SOURCES: Mapping[str, Callable[[str], Path]] = {
 """Finds the description by what follows the name of the source and a colon."""
 
 
-def scenery_triangles(assets: Mapping[str, Path | bytes]) -> Float64Array:
+def scenery_triangles(assets: Mapping[str, Path]) -> Float64Array:
     """Read all triangles of a world's scenery.
 
     Args:
@@ -125,9 +126,7 @@ def scenery_triangles(assets: Mapping[str, Path | bytes]) -> Float64Array:
         (0, 3, 3)
     """
     descriptions = [
-        content
-        for name, content in sorted(assets.items())
-        if PurePosixPath(name).match("scenery/*.xml") and isinstance(content, Path)
+        file for name, file in sorted(assets.items()) if PurePosixPath(name).match("scenery/*.xml")
     ]
     meshes = [world_mesh(shape) for xml in descriptions for shape in read_scenery(xml).shapes]
     return np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])

@@ -3,8 +3,6 @@
 From messages: what the service knows about the run, the frame with its inputs, what products are checked for.
 To messages: DONE with products, encoded or as they are, and FAULT. The newest answers are kept, for a GRANT
 that is repeated.
-
-The line of a service's own code, for texts that say where it waits or failed.
 """
 
 from __future__ import annotations

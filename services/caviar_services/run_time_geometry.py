@@ -4,7 +4,7 @@
 that of the services that load them: GEOMETRY says which there are from a frame on, the files are fetched
 beside the frames, and the service uses them from that frame on.
 
-Files fetched from the broker by digest: scenery, and files for one service alone.
+`AssetFetcher` fetches files from the broker by digest: scenery, and files for one service alone.
 """
 
 from __future__ import annotations

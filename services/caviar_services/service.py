@@ -9,8 +9,6 @@ Life of a service: ``__init__`` → ``scenery`` (worlds) → ``prepare`` → per
 ``step`` for each frame, ``end_episode`` → ``close``. What a service with state knows after a frame
 it saves with ``checkpoint``; another process takes it over with ``restore``, after ``reset`` of the
 same episode, and continues with the same bytes (`checkpoint` makes bytes of a struct, and checks them).
-
-What methods that users write return, checked where they can still be named.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 Every beam pair of every user is swept (`sweep_users`), so that the chosen pair stands beside the best one
 (paper, eq. 2) and beside the pair along the straight line (the baseline of section 4).
 
-Sweep of DFT codebooks, and what beam pairs get over the band.
-
 Each end has one RF chain and the DFT codebook of its array (paper, section 2.1). Every beam pair of every
 user is swept each frame (eq. 1, `caviar_protocol.space.beams.beam_gains`).
 
@@ -15,7 +13,7 @@ Over the band and the slots of a frame the equivalent channel (eq. 1) of a pair 
 with the phases r_p and t_p of the elements on path p: two numbers a path instead of a matrix a subcarrier
 (`beam_responses`).
 
-Interference: what receivers get from transmitters that serve others at the same time, on the same carrier.
+Interference (`Interferers`) comes from transmitters that serve others at the same time on the same carrier.
 
 Receiver u listens with its beam w_u; a transmitter x serves its users v with beams f_v and spreads its power
 P_x evenly over those that it serves at once or in turn, K_x of them. Beside the noise N_u there is

@@ -1,15 +1,14 @@
 """Bits that slots carry for the terminals that they serve: SINR with interference, and rate models.
 
-Channels at the instants of slots and over the band, for chosen beams, from the paths of a channel product.
-
-Δt after the frame's instant and Δf from the carrier, the equivalent channel of TX beam f and RX beam w is
+Channels of chosen beams follow from the paths of a channel product. Δt after the frame's instant and Δf
+from the carrier, the equivalent channel of TX beam f and RX beam w is
 
     y(Δf, Δt) = Σ_p (w* r_p) · (t_pᵀ f) · a_p · exp(j2π(ν_p·Δt − Δf·(τ_p − Δt·ν_p/f_c)))
 
 with the phases r_p and t_p of the elements on path p (`beam_scores`): Doppler shifts ν turn the phases of the
 paths against each other within a frame, delays τ over the band.
 
-Association: which transmitter serves a receiver, and what it costs to change.
+`associate` says which transmitter serves a receiver, and what it costs to change.
 """
 
 from __future__ import annotations

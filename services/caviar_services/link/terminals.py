@@ -1,6 +1,6 @@
 """Receivers with a buffer on each carrier: what arrives for them, what waits, and who was served when.
 
-Settings of the link ``cell``: traffic, slots, scheduler, rates.
+`CellSettings` are those of the link ``cell``: traffic, slots, scheduler, rates.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ where the way through it and to a stop after it is free. Otherwise the part of t
 leads into what is in the way is taken off; at last the object brakes, the way for which was found
 free before. So speed, acceleration and clearance hold at once, at any speed.
 
-Commands of agents for flown objects, in the terms of what flies them: points and quadrotors.
+Commands of agents stand here in the terms of what flies the objects: points and quadrotors.
 """
 
 from __future__ import annotations

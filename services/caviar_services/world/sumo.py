@@ -1,8 +1,7 @@
 """World ``sumo``: road traffic and people of Eclipse SUMO, in this process.
 
-World ``sumo-actuated``: the world ``sumo`` whose vehicles and traffic lights agents command.
-
-It is an implementation of its own because commands close the loop: a frame waits for the actions of the one
+``sumo-actuated`` is the world ``sumo`` whose vehicles and traffic lights agents command. It is an
+implementation of its own because commands close the loop: a frame waits for the actions of the one
 before, while frames of ``sumo`` overlap.
 """
 

@@ -11,7 +11,7 @@ D'Andrea, "Nonlinear Quadrocopter Attitude Control", ETH Zurich, 2013):
 
 so that small errors obey ε̈ + 2·ζ·ω_a·ε̇ + ω_a²·ε = 0 but for the lag of the rotors.
 
-What a quadrotor is commanded, what its battery is like, and the state that its flight goes on from.
+Commands of a quadrotor, its battery, and the state that its flight goes on from stand here, too.
 """
 
 from __future__ import annotations
