@@ -23,7 +23,7 @@ class Drawn(NamedTuple):
 
 
 class Draws(Protocol):
-    """Where a simulation has its random numbers from."""
+    """Sources of the random numbers of a simulation."""
 
     def seed(self, member: int, random: np.random.Generator, seed: int) -> None:
         """Begin the stream of a member anew.

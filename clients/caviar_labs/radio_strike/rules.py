@@ -56,7 +56,7 @@ _POWER_DBM, _TEMPERATURE_K, _BOLTZMANN = 30.0, 290.0, 1.380649e-23
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """What distinguishes the variants of the environment."""
+    """Rules that distinguish the variants of the environment."""
 
     name: RulesName
     all_move: bool

@@ -84,7 +84,7 @@ class Library:
 
 
 class Outcome(NamedTuple):
-    """What a step led to, of K members; Shape ``[K]``."""
+    """Outcome of a step, of K members; Shape ``[K]``."""
 
     observation: Float64Array
     """Shape ``[K, 7]``: position of the scheduled user [m], packets dropped, sent and buffered, bit rate
@@ -99,7 +99,7 @@ class Outcome(NamedTuple):
     """|y|."""
 
     def info(self) -> dict[str, Any]:
-        """What the original says beside the observation, by its names."""
+        """Information that the original gives beside the observation, by its names."""
         _, _, _, dropped, sent, buffered, rate = self.observation.T
         return {
             "pkts_dropped": dropped,
@@ -173,7 +173,7 @@ class Simulation:
         self._row[member], self._stop[member] = self.library.bounds(episode)
 
     def first_observation(self, member: int) -> Float64Array:
-        """What is observed before the first step: with ``fixed`` the position of the first user, with
+        """Observation before the first step: with ``fixed`` the position of the first user, with
         ``legacy`` zeros. Shape ``[7]``.
 
         Args:

@@ -1,4 +1,4 @@
-"""Where the trajectories of Radio-Strike come from: its files, recordings of CAVIAR, or made up.
+"""Sources of the trajectories of Radio-Strike: its files, recordings of CAVIAR, or made up.
 
 * `read_episode`: an episode file ``ep{N}.csv`` as AirSim wrote it, or the output of an agent of the original,
   in which each row has the position of the scheduled user;
