@@ -276,7 +276,7 @@ def planned_run(scenario: Scenario, run: str, directory: Path, store: AssetStore
     Args:
         scenario: After `with_ownership`.
         run: Its id.
-        directory: Of the run, as services are told.
+        directory: The directory of the run, which the briefings of its services name.
         store: Gets the files of antennas and of trained policies.
         keeps: Whether the directory keeps the policies.
 

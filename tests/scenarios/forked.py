@@ -115,18 +115,18 @@ def main() -> None:
         text, fds, *_ = socket.recv_fds(orders, _LARGEST, 3)
         if not text:
             return
-        told, tell = os.pipe()
+        read_end, write_end = os.pipe()
         between = os.fork()
         if between == 0:
             pid = os.fork()
             if pid:
-                os.write(tell, str(pid).encode())
+                os.write(write_end, str(pid).encode())
                 os._exit(0)
             _become(json.loads(text), fds)
             return
         os.waitpid(between, 0)  # now its child is that of the tests
-        orders.send(os.read(told, 64))
-        for fd in (told, tell, *fds):
+        orders.send(os.read(read_end, 64))
+        for fd in (read_end, write_end, *fds):
             os.close(fd)
 
 

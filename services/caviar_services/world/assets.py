@@ -147,7 +147,7 @@ class RunTimeMeshes:
     @property
     def counts(self) -> Mapping[str, int]:
         """Meshes that were refused since the last call, for the report."""
-        # Told once each: the summary adds counts up.
+        # Each mesh counts once: the summary adds counts up.
         news = [name for name in self._refused if name not in self._told]
         self._told.update(news)
         return {f"{MESH_REFUSED_PREFIX}{name}": 1 for name in news}
