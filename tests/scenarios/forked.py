@@ -22,6 +22,7 @@ import runpy
 import socket
 import subprocess
 import sys
+import threading
 import types
 from pathlib import Path
 from typing import Any
@@ -157,7 +158,17 @@ def _become(order: dict[str, Any], fds: list[int]) -> None:
         _fork_processes_of_runs()
     if "-P" in order["options"]:
         del sys.path[0]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if end.code is not None and not isinstance(end.code, int):
+            raise  # a message is printed, and the status is 1
+        # To free what the process before it has loaded takes longer than most programs.
+        threading._shutdown()
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(end.code or 0)
 
 
 def main() -> None:

@@ -32,9 +32,16 @@ PRELOAD = (
     "caviar_services.runner",
     "caviar_services.agent.baselines",
     "caviar_services.channel.statistical.free_space",
+    "caviar_broker.policies",
     "caviar_services.link.beam_scores",
+    "caviar_services.link.beams",
     "caviar_services.recorder.mcap",
     "caviar_services.world.trajectory",
+    "lz4.frame",
+    "mcap.writer",
+    "numpy.ma",
+    "pydantic.main",
+    "pydantic.type_adapter",
 )
 """What the command, the broker and the services import in most runs."""
 
