@@ -1,7 +1,7 @@
 """Validation of products on the consumer's side: whether a product says what its topic allows.
 
 The broker never looks into a payload, and a decoder checks types and shapes only. What a service
-consumes therefore passes through one `ContentCheck` before the service sees it: a product with a
+consumes therefore passes through one `ProductCheck` before the service sees it: a product with a
 quaternion of norm 2, a negative dimension, a name twice or a number that is none is refused in the first
 frame, and the error names the service that made it. `scene_validation` looks at scenes, `PartCheck` at
 the parts that were asked for.
@@ -204,7 +204,7 @@ class ContentRules(SceneRules, frozen=True, kw_only=True):
     """By topic: the parts of products that the consumer asks for."""
 
 
-class ContentCheck:
+class ProductCheck:
     """Checks the products that one process consumes; one object for all frames of a run.
 
     Names, meshes and devices of a scene are looked at where they differ from those of the scene before,

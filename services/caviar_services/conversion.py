@@ -28,7 +28,7 @@ from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.codebooks import codebook_digest, codebook_file
 from caviar_protocol.topics import PAYLOADS, Carrier
-from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_protocol.validation import ContentRules, ProductCheck
 from caviar_services.service import (
     Frame,
     FrameInput,
@@ -199,7 +199,7 @@ def granted_frame(
 
 
 def frame_inputs(
-    grant: m.Grant, parts: Sequence[Any], check: ContentCheck, *, encoded: bool
+    grant: m.Grant, parts: Sequence[Any], check: ProductCheck, *, encoded: bool
 ) -> tuple[FrameInput, ...]:
     """Inputs of a grant.
 

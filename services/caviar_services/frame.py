@@ -16,7 +16,7 @@ from caviar_protocol.messages import GrantInput, Report, Status
 from caviar_protocol.seeding import generator
 from caviar_protocol.space.scene import merge_scenes
 from caviar_protocol.topics import Scene
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ProductCheck
 
 P = TypeVar("P", bound=Payload)
 
@@ -48,7 +48,7 @@ class FrameInput:
         header: bytes | memoryview = b"",
         body: bytes | memoryview = b"",
         payload: Payload | None = None,
-        check: ContentCheck | None = None,
+        check: ProductCheck | None = None,
     ) -> None:
         self.provenance = provenance
         self.header = header

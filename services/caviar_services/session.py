@@ -24,7 +24,7 @@ from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.codebooks import add_codebook_files
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ProductCheck
 from caviar_services.conversion import (
     Answer,
     Answers,
@@ -108,7 +108,7 @@ class ServiceSession:
         *,
         progress: Progress = no_progress,
         attend: Callable[[], None] = no_orders,
-        check: ContentCheck | None = None,
+        check: ProductCheck | None = None,
         encodes: bool = True,
         tunes_memory: bool = False,
         fetch_timeout_s: float = FETCH_TIMEOUT_S,
@@ -116,7 +116,7 @@ class ServiceSession:
         self.name, self.use, self.cls = name, use, cls
         self._send, self._store, self._progress, self._attend = send, store, progress, attend
         self._encodes, self._tunes_memory = encodes, tunes_memory
-        self._check = check or ContentCheck()
+        self._check = check or ProductCheck()
         # A frame clock in the same process repeats no GRANT: answers would be kept for nothing.
         self._answers = Answers() if check is None else None
         self._service: Service[Any] | None = None

@@ -21,7 +21,7 @@ from observation_builders import (
 )
 
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.observations import PARTS, Part, Users, part
+from caviar_protocol.observations import OBSERVATION_PARTS, Part, Users, part
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import (
@@ -222,7 +222,7 @@ def test_a_mistake_is_named_with_what_to_write(scenario: Scenario, name: str, to
     assert told in str(error.value)
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", OBSERVATION_PARTS)
 def test_zeros_are_in_the_space_of_every_part(scenario: Scenario, name: str) -> None:
     sensor = {"camera": ":wall", "depth": ":wall"}.get(name, "")
     found: Part = part(scenario, Users(scenario, ("*",)), name + sensor)

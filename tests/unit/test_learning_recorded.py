@@ -18,7 +18,7 @@ from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.learning.recorded import RecordedBeamsEnv, RecordedBeamsVectorEnv
 from caviar_clients.learning.tracks import read_tracks
 from caviar_protocol.errors import CaviarError, PayloadError, RunError, ScenarioError
-from caviar_protocol.observations import PARTS, is_feedback
+from caviar_protocol.observations import OBSERVATION_PARTS, is_feedback
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import find_scenario, load_scenario, parse_scenario
 
@@ -178,7 +178,12 @@ def test_dqn_of_stable_baselines3_trains_on_it(geometric: tuple[Path, Path]) -> 
 
 def test_which_parts_are_fed_back() -> None:
     of_packets = ["last_throughput", "buffered", "waiting"]
-    assert [n for n in PARTS if is_feedback(n)] == ["last_abs_y", "last_rate", "last_beam", *of_packets]
+    assert [n for n in OBSERVATION_PARTS if is_feedback(n)] == [
+        "last_abs_y",
+        "last_rate",
+        "last_beam",
+        *of_packets,
+    ]
     assert not is_feedback("no_such_part")
 
 

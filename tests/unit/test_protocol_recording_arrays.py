@@ -44,7 +44,7 @@ from caviar_protocol.topics import (
     SegmentationImage,
     WaypointCommand,
 )
-from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_protocol.validation import ContentRules, ProductCheck
 from caviar_services.service import FrameInput
 
 pytestmark = pytest.mark.slow
@@ -432,7 +432,7 @@ def test_paths_without_h_say_how_to_record_it(tmp_path: Path) -> None:
 
 def test_a_recorder_that_asks_for_a_part_refuses_a_channel_without_it(tmp_path: Path) -> None:
     made = recorder(tmp_path, run={"record": ("channel.h",)})
-    check = ContentCheck(ContentRules(parts=made.parts))
+    check = ProductCheck(ContentRules(parts=made.parts))
     bare = product("channel", "rt", channel(0), 0)
     with pytest.raises(ProductError, match="channel of 'rt', frame 0: part 'h' is in demand"):
         made.step(frame(0, FrameInput(bare.provenance, bare.header, bare.body, check=check)))

@@ -34,7 +34,7 @@ from caviar_protocol.topics import (
     WaypointCommand,
 )
 from caviar_protocol.topics.scene import Device, Panel
-from caviar_protocol.validation import FIRST_LOOKS, ContentCheck, check_digest, wrong_values
+from caviar_protocol.validation import FIRST_LOOKS, ProductCheck, check_digest, wrong_values
 
 COUNT = 20
 NAMES = tuple(f"car.{index:02d}" for index in range(COUNT))
@@ -169,7 +169,7 @@ WRONG: dict[str, tuple[Callable[[], Scene], str]] = {
 
 
 def test_a_right_scene_passes_in_one_process_and_over_the_wire() -> None:
-    check = ContentCheck(RULES)
+    check = ProductCheck(RULES)
     check(entry(), scene())
     header, body = encode_payload(scene())
     check(entry(), decode_payload("scene", header, body), header)
@@ -180,7 +180,7 @@ def test_a_right_scene_passes_in_one_process_and_over_the_wire() -> None:
 @pytest.mark.parametrize("travels", [False, True])
 def test_a_wrong_scene_is_refused_by_object_field_and_value(wrong: str, travels: bool) -> None:
     make, words = WRONG[wrong]
-    check = ContentCheck(RULES)
+    check = ProductCheck(RULES)
     check(entry(), scene(), b"the header of a right scene" if travels else b"")
     with pytest.raises(ProductError, match=f"^scene of 'world', frame 3: .*{words}") as caught:
         check(entry(), make(), b"another header" if travels else b"")
@@ -191,18 +191,18 @@ def test_what_the_run_does_not_say_is_not_checked() -> None:
     lone = scene(names=("a",), classes=("x",), assets=("y",), devices=(), **{
         field: getattr(scene(), field)[:1] for field in ("position", "orientation", "velocity", "dimensions")
     })  # fmt: skip
-    ContentCheck()(entry(), lone)
+    ProductCheck()(entry(), lone)
     nothing = scene(names=(), classes=(), assets=(), devices=(), **{
         field: getattr(scene(), field)[:0] for field in ("position", "orientation", "velocity", "dimensions")
     })  # fmt: skip
-    ContentCheck()(entry(), nothing)
+    ProductCheck()(entry(), nothing)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_an_array_with_fewer_or_more_panels_than_the_scenario_says_is_refused(count: int) -> None:
     array = AntennaArray(columns=4, panels=(Panel(), Panel(yaw_deg=180.0)))
     specs = (SPECS[0], replace(SPECS[1], array=array), SPECS[2])
-    check = ContentCheck(replace(RULES, devices={"world": specs}))
+    check = ProductCheck(replace(RULES, devices={"world": specs}))
     wrong = replace(array, panels=(Panel(),) * count)
     devices = (BS, EYE, replace(A, array=wrong), replace(B, array=array))
     with pytest.raises(
@@ -214,14 +214,14 @@ def test_an_array_with_fewer_or_more_panels_than_the_scenario_says_is_refused(co
 
 
 def test_a_device_that_changes_under_equal_names_is_noticed() -> None:
-    check = ContentCheck(RULES)
+    check = ProductCheck(RULES)
     check(entry(), scene())
     with pytest.raises(ProductError, match="is missing"):
         check(entry(), scene(devices=(EYE, A, B)))
 
 
 def test_worlds_are_checked_by_their_own_rules() -> None:
-    check = ContentCheck(RULES)
+    check = ProductCheck(RULES)
     check(entry(), scene())
     other = GrantInput(topic="scene", source="air", status=Status.FRESH, frame=3)
     check(other, scene(devices=()))
@@ -312,7 +312,7 @@ VALUES: dict[str, tuple[Callable[[], Payload], str]] = {
 def test_wrong_values_of_other_topics_are_refused(wrong: str) -> None:
     make, words = VALUES[wrong]
     with pytest.raises(ProductError, match=words):
-        ContentCheck()(entry("channel"), make())
+        ProductCheck()(entry("channel"), make())
 
 
 @pytest.mark.parametrize("topic", ["channel", "link", "lidar", "depth"])
@@ -339,7 +339,7 @@ def test_a_scene_of_which_a_channel_was_made_is_looked_at_by_the_channel_alone_a
     vouched = GrantInput(topic="channel", source="channel", status=Status.FRESH, frame=3)
     wrong = scene(orientation=2 * scene().orientation)
     header, _ = encode_payload(scene())
-    check = ContentCheck(RULES)
+    check = ProductCheck(RULES)
     check.begin([entry(), vouched])
     for _ in range(FIRST_LOOKS):
         assert check.is_due(entry())
@@ -355,7 +355,7 @@ def test_a_scene_of_which_a_channel_was_made_is_looked_at_by_the_channel_alone_a
 
 def test_a_false_digest_is_refused_in_the_first_products_of_a_source() -> None:
     header, body = encode_payload(scene())
-    check, false = ContentCheck(RULES), entry(digest="0" * 64)
+    check, false = ProductCheck(RULES), entry(digest="0" * 64)
     with pytest.raises(ProductError, match="its digest is"):
         check.digest(false, header, body)
     for _ in range(FIRST_LOOKS):
@@ -381,7 +381,7 @@ def cost_us(call: Callable[[], object]) -> float:
 
 def test_a_scene_of_twenty_objects_is_checked_within_20_us() -> None:
     """6 µs on the machine that it was written on."""
-    check, right = ContentCheck(RULES), scene()
+    check, right = ProductCheck(RULES), scene()
     header, _ = encode_payload(right)
     check(entry(), right, header)
     told = entry()
@@ -389,7 +389,7 @@ def test_a_scene_of_twenty_objects_is_checked_within_20_us() -> None:
 
 
 def test_a_product_of_this_process_is_checked_once() -> None:
-    check, right = ContentCheck(RULES), scene()
+    check, right = ProductCheck(RULES), scene()
     check(entry(), right)
     right.orientation[0] = 2.0  # which no producer does, and would be noticed
     check(entry(), right)

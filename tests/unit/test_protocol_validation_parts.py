@@ -24,7 +24,7 @@ from caviar_protocol.topics import (
     Intrinsics,
     Panel,
 )
-from caviar_protocol.validation import ContentCheck, ContentRules, PartCheck
+from caviar_protocol.validation import ContentRules, PartCheck, ProductCheck
 
 WIDE = Carrier(name="wide", frequency_hz=28e9, subcarriers=5, subcarrier_spacing_hz=1e5, taps=3, slots=2)
 CARRIERS = (Carrier(name="narrow", frequency_hz=3e9), WIDE)
@@ -108,7 +108,7 @@ WRONG: dict[str, tuple[Callable[[], Channel], str]] = {
 
 def checked(payload: Channel, demand: frozenset[str] = ALL) -> None:
     rules = ContentRules(devices={"world": SPECS}, carriers=CARRIERS, parts={"channel": demand})
-    check = ContentCheck(rules)
+    check = ProductCheck(rules)
     check(GrantInput(topic="channel", source="rays", status=Status.FRESH, frame=0), payload)
 
 
@@ -130,7 +130,7 @@ def test_a_part_that_no_carrier_has_is_empty() -> None:
     narrow = CARRIERS[:1]
     made = channel(carriers=narrow, h=RIGHT.h[:2], hf=(), taps=(), a=RIGHT.a[:1], doppler=RIGHT.doppler[:1])
     rules = ContentRules(devices={"world": SPECS}, carriers=narrow, parts={"channel": ALL})
-    ContentCheck(rules)(GrantInput(topic="channel", source="rays", status=Status.FRESH, frame=0), made)
+    ProductCheck(rules)(GrantInput(topic="channel", source="rays", status=Status.FRESH, frame=0), made)
 
 
 def test_what_is_not_known_of_the_scenario_is_not_compared() -> None:
@@ -140,7 +140,7 @@ def test_what_is_not_known_of_the_scenario_is_not_compared() -> None:
 
 
 def test_what_one_consumer_of_a_process_asks_for_stays_asked_for() -> None:
-    check = ContentCheck()
+    check = ProductCheck()
     check.adopt(ContentRules(parts={"channel": frozenset({"hf"})}))
     check.adopt(ContentRules(parts={"channel": frozenset({"h"}), "lidar": frozenset()}))
     with pytest.raises(ProductError, match="'hf'"):

@@ -15,7 +15,7 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Grant, Reset
 from caviar_protocol.topics import Carrier
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ProductCheck
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.conversion import granted_frame
 from caviar_services.service import Frame, NoSettings, RunInfo, Service, StepResult
@@ -147,7 +147,7 @@ def test_a_frame_is_answered_from_outside_once(tmp_path: Path) -> None:
     sent: list[m.Message] = []
     session = OutsideSession(
         "sensor", "town", Town, lambda message, _: sent.append(message), AssetStore(tmp_path),
-        check=ContentCheck(), encodes=False,
+        check=ProductCheck(), encodes=False,
     )  # fmt: skip
     session.handle(WELCOME)
     session.handle(m.Reset(**IDENTITY, episode=0, seed=1, t0_ns=0))

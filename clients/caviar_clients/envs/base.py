@@ -213,7 +213,7 @@ class SessionEnv(gymnasium.Env[Observation, A], Generic[A]):
         agent: Name of the agent whose place is taken; None: the remote one, or the only one.
         users: Receivers served, as names with ``*`` and ``?``.
         transmitters: Transmitters that serve them, likewise; the users of others have no beams.
-        observe: Names of the parts of the observation: `caviar_protocol.observations.PARTS`.
+        observe: Names of the parts of the observation: `caviar_protocol.observations.OBSERVATION_PARTS`.
         reward: What the reward is: `caviar_clients.envs.base.Reward`.
         directory: Where an embedded run records; None: it does not, which is faster.
         render_mode: ``rgb_array``: a map of the scene.

@@ -238,7 +238,7 @@ class UavPathEnv(FlightEnv):
         no_fly_m: Boxes to keep out of, each as its lowest and its highest corner [m]. Starts, goals and
             addresses are drawn outside of them; nothing but the reward keeps the object out.
         weights: Of the parts: `Weights`, by name; what is left out has its default.
-        observe: Further parts: `caviar_protocol.observations.PARTS`; their bounds are their own.
+        observe: Further parts: `caviar_protocol.observations.OBSERVATION_PARTS`; their bounds are their own.
         options: The other arguments of `SessionEnv`, but for ``reward``.
 
     Raises:

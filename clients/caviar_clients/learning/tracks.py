@@ -130,7 +130,8 @@ def read_tracks(
 
     Args:
         recordings: Directories of runs that recorded topics ``scene`` and ``channel``, with part ``h``.
-        observe: Parts of the observation, as in `caviar_protocol.observations.PARTS`; none of sensors.
+        observe: Parts of the observation, as in `caviar_protocol.observations.OBSERVATION_PARTS`;
+            none of sensors.
         users: Receivers, as names with ``*`` and ``?``.
         carrier: By its name; None: the first.
 

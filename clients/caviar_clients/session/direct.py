@@ -20,7 +20,7 @@ from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError, one_line
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario.conversion import located
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ProductCheck
 from caviar_services.conversion import decoded
 from caviar_services.service import Frame, FrameInput, StepResult
 from caviar_services.session import ServiceSession
@@ -53,7 +53,7 @@ class _Part:
     session: ServiceSession
     is_agent: bool
     budget_ns: int
-    check: ContentCheck | None
+    check: ProductCheck | None
     """Of its products; None: it is one of CAVIAR's own. Checks would take an eighth of a step of training."""
     outputs: tuple[str, ...]
     """Topics in demand."""
@@ -87,7 +87,7 @@ class DirectFrames:
         plan: RunPlan,
         graph: Graph,
         sessions: Mapping[str, ServiceSession],
-        check: ContentCheck,
+        check: ProductCheck,
         reset: m.Reset,
         sent: deque[ev.Event],
         notice: Callable[[ev.Notice], None],

@@ -38,7 +38,7 @@ from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.validation import ContentCheck
+from caviar_protocol.validation import ProductCheck
 from caviar_services.conversion import Answer, sorted_products
 from caviar_services.registry import with_inputs
 from caviar_services.service import Service, StepResult
@@ -202,7 +202,7 @@ class EmbeddedRun:
         # Seats alone: a run that plays by itself is measured and watched frame by frame, by the clock.
         self._without_clock = directory is None and bool(seats) and plays_directly(plan)
         self._reset: m.Reset | None = None  # the last one
-        self._check = check = ContentCheck()
+        self._check = check = ProductCheck()
 
         def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
             use, send = scenario.services[name].use, partial(self._take, name)

@@ -87,7 +87,7 @@ def check_traffic(traffic: Traffic, place: Place) -> None:
         if key in model.needs and not given:
             raise place.at(key).error(f"is missing; {traffic.model!r} needs {', '.join(model.needs)}")
         if given and key not in model.needs:
-            models = ", ".join(repr(name) for name, row in MODELS.items() if key in row.needs)
+            models = ", ".join(repr(name) for name, row in TRAFFIC_MODELS.items() if key in row.needs)
             raise place.at(key).error(
                 f"has no effect with model {traffic.model!r}; leave it out, or choose {models}"
             )
@@ -177,7 +177,7 @@ class TrafficModel(NamedTuple):
     """Whether the packets of each slot are drawn from a Poisson distribution of the mean that is offered."""
 
 
-MODELS: Mapping[str, TrafficModel] = {
+TRAFFIC_MODELS: Mapping[str, TrafficModel] = {
     "full": TrafficModel(_steady),
     "constant": TrafficModel(_steady, ("rate_bit_s",)),
     "poisson": TrafficModel(_steady, ("rate_bit_s",), random=True),
@@ -200,11 +200,13 @@ def traffic_model(name: str, place: Place) -> TrafficModel:
         ScenarioError: There is none of this name; names the key, and the models there are.
         DeclarationError: The plug-in cannot be loaded, or is no `TrafficModel`.
     """
-    if name in MODELS:
-        return MODELS[name]
+    if name in TRAFFIC_MODELS:
+        return TRAFFIC_MODELS[name]
     added = plugins(TRAFFIC_PLUGINS)
     if name not in added:
-        raise place.at("model").error(f"{name!r} is no traffic model; {suggestion(name, [*MODELS, *added])}")
+        raise place.at("model").error(
+            f"{name!r} is no traffic model; {suggestion(name, [*TRAFFIC_MODELS, *added])}"
+        )
     return load_plugin(added[name], TrafficModel)
 
 

@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.observations.parts import (
     FAR,
-    PARTS,
+    OBSERVATION_PARTS,
     Bounds,
     LinkFigures,
     Moment,
@@ -31,7 +31,7 @@ from caviar_protocol.plugins import plugin_class, plugins
 
 __all__ = [
     "FAR",
-    "PARTS",
+    "OBSERVATION_PARTS",
     "Bounds",
     "KnownDevices",
     "KnownScenario",
@@ -54,7 +54,7 @@ def is_feedback(name: str) -> bool:
     """Return whether a part is read from the link of the frame before alone, and from nothing of the scene.
 
     Args:
-        name: Of the part, as in `PARTS`.
+        name: Of the part, as in `OBSERVATION_PARTS`.
 
     Example:
         >>> is_feedback("last_beam"), is_feedback("position")
@@ -92,7 +92,7 @@ def part_class(name: str) -> type[Part] | None:
         DeclarationError: The plug-in cannot be loaded, or is no `Part`.
     """
     kind = name.partition(":")[0]
-    return PARTS.get(kind) or plugin_class(PART_PLUGINS, kind, Part)  # type: ignore[type-abstract]  # compared, never made
+    return OBSERVATION_PARTS.get(kind) or plugin_class(PART_PLUGINS, kind, Part)  # type: ignore[type-abstract]  # compared, never made
 
 
 def part(scenario: KnownScenario, users: Users, name: str) -> Part:
@@ -101,7 +101,7 @@ def part(scenario: KnownScenario, users: Users, name: str) -> Part:
     Args:
         scenario: Has the devices.
         users: The places.
-        name: Of the part, as in `PARTS`; of a sensor's, the sensor may stand after a colon.
+        name: Of the part, as in `OBSERVATION_PARTS`; of a sensor's, the sensor may stand after a colon.
 
     Raises:
         ScenarioError: The part does not exist, or its sensor does not; the text has those there are.
@@ -109,7 +109,7 @@ def part(scenario: KnownScenario, users: Users, name: str) -> Part:
     kind, _, sensor = name.partition(":")
     cls = part_class(kind)
     if cls is None:
-        known = [*PARTS, *plugins(PART_PLUGINS)]
+        known = [*OBSERVATION_PARTS, *plugins(PART_PLUGINS)]
         near = get_close_matches(kind, known, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ScenarioError(f"no observation is called {name!r}; {hint}there are: {', '.join(known)}")
@@ -136,7 +136,7 @@ class Observer:
     Args:
         scenario: Has the devices.
         users: The places.
-        names: Of the parts, as in `PARTS`.
+        names: Of the parts, as in `OBSERVATION_PARTS`.
 
     Raises:
         ScenarioError: A part does not exist, or its sensor does not; the text has those there are.

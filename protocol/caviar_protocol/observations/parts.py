@@ -1,6 +1,6 @@
 """Parts of the observation, each a class: angles, positions, the link of the frame before, packets, sensors.
 
-To add one: a subclass of `Part` here, and a line in `PARTS`.
+To add one: a subclass of `Part` here, and a line in `OBSERVATION_PARTS`.
 """
 
 from __future__ import annotations
@@ -455,7 +455,7 @@ def _grid_shape(scenario: KnownScenario) -> tuple[int, int, int]:
     raise ScenarioError("observation 'lidar_grid' needs [services.<lidar>.settings.grid] in the scenario")
 
 
-PARTS: Mapping[str, type[Part]] = {
+OBSERVATION_PARTS: Mapping[str, type[Part]] = {
     "aoa": AngleOfArrival,
     "aod": AngleOfDeparture,
     "departure": Departure,

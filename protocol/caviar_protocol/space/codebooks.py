@@ -312,6 +312,7 @@ def codebook_of(array: AntennaArray) -> Codebook:
     return cls(array, argument)
 
 
+@lru_cache(maxsize=256)
 def beam_count(array: AntennaArray) -> int:
     """Number of beams of an array's codebook."""
     return codebook_of(array).beams
