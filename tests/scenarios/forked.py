@@ -120,17 +120,16 @@ def _fork_processes_of_runs() -> None:
     theirs.close()
     global _nursery
     _nursery = lambda preload: ours  # noqa: E731
-    fork_services()
+    importlib.import_module(_OF_A_RUN).subprocess = forking()
 
 
-def fork_services(preload: tuple[str, ...] = ()) -> None:
-    """Let the launcher of this process start the broker and the services as forks."""
+def forking(preload: tuple[str, ...] = ()) -> types.SimpleNamespace:
+    """Module `subprocess` with forks in place of processes: what a test gives the launcher."""
 
     def start(command: list[str], **more: Any) -> subprocess.Popen[Any]:
         return Forked(command, preload, **more)
 
-    launch = importlib.import_module(_OF_A_RUN)
-    launch.subprocess = types.SimpleNamespace(**vars(subprocess) | {"Popen": start})
+    return types.SimpleNamespace(**vars(subprocess) | {"Popen": start})
 
 
 def _become(order: dict[str, Any], fds: list[int]) -> None:
