@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from forked import Forked
 from scenarios_support import ROOT, blocks
 from typer.testing import CliRunner
 
@@ -42,6 +43,10 @@ def written(folder: Path, steps: int, seeds: str = "[1, 2]", observe: str = "aod
     return file
 
 
+PRELOAD = ("caviar_clients.cli.main", "caviar_clients.cli.learning", "caviar_clients.learning.training")
+"""Imported once, and with it PyTorch."""
+
+
 def results(folder: Path) -> dict[int, str]:
     """SHA-256 of the policy of each seed that is done."""
     found = [json.loads(path.read_text()) for path in folder.glob("beams/*/result.json")]
@@ -62,8 +67,8 @@ def train(file: Path, out: str, jobs: int = 2) -> subprocess.Popen[str]:
         "--jobs",
         str(jobs),
     ]
-    return subprocess.Popen(
-        command, cwd=file.parent, start_new_session=True, text=True,
+    return Forked(
+        command, PRELOAD, cwd=file.parent, start_new_session=True, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
 
