@@ -200,7 +200,6 @@ _MODULES = {
     "world": "libsumo",
     "datasets": "distributed",
     "learning": "stable_baselines3",
-    "geo": "pyproj",
     "plot": "matplotlib",
     "mavlink": "pymavlink",
     "mujoco": "mujoco",
