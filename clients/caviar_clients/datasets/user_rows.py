@@ -21,6 +21,7 @@ from caviar_protocol.recording.topics import TOPIC_ARRAYS
 from caviar_protocol.topics import Lidar, Link, topics_of
 
 if TYPE_CHECKING:
+    from caviar_clients.datasets.impulse_responses import ImpulseResponses
     from caviar_clients.datasets.reader import Dataset
     from caviar_clients.datasets.torch_data import UserBatches, UserSamples
 
@@ -104,6 +105,11 @@ class Users:
     def __init__(self, dataset: Dataset, table: Columns) -> None:
         self._dataset, self._table = dataset, table
 
+    @property
+    def dataset(self) -> Dataset:
+        """The dataset that they are of."""
+        return self._dataset
+
     def __len__(self) -> int:
         """Number of users."""
         return len(self._table)
@@ -157,6 +163,14 @@ class Users:
         except IndexError as error:
             raise IndexError(f"users[{_shown(name)}]: {error}; {has}, as a slice, list or mask") from None
         return Users(self._dataset, self._table.where(rows))
+
+    def of(self, dataset: Dataset) -> Users:
+        """Take the users of some of these episodes.
+
+        Args:
+            dataset: The episodes, as `Dataset.select` gives them.
+        """
+        return Users(dataset, self._table.where(np.isin(self._table["episode"], dataset.episodes)))
 
     def read(self, names: Sequence[str]) -> Columns:
         """Read several columns and recorded arrays at once, each scene once.
@@ -238,6 +252,24 @@ class Users:
         check_batches(size, shuffle)
         order = np.arange(len(self)) if shuffle is None else self._shuffled(shuffle)
         return [self[order[start : start + size]] for start in range(0, len(order), size)]
+
+    def cir(
+        self, *, time_steps: int = 1, sampling_frequency: float = 1.0, paths: int | None = None
+    ) -> ImpulseResponses:
+        """Impulse responses between antenna elements, for Sionna's ``CIRDataset``.
+
+        Args:
+            time_steps: Of each response.
+            sampling_frequency: Of the time steps [Hz].
+            paths: Of each response; None: as many as the user with most has.
+
+        Raises:
+            RecordingError: The users' arrays differ, or have several polarizations or panels.
+            ValueError: There is no time step, or the frequency is not positive.
+        """
+        from caviar_clients.datasets.impulse_responses import ImpulseResponses
+
+        return ImpulseResponses(self, time_steps, sampling_frequency, paths)
 
     def torch(self, names: Sequence[str]) -> UserSamples:
         """A PyTorch ``Dataset`` of these users, by position (`torch_data.UserSamples`).
