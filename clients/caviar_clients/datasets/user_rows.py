@@ -380,6 +380,10 @@ class Users:
     def _recorded(self, names: Sequence[str]) -> dict[str, list[Any]]:
         """Rows of recorded arrays, in the order of the users."""
         found: dict[str, list[Any]] = {name: [None] * len(self) for name in names}
+        by_topic: dict[str, list[str]] = {}
+        for name in names:
+            topic, _, field = name.partition(".")
+            by_topic.setdefault(topic, []).append(field)
         table = self._table
         scenes = np.stack([table["episode"], table["scene"]], axis=1)
         # Each scene once, in the order in which they lie on the disk.
@@ -389,26 +393,33 @@ class Users:
             stop = starts[at + 1] if at + 1 < len(starts) else len(order)
             users = order[start:stop]
             episode, scene = (int(value) for value in scenes[users[0]])
-            for name in names:
-                for user, row in zip(users, self._rows(name, episode, scene, users), strict=True):
-                    found[name][user] = row
+            for topic, fields in by_topic.items():
+                rows = self._rows(topic, fields, episode, scene, users)
+                for field, values in zip(fields, rows, strict=True):
+                    column = found[f"{topic}.{field}"]
+                    for user, row in zip(users, values, strict=True):
+                        column[user] = row
         return found
 
-    def _rows(self, name: str, episode: int, scene: int, users: NDArray[Any]) -> list[Any]:
-        """Rows of a recorded array, of users of one scene."""
-        topic, _, field = name.partition(".")
+    def _rows(
+        self, topic: str, fields: Sequence[str], episode: int, scene: int, users: NDArray[Any]
+    ) -> list[list[Any]]:
+        """Rows of recorded arrays of a topic, of users of one scene, whose payload is decoded once."""
         recording = self._dataset.episode(episode)
         arrays: TopicArrays[Any, Any] = recording[topic]
         payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
         place = f"{recording.path}, scene {scene}"
         if payload is None:
             raise RecordingError(f"{place}: {topic} is absent")
-        rows = arrays.columns[field].rows(arrays, payload)
         at = {key: number for number, key in enumerate(arrays.keys_of(payload))}
         keys = [self._key(topic, at, user, place) for user in users]
-        # Users with one row have one object, which `_stacked` and `distinct` know again.
-        found = {key: rows[key] for key in set(keys)}
-        return [found[key] for key in keys]
+        all_rows = list[list[Any]]()
+        for field in fields:
+            rows = arrays.columns[field].rows(arrays, payload)
+            # Users with one row have one object, which `_stacked` and `distinct` know again.
+            found = {key: rows[key] for key in set(keys)}
+            all_rows.append([found[key] for key in keys])
+        return all_rows
 
     def _key(self, topic: str, at: Mapping[Any, int], user: int, place: str) -> int:
         """The row of a product that a user has."""
