@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import ClassVar
@@ -87,7 +87,9 @@ class Format(ABC):
 
 
 FORMATS: Mapping[str, str] = {
+    "huggingface": "caviar_formats.huggingface:HuggingFace",
     "npz": "caviar_formats.npz:Npz",
+    "parquet": "caviar_formats.parquet:Parquet",
     "sionna": "caviar_formats.sionna:Sionna",
 }
 """Places of the formats that come with this distribution, by name."""
@@ -104,17 +106,14 @@ def find_format(name: str, flavour: str = "") -> Format:
         RunError: There is no such format, or it has no such flavour; names those there are.
         DeclarationError: A plug-in cannot be loaded, or is no `Format`.
     """
-    cls: type[Format] | None
     if place := FORMATS.get(name):
-        cls = resolve_name(place)
-    else:
-        cls = plugin_class(FORMAT_PLUGINS, name, Format)  # type: ignore[type-abstract]  # compared, never made
+        found: type[Format] = resolve_name(place)
+        return found(flavour)
+    cls = plugin_class(FORMAT_PLUGINS, name, Format)  # type: ignore[type-abstract]  # compared, never made
     if cls is None:
-        raise RunError(f"--to {name!r} is no format; {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
-    if flavour and flavour not in cls.flavours:
-        known = suggestion(flavour, [one for one in cls.flavours if one]) if any(cls.flavours) else "it has none"
-        raise RunError(f"--flavour {flavour!r} is none of {name}; {known}")
-    return cls(flavour or next(iter(cls.flavours)))
+        known = [*FORMATS, *plugins(FORMAT_PLUGINS)]
+        raise RunError(f"--to {name!r} is no format; {suggestion(name, known)}")
+    return cls(flavour)
 
 
 class _State(msgspec.Struct):
@@ -127,7 +126,9 @@ class _State(msgspec.Struct):
 def export_users(
     users: Users, to: Format, out: Path, on_part: Callable[[int, int], None] = lambda done, of: None
 ) -> None:
-    """Write users of a dataset in a format. The folder appears when it is whole; what a kill left is continued.
+    """Write users of a dataset in a format.
+
+    The folder appears when it is whole; what a kill left is continued.
 
     Args:
         users: Of a dataset, in its order.
@@ -136,8 +137,8 @@ def export_users(
         on_part: Called with the episodes that are written, and with all of them.
 
     Raises:
-        RunError: The folder holds something, ``OUT.part`` is of another export, there is nothing to export, or
-            a file cannot be written.
+        RunError: The folder holds something, ``OUT.part`` is of another export, there is nothing to export,
+            or a file cannot be written.
         RecordingError, RunError: As of `Format.begin`.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -180,7 +181,9 @@ def _continued(folder: Path, export: str) -> _State:
         return _State(export)
     state = msgspec.json.decode(file.read_bytes(), type=_State)
     if state.export != export:
-        raise RunError(f"{folder} is a part of another export; remove it, or choose another folder with --out")
+        raise RunError(
+            f"{folder} is a part of another export; remove it, or choose another folder with --out"
+        )
     return state
 
 
@@ -191,3 +194,15 @@ def _readme(users: Users, to: Format) -> str:
     made = ", ".join(f"{name} {version}" for name, version in dataset.settings["versions"].items())
     counts = f"{len(dataset):,} episodes, {len(users):,} users"
     return f"{text}{lost}\n\n## Origin\n\nDataset `{dataset.name}` of CAVIAR: {counts}; {made}.\n"
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Make a table of Markdown.
+
+    Args:
+        head: Titles of the columns.
+        rows: Their cells.
+    """
+    lines = [head, ["---"] * len(head), *rows]
+    cells = ([str(cell).replace("|", "\\|") for cell in line] for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)

@@ -8,7 +8,7 @@ import numpy as np
 
 from caviar_clients.datasets.rows import USER_COLUMNS
 from caviar_clients.datasets.user_rows import Users
-from caviar_formats.base import Format
+from caviar_formats.base import Format, markdown_table
 
 
 class Npz(Format):
@@ -25,7 +25,7 @@ class Npz(Format):
 
     def readme(self, users: Users) -> str:
         about = USER_COLUMNS | users.recorded()
-        rows = "\n".join(f"| `{name}` | {text} |" for name, text in about.items())
+        rows = markdown_table(("array", "what it is [unit], type, shape of a row"), about.items())
         return f"""# {users.dataset.name} as NumPy archives
 
 `users-NNNNN.npz` hold a row for each user: a receiver in a scene, on a carrier, for a transmitter.
@@ -41,7 +41,5 @@ Where a row has fewer values than the longest of its file, NaN follows, or −1 
 ones, false for booleans. Angles are (zenith from +z, azimuth from +x) in world axes, x to the east, y to the
 north, z upwards. `channel.a` has the phase of the carrier.
 
-| array | what it is [unit], type, shape of a row |
-| --- | --- |
 {rows}
 """

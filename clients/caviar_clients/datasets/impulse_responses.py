@@ -54,7 +54,9 @@ class ImpulseResponses:
         self, users: Users, time_steps: int = 1, sampling_frequency: float = 1.0, paths: int | None = None
     ) -> None:
         if time_steps < 1 or sampling_frequency <= 0.0:
-            raise ValueError(f"time_steps is {time_steps} and sampling_frequency {sampling_frequency}: both > 0")
+            raise ValueError(
+                f"time_steps {time_steps}, sampling_frequency {sampling_frequency}: both above 0"
+            )
         self._users = users
         self._times = np.arange(time_steps) / sampling_frequency
         self._arrays = _arrays_of(users)
@@ -130,9 +132,7 @@ def _arrays_of(users: Users) -> dict[str, AntennaArray]:
     """Array of each device of these users, by the scenario of the dataset."""
     specs = msgspec.convert(users.dataset.settings["scenario"].get("devices", ()), tuple[DeviceSpec, ...])
     names = {str(name) for end in ("tx", "rx") for name in np.unique(users[end])}
-    return {
-        name: spec.array or AntennaArray() for name in names for spec in specs if is_made_by(spec, name)
-    }
+    return {name: spec.array or AntennaArray() for name in names for spec in specs if is_made_by(spec, name)}
 
 
 def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:

@@ -195,6 +195,21 @@ class Users:
         rows = self._recorded(recorded) if recorded else {}
         return Columns({name: columns[name] if name in columns else _stacked(rows[name]) for name in names})
 
+    def rows(self, names: Sequence[str]) -> dict[str, list[Any]]:
+        """Read the rows of recorded arrays as they are, without padding.
+
+        Args:
+            names: Of recorded arrays.
+
+        Returns:
+            For each name an array or a number a user, in their order.
+
+        Raises:
+            RecordingError, ValueError, TypeError: As of `read`.
+        """
+        self.check_names(names)
+        return self._recorded(names)
+
     def distinct(self, name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Read each row of a recorded array once, however many users have it, as the pictures of cameras.
 
