@@ -34,18 +34,24 @@ class Format(ABC):
     is written again, so that `write` replaces what is there.
 
     Args:
-        flavour: One of `flavours`.
+        flavour: One of `flavours`; empty: the first.
+
+    Raises:
+        RunError: There is no such flavour; names those there are.
     """
 
-    flavours: ClassVar[Mapping[str, str]] = {"": ""}
+    flavours: ClassVar[Mapping[str, str]] = {}
     """Variants of the format by name, with what each is; the first is the default."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
     def __init__(self, flavour: str = "") -> None:
-        self.flavour = flavour
+        if flavour and flavour not in self.flavours:
+            known = suggestion(flavour, self.flavours) if self.flavours else "this format has none"
+            raise RunError(f"--flavour {flavour!r}: {known}")
+        self.flavour = flavour or next(iter(self.flavours), "")
 
-    def begin(self, users: Users) -> None:
+    def begin(self, users: Users) -> None:  # noqa: B027 - most formats need no look
         """Look at the whole before its first part, also where an export is continued.
 
         Args:
@@ -69,7 +75,7 @@ class Format(ABC):
             RecordingError, RunError: As of `begin`.
         """
 
-    def finish(self, users: Users, folder: Path) -> None:
+    def finish(self, users: Users, folder: Path) -> None:  # noqa: B027 - parts are all there is to most
         """Write what only the whole says, once all parts are there.
 
         Args:

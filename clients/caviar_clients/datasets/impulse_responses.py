@@ -26,9 +26,9 @@ class ImpulseResponses:
 
     Calling it yields for each user, in their order, ``(a, tau)``:
 
-    - ``a``, complex, Shape ``[1, Nr, 1, Nt, P, S]``: gain of each path between elements, with the phase of the
-      carrier, in each time step: H(Δf, Δt) = Σ a·exp(−j2πΔf·τ) is ``channel.hf`` but for the Doppler shift of
-      Δf, which is below 1e-6 of ν;
+    - ``a``, complex, Shape ``[1, Nr, 1, Nt, P, S]``: gain of each path between elements, with the phase of
+      the carrier, in each time step: H(Δf, Δt) = Σ a·exp(−j2πΔf·τ) is ``channel.hf`` but for the Doppler
+      shift of Δf, ν·Δf/f;
     - ``tau``, float, Shape ``[1, 1, P]``: delay [s].
 
     Paths that a user lacks are zeros: P is the same for all users, as that of the one that has most.
@@ -140,7 +140,8 @@ def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:
     place = users.dataset.location
     if len(arrays) != 1:
         raise RecordingError(
-            f"{place}: {len(arrays)} different arrays at {end}; take users of one, as users[users[{end!r}] == NAME]"
+            f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
+            f"users[users[{end!r}] == NAME]"
         )
     (array,) = arrays
     if len(array.polarizations) > 1 or array.panels:
