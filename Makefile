@@ -43,11 +43,10 @@ lint: setup ## Style, types and the imports that the architecture allows
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
-	@$(BIN)/mypy tests/bench
 	@$(BIN)/lint-imports
 
-check: lint ## In a minute and a half: lint, and the unit tests that are quick
-	@$(BIN)/pytest --quiet --numprocesses=$(WORKERS) --dist=loadfile -m "not slow" tests/unit tests/vectors
+check: lint ## In a minute: lint, and the unit tests that are quick
+	@$(BIN)/pytest --quiet --numprocesses=2 --dist=loadfile -m "not slow" tests/unit tests/vectors
 
 test: lint ## Everything that CI checks; TESTS=tests/unit runs a part, in WORKERS processes
 	@$(BIN)/pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder --durations=10 $(TESTS)

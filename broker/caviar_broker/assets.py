@@ -17,9 +17,8 @@ from caviar_broker.core.geometry import GEOMETRY, has_capability
 from caviar_broker.core.plan import PatternFile
 from caviar_broker.core.transitions import ServiceState
 from caviar_protocol import messages as m
-from caviar_protocol.assets import MAX_ASSET, AssetStore, IncomingAsset
+from caviar_protocol.assets import MAX_ASSET, MAX_FACES, AssetStore, IncomingAsset, MeshCheck, wrong_name
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import MAX_FACES, MeshCheck, wrong_name
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import world_of
 from caviar_protocol.scenario.schema import pattern_asset
@@ -203,7 +202,13 @@ class AssetExchange:
             event = waiting[0]
             change = event.message.geometry
             if change is not None:
-                if missing := self._missing_meshes(change):
+                # Meshes that are to be asked for, by digest; those of wrong names and sizes are refused
+                # unseen.
+                if missing := {
+                    asset.digest: asset
+                    for asset in change.assets
+                    if not wrong_name(asset) and asset.size <= MAX_ASSET and not self.store.holds(asset)
+                }:
                     self._deliveries[service] = _Delivery(missing)
                     self._ask_for_more(service)
                     return
@@ -212,14 +217,6 @@ class AssetExchange:
             self.feed(event)
             waiting = self._answers.get(service)
         self._answers.pop(service, None)
-
-    def _missing_meshes(self, change: m.GeometryChange) -> dict[str, m.Asset]:
-        """Meshes that are to be asked for, by digest; those of wrong names and sizes are refused unseen."""
-        return {
-            asset.digest: asset
-            for asset in change.assets
-            if not wrong_name(asset) and asset.size <= MAX_ASSET and not self.store.holds(asset)
-        }
 
     def handle_error(self, service: str, error: m.Error) -> bool:
         """Whether an ERROR says that a world does not have what it offered; then the run ends."""

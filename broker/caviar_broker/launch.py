@@ -24,25 +24,23 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from caviar_broker.assets import pattern_files
 from caviar_broker.control.launcher import LauncherPipe, Reporter, stop_on_signals
 from caviar_broker.control.server import ControlServer
 from caviar_broker.control.socket import locked, refuse_second_broker
-from caviar_broker.core.plan import briefings, plan_run, with_ownership
+from caviar_broker.core.plan import with_ownership
 from caviar_broker.event_loop import call_with_timeout, raise_priority
 from caviar_broker.journal import CheckpointFiles, JournalFile
-from caviar_broker.policies import given_policies
 from caviar_broker.resume import ResumeState, read_resumption
 from caviar_broker.run_record import (
     RunRecord,
     changes,
     check_run_files,
     has_recording,
+    planned_run,
     read_record,
     recorded_frames,
     sync_recording,
     versions_of,
-    with_replay,
 )
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import PeerLimits
@@ -52,8 +50,7 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import file_system_of
 from caviar_protocol.host import steady_memory
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import attached, load_scenario
 from caviar_protocol.scenario.rules import with_overrides
 
 if TYPE_CHECKING:
@@ -115,13 +112,8 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
     access = _access(arguments, local)
     check_bind(record.endpoint, keys=access is not None)
     beside = _http_process(arguments, directory)
-    plan = replace(plan_run(scenario, record.run, briefings(scenario, directory)), epoch=record.epoch)
     store = AssetStore()
-    plan = replace(
-        with_replay(plan, scenario.replay),
-        patterns=pattern_files(scenario, store),
-        policies=given_policies(scenario, store, directory),
-    )
+    plan = replace(planned_run(scenario, record.run, directory, store, keeps=True), epoch=record.epoch)
     durability = record.scenario.run.durability
     # Under every durability but `none` a state is on the disk before an older one is removed.
     checkpoints = CheckpointFiles(directory, durable=durability != "none")
@@ -176,17 +168,13 @@ def _serve(arguments: argparse.Namespace, record: RunRecord, directory: Path, fo
             outcome = server.run(raise_priority)
     statistics = server.statistics
     takes_files = server.disk_answers and call_with_timeout(lambda: statistics.save(files.latencies), SAVE_S)
+    figures = statistics.figures()
     reporter.finished(
         disk="" if takes_files else f"the disk does not answer: {file_system_of(directory)}",
         error=outcome.error,
         culprit=outcome.culprit,
         digest=outcome.digest,
-        frames=statistics.frames + statistics.earlier,
-        frames_per_second=statistics.frames_per_second(),
-        warm_up_frames=statistics.warm_up_frames,
-        deadlines={"scheduling": scheduling} | msgspec.structs.asdict(statistics.deadlines()),
-        pace=msgspec.structs.asdict(statistics.pace()),
-        services={n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
+        **figures | {"deadlines": {"scheduling": scheduling} | figures["deadlines"]},
     )
     if outcome.error and not arguments.control:
         sys.stderr.write(f"caviar broker: {outcome.error}\n")
@@ -221,7 +209,13 @@ def _begun(arguments: argparse.Namespace) -> tuple[RunRecord, Path, tuple[str, .
         load_scenario(arguments.scenario, arguments.set), arguments.frames, arguments.seed, arguments.pace
     )
     scenario = attached(scenario, arguments.attach)
-    directory = _made(arguments.directory)
+    try:
+        arguments.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"cannot write the run to {arguments.directory}: {error.strerror}; choose another --directory"
+        ) from error
+    directory = arguments.directory.resolve()
     run, endpoint = arguments.run or directory.name, arguments.bind or DEFAULT_BIND
     versions = versions_of(scenario)
     return (
@@ -275,16 +269,6 @@ def _left(directory: Path, record: RunRecord, checkpoints: CheckpointFiles, last
             "to run its scenario again leave out --resume"
         )
     return replace(left, losses=(*damage, *left.losses)) if left.is_cut else left
-
-
-def _made(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(
-            f"cannot write the run to {directory}: {error.strerror}; choose another --directory"
-        ) from error
-    return directory.resolve()
 
 
 def parser() -> argparse.ArgumentParser:

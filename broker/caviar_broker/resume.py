@@ -116,7 +116,17 @@ class _Reader:
                 self._begin, self._complete_from = entry, -1
                 self._clear()
             case "snapshot":
-                self._open(entry)
+                # A compacted journal: the run up to a frame.
+                if self._recorded is not None and self._recorded < (entry.episode, entry.frame):
+                    raise RecordingError(
+                        f"the recording has {self._recorded[1]} frames of episode {self._recorded[0]}, and "
+                        f"the journal begins after frame {entry.frame - 1} of episode {entry.episode}: what "
+                        "is between is lost, and the run cannot go on"
+                    )
+                self._begin, self._digest = entry, RunDigest(entry.digest)
+                self._clear()
+                self._finished, self._finished_before = entry.frame, entry.facts["finished_before"]
+                self._complete_from = entry.facts["base"]
             case "resumed":
                 self._forget(entry.frame)
             case "checkpoint":
@@ -127,19 +137,6 @@ class _Reader:
                 self._geometry.append(entry)
             case _:
                 self._decided(entry)
-
-    def _open(self, entry: JournalEntry) -> None:
-        """A compacted journal: the run up to a frame."""
-        if self._recorded is not None and self._recorded < (entry.episode, entry.frame):
-            raise RecordingError(
-                f"the recording has {self._recorded[1]} frames of episode {self._recorded[0]}, and the "
-                f"journal begins after frame {entry.frame - 1} of episode {entry.episode}: what is "
-                "between is lost, and the run cannot go on"
-            )
-        self._begin, self._digest = entry, RunDigest(entry.digest)
-        self._clear()
-        self._finished, self._finished_before = entry.frame, entry.facts["finished_before"]
-        self._complete_from = entry.facts["base"]
 
     def _forget(self, frame: int) -> None:
         """The run was resumed with this frame: what had been decided from there on does not count."""

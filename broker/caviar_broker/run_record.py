@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from caviar_broker.core.plan import RunPlan
+from caviar_broker.core.plan import RunPlan, briefings, plan_run
 from caviar_broker.journal_format import run_of_journal
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import PUT_BACK, read_regular, refuse_other_kinds, replace_file, sync_file
@@ -47,7 +47,8 @@ def versions_of(scenario: Scenario) -> dict[str, str]:
     used = {spec.use for spec in scenario.services.values()}
     libraries = [*LIBRARIES]
     libraries += TRAFFIC if used & {"sumo", "sumo-actuated"} else ()
-    libraries += TRACING if used & _tracers() else ()
+    # Implementations that import the ray tracer.
+    libraries += TRACING if used & frozenset({"sionna-rt", "adaptive", "lidar", "camera"}) else ()
     found = {
         "python": platform.python_version(),
         "protocol": ".".join(map(str, PROTOCOL_VERSION)),
@@ -77,11 +78,6 @@ def changes(before: Mapping[str, str], now: Mapping[str, str]) -> str:
         for name in sorted({*before, *now})
         if before.get(name) != now.get(name)
     )
-
-
-def _tracers() -> frozenset[str]:
-    """Implementations that import the ray tracer."""
-    return frozenset({"sionna-rt", "adaptive", "lidar", "camera"})
 
 
 def _version(name: str) -> str:
@@ -190,6 +186,7 @@ def _blanked(data: bytes, found: re.Match[bytes]) -> bytes:
 
 
 if TYPE_CHECKING:
+    from caviar_protocol.assets import AssetStore
     from caviar_protocol.recording import Recording
 
 
@@ -273,7 +270,33 @@ def check_run_files(directory: Path, journal: Path, run: str) -> None:
         )
 
 
-def with_replay(plan: RunPlan, spec: ReplaySpec | None) -> RunPlan:
+def planned_run(scenario: Scenario, run: str, directory: Path, store: AssetStore, *, keeps: bool) -> RunPlan:
+    """Plan a run, for its broker or for one process.
+
+    Args:
+        scenario: After `with_ownership`.
+        run: Its id.
+        directory: Of the run, as services are told.
+        store: Gets the files of antennas and of trained policies.
+        keeps: Whether the directory keeps the policies.
+
+    Raises:
+        RecordingError: There is no recording of the run that is repeated.
+        AssetError: A file cannot be read or stored.
+        ScenarioError: A policy is not the one that the scenario names.
+    """
+    # Late: a command that only reads a record needs neither sockets nor asyncio.
+    from caviar_broker.assets import pattern_files
+    from caviar_broker.policies import given_policies
+
+    return replace(
+        _with_replay(plan_run(scenario, run, briefings(scenario, directory)), scenario.replay),
+        patterns=pattern_files(scenario, store),
+        policies=given_policies(scenario, store, directory if keeps else None),
+    )
+
+
+def _with_replay(plan: RunPlan, spec: ReplaySpec | None) -> RunPlan:
     """The plan with the recorded decisions and misses of a run that is repeated.
 
     Args:

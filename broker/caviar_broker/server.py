@@ -15,16 +15,14 @@ from typing import Any, Protocol
 import zmq
 
 from caviar_broker.assets import AssetExchange
-from caviar_broker.connections import COMPLAINTS, Connections
+from caviar_broker.connections import COMPLAINTS, Connections, Router
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.run import Resumption
 from caviar_broker.core.transitions import RunState
 from caviar_broker.event_loop import EventLoop, Standby
-from caviar_broker.journal import JournalFile
-from caviar_broker.journal_writer import JournalWriter
-from caviar_broker.router import Router
+from caviar_broker.journal import JournalFile, JournalWriter
 from caviar_broker.security.access import Access
 from caviar_broker.security.limits import PeerLimits
 from caviar_broker.statistics import Statistics

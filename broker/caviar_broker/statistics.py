@@ -190,6 +190,17 @@ class Statistics:
         except OSError:
             path.unlink(missing_ok=True)
 
+    def figures(self) -> dict[str, Any]:
+        """The figures of the event ``finished``, as plain values."""
+        return {
+            "frames": self.frames + self.earlier,
+            "frames_per_second": self.frames_per_second(),
+            "warm_up_frames": self.warm_up_frames,
+            "deadlines": msgspec.structs.asdict(self.deadlines()),
+            "pace": msgspec.structs.asdict(self.pace()),
+            "services": {name: msgspec.structs.asdict(found) for name, found in self.services().items()},
+        }
+
     def services(self) -> dict[str, ServiceStatistics]:
         """Summary by service; a service that was never granted a frame has none."""
         return {

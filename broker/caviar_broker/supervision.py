@@ -7,8 +7,11 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from caviar_broker.core.clock import FrameClock
+# The launcher looks at processes, too, and loads no clock for it.
+if TYPE_CHECKING:
+    from caviar_broker.core.clock import FrameClock
 
 
 class LocalProcess:
@@ -202,9 +205,22 @@ class Watchdog:
             if member is None or not member.present:
                 continue
             if watched.process is not None:
-                self._check_local(service, watched, watched.process, now)
+                if watched.died_at is not None:
+                    if now - watched.died_at > SUPERVISOR_NS:
+                        self.lost(service, watched.process.verdict())
+                elif watched.process.stopped:
+                    self.lost(service, describe_stop(watched.process.pid))
+                # A process that dies loses its connection first: one that lives on without is reported here.
+                elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
+                    self.lost(service, f"its process {watched.process.pid} lives, but {self.gone_words}")
             else:
-                self._check_remote(service, watched, now)
+                if watched.pulse is None:
+                    if not watched.warned and now - watched.since > self.liveness_ns:
+                        watched.warned = True
+                        text = "has no heartbeat connection: its death shows only when it is due to answer"
+                        self.warn(service, text)
+                elif now - watched.heard_at > 2 * self.heartbeat_ns:
+                    self._probe(service, watched.pulse)
 
     def recheck(self, service: str) -> None:
         """Probe a remote service now, since another process claims its name."""
@@ -216,26 +232,6 @@ class Watchdog:
         """Stop watching."""
         for service in tuple(self._watched):
             self.forget(service)
-
-    def _check_local(self, service: str, watched: _Watched, process: LocalProcess, now: int) -> None:
-        if watched.died_at is not None:
-            if now - watched.died_at > SUPERVISOR_NS:
-                self.lost(service, process.verdict())
-        elif process.stopped:
-            self.lost(service, describe_stop(process.pid))
-        # A process that dies loses its connection first; only one that lives on without one is reported here.
-        elif watched.cut_off_at is not None and now - watched.cut_off_at > SUPERVISOR_NS:
-            self.lost(service, f"its process {process.pid} lives, but {self.gone_words}")
-
-    def _check_remote(self, service: str, watched: _Watched, now: int) -> None:
-        if watched.pulse is None:
-            if not watched.warned and now - watched.since > self.liveness_ns:
-                watched.warned = True
-                self.warn(
-                    service, "has no heartbeat connection: its death shows only when it is due to answer"
-                )
-        elif now - watched.heard_at > 2 * self.heartbeat_ns:
-            self._probe(service, watched.pulse)
 
     def _probe(self, service: str, pulse: bytes) -> None:
         reason = self.probe(pulse)

@@ -202,20 +202,17 @@ class Payload(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         except (AttributeError, TypeError):  # no array, or no length: reported below
             is_known = False
         if not is_known:
-            self._check_arrays()
+            # Raise `PayloadError` naming the first array that is not as declared.
+            sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
+            for name, spec in array_fields(type(self)).items():
+                value = getattr(self, name)
+                if value is not None:
+                    _check_array(type(self).__name__, name, value, spec, sizes)
             # A lidar has another number of hits in every frame: without a bound the set would grow for hours.
             if len(layout.known) >= KNOWN_SHAPES:
                 layout.known.clear()
             layout.known.add(shapes)
         self.check()
-
-    def _check_arrays(self) -> None:
-        """Raise `PayloadError` naming the first array that is not as declared."""
-        sizes = {size: self._length(fields) for size, fields in self.sizes_from.items()}
-        for name, spec in array_fields(type(self)).items():
-            value = getattr(self, name)
-            if value is not None:
-                _check_array(type(self).__name__, name, value, spec, sizes)
 
     def check(self) -> None:  # optional hook
         """Raise `PayloadError` where fields contradict each other beyond what shapes say."""

@@ -174,7 +174,7 @@ def delay_spread(a: Complex128Array, tau: Float64Array) -> Float64Array:
         >>> float(delay_spread(np.array([1.0, 1.0], complex), np.array([0.0, 2e-7])))  # two equal paths
         1e-07
     """
-    return _spread(a, tau)
+    return power_spread(np.abs(a) ** 2, tau)
 
 
 def doppler_spread(a: Complex128Array, doppler: Float64Array) -> Float64Array:
@@ -191,7 +191,7 @@ def doppler_spread(a: Complex128Array, doppler: Float64Array) -> Float64Array:
         >>> float(doppler_spread(np.array([1.0, 1.0], complex), np.array([-50.0, 50.0])))
         50.0
     """
-    return _spread(a, doppler)
+    return power_spread(np.abs(a) ** 2, doppler)
 
 
 def k_factor(a: Complex128Array, tau: Float64Array, los: BoolArray) -> Float64Array:
@@ -247,15 +247,24 @@ def coherence(spread: Float64Array, correlation: float = CORRELATION) -> Float64
     return bound
 
 
-def _spread(a: Complex128Array, of: Float64Array) -> Float64Array:
-    """Standard deviation along the last axis, weighted with power."""
-    power, value = np.nan_to_num(np.abs(a) ** 2), np.nan_to_num(of)
+def power_spread(power: Float64Array, values: Float64Array) -> Float64Array:
+    """Standard deviation of values, weighted with power.
+
+    Args:
+        power: Of the paths, Shape ``[..., P]``; NaN: no path.
+        values: Of the paths, likewise.
+
+    Returns:
+        Shape ``[...]``; NaN without a path.
+    """
+    power, values = np.nan_to_num(power), np.nan_to_num(values)
+    total = power.sum(-1)
+    # 0/0: a user without a path has no spread, and 0 would be that of one path.
     with np.errstate(invalid="ignore"):
-        share = power / power.sum(-1, keepdims=True)
-    mean = (share * value).sum(-1, keepdims=True)
-    spread: Float64Array = np.sqrt((share * (value - mean) ** 2).sum(-1))
-    # 0/0 above: a user without a path has no spread, and 0 would be that of one path.
-    return np.where(power.sum(-1) > 0, spread, np.nan)
+        mean = (power * values).sum(-1) / total
+        # About the mean: the difference of two squares of a microsecond keeps no picoseconds.
+        spread: Float64Array = np.sqrt((power * (values - mean[..., None]) ** 2).sum(-1) / total)
+    return spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,12 +308,7 @@ def changes(before: Channel, after: Channel) -> Changes:
     same = before.tx == after.tx and before.rx == after.rx
     if same and np.array_equal(before.offsets, after.offsets) and np.array_equal(before.id, after.id):
         return Changes(np.zeros(len(after.id), np.bool_), np.zeros(len(before.id), np.bool_))
-    earlier, later = _keys(before, after)
-    return Changes(~np.isin(later, earlier), ~np.isin(earlier, later))
-
-
-def _keys(before: Channel, after: Channel) -> tuple[Int64Array, Int64Array]:
-    """Numbers that two paths of the products, Shape ``[P]`` each, have in common where they are the same."""
+    # Numbers that two paths of the products, Shape ``[P]`` each, have in common where they are the same.
     channels = (before, after)
     tx, rx = (
         {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -316,4 +320,5 @@ def _keys(before: Channel, after: Channel) -> tuple[Int64Array, Int64Array]:
         for c in channels
     ]
     keys = np.concatenate(pairs) * len(numbers) + places.reshape(-1)
-    return keys[: len(before.id)], keys[len(before.id) :]
+    earlier, later = keys[: len(before.id)], keys[len(before.id) :]
+    return Changes(~np.isin(later, earlier), ~np.isin(earlier, later))

@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | ``caviar.services`` | ``role:name`` | a subclass of `Service` |
 | ``caviar.plants`` | engine of a quadrotor in the world ``flight`` | a subclass of its `Plant` |
-| ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario.attachments` |
+| ``caviar.attachments`` | option of ``caviar run`` | as of `caviar_protocol.scenario` |
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
 | ``caviar.codebooks`` | codebook of antenna arrays | a `caviar_protocol.space.codebooks.Codebook` class |
 | ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |

@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import MAX_COORDINATE_M, BoolArray, Float64Array
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.fields import PRINTABLE
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.scenario.schema import DeviceSpec, carries, fixed_device, mounted_device, turned_back
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics.scene import AntennaDevice, Device, Scene

@@ -85,7 +85,18 @@ def type_text(hint: Any) -> str:
     """A type hint in words."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return _annotated_text(hint)
+        base, *metas = get_args(hint)
+        # By identity: two types may have equal bounds and mean different things.
+        for meta in metas:
+            if id(meta) in _aliases():
+                name = _aliases()[id(meta)]
+                rest = [other for other in metas if other is not meta]
+                return f"[{name}](#field-types)" + "".join(f", {text}" for text in _bounds_text(rest))
+        for meta in metas:
+            if isinstance(meta, msgspec.Meta) and meta.extra and "array" in meta.extra:
+                spec: ArrayField = meta.extra["array"]
+                return f"array `{spec.dtype}` [{', '.join(map(str, spec.shape))}]"
+        return ", ".join([type_text(base), *_bounds_text(metas)])
     if origin in (Union, UnionType):
         return " or ".join(type_text(member) for member in arguments if member is not NoneType)
     if origin is Literal:
@@ -105,21 +116,6 @@ def type_text(hint: Any) -> str:
     if issubclass(hint, msgspec.Struct):
         return f"[{hint.__name__}](#{hint.__name__.lower()})"
     return str(hint.__name__)
-
-
-def _annotated_text(hint: Any) -> str:
-    base, *metas = get_args(hint)
-    # By identity: two types may have equal bounds and mean different things.
-    for meta in metas:
-        if id(meta) in _aliases():
-            name = _aliases()[id(meta)]
-            rest = [other for other in metas if other is not meta]
-            return f"[{name}](#field-types)" + "".join(f", {text}" for text in _bounds_text(rest))
-    for meta in metas:
-        if isinstance(meta, msgspec.Meta) and meta.extra and "array" in meta.extra:
-            spec: ArrayField = meta.extra["array"]
-            return f"array `{spec.dtype}` [{', '.join(map(str, spec.shape))}]"
-    return ", ".join([type_text(base), *_bounds_text(metas)])
 
 
 def _bounds_text(metas: list[Any]) -> list[str]:

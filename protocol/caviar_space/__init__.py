@@ -1,1 +1,1 @@
-"""Geometry above the wire and below services: meshes, scenery, obstacles, ground, axes of engines."""
+"""Geometry above the wire and below services: meshes, materials, scenery, obstacles, ground, engine axes."""

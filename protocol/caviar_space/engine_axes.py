@@ -23,7 +23,7 @@ _Rows: TypeAlias = tuple[Vector, Vector, Vector]
 
 
 class Motion(NamedTuple):
-    """How a body moves.
+    """Motion of a body.
 
     Args:
         velocity: In world axes, a length a second.

@@ -73,7 +73,7 @@ def _piece(file: Path, to_world: Float64Array) -> Piece:
 
 
 def _is_ground(shape: Piece, lowest: float, walls: Sequence[Float64Array]) -> bool:
-    """Whether a mesh is ground, given the extents of the meshes with walls.
+    """Test whether a mesh is ground, given the extents of the meshes with walls.
 
     A roof may reach the ground too, as a mesh apart from its walls; it has their extent.
     """

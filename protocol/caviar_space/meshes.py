@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int32Array
+from caviar_protocol.assets import check_unit_box, is_mesh_name
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
+from caviar_protocol.space.ply import read_ply
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +99,66 @@ def unit_box() -> Mesh:
     return box((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
 
 
+Body = tuple[str, int]
+"""Asset (or kind: an asset and a material) and slot, from 0, of a body in a ray tracer's pool."""
+
+
+def object_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
+    """Read the unit meshes that objects may have.
+
+    Args:
+        files: PLY files of meshes by asset name; others of a run's files are left out.
+
+    Returns:
+        Meshes by asset name, and the box by the empty one.
+
+    Raises:
+        AssetError: A file is no mesh, or its bounding box is not −½…½ on every axis.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "box.ply")
+        ...     _ = file.write_bytes(ply(unit_box()))
+        ...     sorted(object_meshes({"objects/box.ply": file, "scenery/street.xml": file}))
+        ['', 'objects/box.ply']
+    """
+    meshes = {"": unit_box()}
+    for name in sorted(files):
+        if PurePosixPath(name).match("objects/*.ply"):
+            vertices, faces = read_ply(files[name], f"mesh {name!r}")
+            check_unit_box(vertices, f"mesh {name!r}")
+            meshes[name] = Mesh(vertices, faces.astype(np.int32))
+    return meshes
+
+
+def shown_asset(asset: str, meshes: Container[str]) -> str:
+    """Asset whose mesh stands for an object: its own, or the box's, empty, in place of one that came while
+    the run goes on and is not there.
+
+    Args:
+        asset: Asset of the object.
+        meshes: Names of the meshes that there are.
+    """
+    return "" if is_mesh_name(asset) and asset not in meshes else asset
+
+
+# [m]; a centre to count from is a multiple of it, so that a scene about the origin stays as it is.
+_CENTRE_STEP = 128.0
+
+
+def coarse_centre(middle: Float64Array) -> Float64Array:
+    """Centre that a ray tracer in float32 counts from, near the middle of a scene [m], Shape ``[3]``; no
+    negative zeros."""
+    centre: Float64Array = np.round(middle / _CENTRE_STEP) * _CENTRE_STEP + 0.0
+    return centre
+
+
 def assign_bodies(
     objects: Iterable[tuple[str, str]],
     pool: Mapping[str, int],
     keys: Mapping[str, str] = MappingProxyType({}),
-) -> dict[str, tuple[str, int]]:
+) -> dict[str, Body]:
     """Choose the body of a ray tracer that stands for each object of a scene.
 
     Names are assigned in sorted order, so that the assignment follows from the scene alone, also after a
@@ -112,7 +170,7 @@ def assign_bodies(
         keys: Key of the scenario that says how many, by asset, for the error.
 
     Returns:
-        Asset and slot, from 0, of each object's body, by name.
+        The body of each object, by its name.
 
     Raises:
         PayloadError: There are more objects of an asset than bodies, or none of its bodies at all; names the
@@ -122,7 +180,7 @@ def assign_bodies(
         >>> assign_bodies([("car.2", ""), ("car.1", "")], {"": 2})
         {'car.1': ('', 0), 'car.2': ('', 1)}
     """
-    taken: dict[str, tuple[str, int]] = {}
+    taken: dict[str, Body] = {}
     used: Counter[str] = Counter()
     for name, asset in sorted(objects):
         count = pool.get(asset)
@@ -176,7 +234,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def contains(mesh: Mesh, point: Float64Array) -> bool:
-    """Whether a point lies inside a closed mesh; undecided on its surface.
+    """Test whether a point lies inside a closed mesh; undecided on its surface.
 
     Sums the solid angles of all triangles (Van Oosterom and Strackee, "The solid angle of a plane
     triangle", 1983): ±4π inside, 0 outside.

@@ -16,13 +16,12 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.errors import AssetError, suggestion
-from caviar_protocol.geometry import ITU_MATERIALS as ITU_MATERIALS
 from caviar_protocol.space.ply import read_ply
 from caviar_space.meshes import Mesh, ply
 
@@ -65,7 +64,7 @@ class SceneryShape:
 
 @dataclass(frozen=True)
 class Scenery:
-    """What a description holds, in its order."""
+    """Content of a description, in its order."""
 
     file: Path
     shapes: tuple[SceneryShape, ...]
@@ -137,6 +136,8 @@ def scenery_files(
         >>> list(scenery_files("town", {"house": (unit_box(), "wall")}, {"wall": RadioMaterial("brick")}))
         ['scenery/town.xml', 'scenery/meshes/house.ply']
     """
+    from xml.sax.saxutils import quoteattr  # with urllib, a tenth of what a world loads
+
     lines = ['<scene version="2.1.0">']
     for key, material in materials.items():
         if material.itu_material not in ITU_MATERIALS:
@@ -195,7 +196,7 @@ def find_scenery(assets: Mapping[str, Path]) -> Path | None:
 
 
 def asset_name(description: Path | None) -> str:
-    """What errors call a description that came from another service: its file is a copy in a cache.
+    """Name that errors give a description from another service: its file is a copy in a cache.
 
     Args:
         description: None: there is none.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -117,7 +118,7 @@ def _claim_by_cells(
 
 
 def _parts(sizes: Int64Array) -> Int64Array:
-    """Where to cut these sizes into parts of about `_AT_ONCE` together."""
+    """Cuts of these sizes into parts of about `_AT_ONCE` together."""
     number = np.cumsum(sizes) // _AT_ONCE
     return np.flatnonzero(number[1:] != number[:-1]) + 1
 
@@ -169,7 +170,7 @@ def _about_middles(points: Float64Array, mesh: Int64Array, meshes: int) -> tuple
 
 
 def _begins(values: Int64Array) -> BoolArray:
-    """Where runs of equal values begin."""
+    """Mask of the beginnings of runs of equal values."""
     begins = np.ones(len(values), np.bool_)
     begins[1:] = values[1:] != values[:-1]
     return begins
@@ -296,7 +297,7 @@ def _apart_by_material(
 
 
 class PlaneTable:
-    """Where the planes of many meshes are: a triangle of each, and the box around all of its triangles.
+    """Table of the planes of many meshes: a triangle of each, and the box around all of its triangles.
 
     Args:
         numbers: Plane of each triangle, counted through all meshes from 0, Shape ``[F]``.
@@ -410,7 +411,7 @@ class PlaneTable:
 
 
 def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
-    """Whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
+    """Test whether points lie in triangles of their plane or at most `_RIM` outside, Shape ``[N]``."""
     normal = cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normal, axis=1)
     inside: BoolArray = length > 0
@@ -423,7 +424,7 @@ def _holds(triangles: Float64Array, points: Float64Array) -> BoolArray:
 
 
 def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
-    """Whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
+    """Test whether the planes of a mesh can be met from both sides, by number, Shape ``[N]``.
 
     From outside of a closed surface whose normals lead outwards, only front faces are met. Every side of a
     triangle then belongs to as many triangles that go along it one way as the other.
@@ -453,7 +454,7 @@ def two_sided_planes(mesh: Mesh, numbers: Int32Array) -> BoolArray:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Whether a mesh encloses a volume, with all normals to one side.
+    """Test whether a mesh encloses a volume, with all normals to one side.
 
     Args:
         mesh: Any.
@@ -472,3 +473,187 @@ def _counted(sides: Int64Array) -> Sequence[list[int]]:
     found, counts = np.unique(sides, axis=0, return_counts=True)
     rows: list[list[int]] = np.column_stack([found, counts]).tolist()
     return rows
+
+
+COPLANAR = 1e-5
+"""[m]; faces are in one plane to this, and `COPLANAR_RELATIVE` of their coordinates: about what float32 tells
+apart. One that stands farther behind another is hidden by it where they overlap."""
+
+
+COPLANAR_RELATIVE = 1.2e-7
+
+
+# [rad]; between the normals of coplanar faces, at most.
+_JOINED_ANGLE = 3e-5
+
+# [m]; boxes around faces that are nearer touch.
+_TOUCHING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedFaces:
+    """The faces of a frame that are one surface."""
+
+    label: Int64Array
+    """Of each plane, the number of the surface that it is of: that of its first plane, Shape ``[P]``."""
+    groups: tuple[Int64Array, ...] = ()
+    """Planes of each surface that is more than one, in ascending order: those of scenery come first."""
+    scenery: dict[int, int] = field(default_factory=dict)
+    """By label, the first triangle of scenery that a face touches, for surfaces that scenery is a part of."""
+
+
+class CoplanarFaces:
+    """Finds the faces of bodies that are one surface with others: coplanar ones that touch or overlap.
+
+    Two lorries side by side with flush walls, or a kiosk flush with a façade, reflect as one wall does. Taken
+    for two planes, a wave would be reflected by each where both overlap, and by the one or the other, at
+    random, where a ray meets what coincides. So in each frame such faces are joined: they have one number, by
+    which chains of planes go, and one id.
+
+    Args:
+        table: Planes of scenery, and after them those of bodies, body after body.
+        first: Number of the first plane of a body.
+        sizes: How many planes each body has, Shape ``[V]``.
+        two_sided: Of each plane of a body, whether both of its sides reflect, Shape ``[P − first]``; of
+            others that face away from each other one at most is seen.
+    """
+
+    def __init__(self, table: PlaneTable, first: int, sizes: Int64Array, two_sided: BoolArray) -> None:
+        self._table, self._first, self._sizes, self._two_sided = table, first, sizes, two_sided
+        self._begin = first + np.cumsum(sizes) - sizes
+        # Random weights: planes that differ hardly ever have the same sum. The seed is fixed, as is the
+        # order.
+        rng = np.random.default_rng(0)
+        self._direction = rng.standard_normal(4)
+        self._direction /= np.abs(self._direction).sum()
+        self._reach = float(np.abs(table.origin[:first]).max(initial=1.0))
+        still = np.flatnonzero((table.normal[:first] != 0).any(1))
+        order = np.argsort(self._projected(still))
+        self._still, self._keys = still[order], self._projected(still)[order]
+        self.none = JoinedFaces(np.arange(len(table.normal)))
+
+    def find(self) -> JoinedFaces:
+        """Faces that are one surface as the table stands."""
+        table = self._table
+        moving = np.arange(self._first, len(table.normal))
+        moving = moving[(table.normal[moving] != 0).any(1)]
+        one, other = self._of_bodies()
+        together = self._coplanar(one, other)
+        one, other = one[together], other[together]
+        body, still = self._with_scenery(moving)
+        together = self._coplanar(body, still)
+        body, still = body[together], still[together]
+        triangle = self._touched(body, still)
+        touching = triangle >= 0
+        body, still, triangle = body[touching], still[touching], triangle[touching]
+        if not len(one) + len(body):
+            return self.none
+        pairs = np.column_stack([np.append(other, still), np.append(one, body)])
+        return self._joined(pairs, still, triangle)
+
+    def _joined(self, pairs: Int64Array, still: Int64Array, triangle: Int64Array) -> JoinedFaces:
+        """Surfaces of planes that are one, pair by pair, and the triangles of planes of scenery that these
+        touch."""
+        label = self.none.label.copy()
+        members = np.unique(pairs)
+        while True:
+            # Labels spread along the pairs until none changes.
+            least = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
+            before = label[members].copy()
+            for side in (0, 1):
+                np.minimum.at(label, pairs[:, side], least)
+            if (label[members] == before).all():
+                break
+        groups = tuple(members[label[members] == first] for first in np.unique(label[members]))
+        # Descending: of equal labels the dictionary keeps the last, the lowest triangle.
+        order = np.argsort(-triangle)
+        touched = dict(zip(label[still[order]].tolist(), triangle[order].tolist(), strict=True))
+        return JoinedFaces(label, groups, touched)
+
+    def _of_bodies(self) -> tuple[Int64Array, Int64Array]:
+        """Planes of one body and of another whose boxes touch, that may be coplanar."""
+        none = np.zeros(0, np.int64)
+        if len(self._sizes) < 2:
+            return none, none
+        table, begin = self._table, self._begin - self._first
+        flat = (table.normal[self._first :] != 0).any(1)[:, None]
+        low = np.minimum.reduceat(np.where(flat, table.low[self._first :], np.inf), begin)
+        high = np.maximum.reduceat(np.where(flat, table.high[self._first :], -np.inf), begin)
+        some = np.flatnonzero(np.isfinite(low).all(1))
+        # Sorted along x, only bodies whose extents overlap there are compared.
+        some = some[np.argsort(low[some, 0], kind="stable")]
+        last = np.searchsorted(low[some, 0], high[some, 0] + _TOUCHING, side="right")
+        place, behind = ranges(np.arange(len(some)) + 1, np.maximum(last - np.arange(len(some)) - 1, 0))
+        one, other = some[place], some[behind]
+        touch = ((low[one] <= high[other] + _TOUCHING) & (low[other] <= high[one] + _TOUCHING)).all(1)
+        one, other = one[touch], other[touch]
+        if not len(one):
+            return none, none
+        pair, first = ranges(self._begin[one], self._sizes[one])
+        row, second = ranges(self._begin[other[pair]], self._sizes[other[pair]])
+        one, other = first[row], second
+        touch = (
+            (table.low[one] <= table.high[other] + _TOUCHING)
+            & (table.low[other] <= table.high[one] + _TOUCHING)
+        ).all(1)
+        one, other = one[touch], other[touch]
+        same = np.einsum("nc,nc->n", table.normal[one], table.normal[other])
+        seen = (same > 0) | self._two_sided[one - self._first] | self._two_sided[other - self._first]
+        kept = seen & (np.abs(same) > 0.5)
+        return one[kept], other[kept]
+
+    def _with_scenery(self, moving: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Planes of bodies and of scenery whose normals and offsets agree, about."""
+        reach = 2.0 * _JOINED_ANGLE
+        found = [np.zeros((0, 2), np.int64)]
+        for sign in (1.0, -1.0):
+            key = sign * self._projected(moving)
+            first = np.searchsorted(self._keys, key - reach)
+            own, place = ranges(first, np.searchsorted(self._keys, key + reach, side="right") - first)
+            found.append(np.column_stack([moving[own], self._still[place]]))
+        body, still = np.concatenate(found).T
+        table = self._table
+        touch = (
+            (table.low[body] <= table.high[still] + _TOUCHING)
+            & (table.low[still] <= table.high[body] + _TOUCHING)
+        ).all(1)
+        return body[touch], still[touch]
+
+    def _projected(self, planes: Int64Array) -> Float64Array:
+        """Normals and offsets of planes as one number each, of opposite sign for the opposite normal: what
+        hardly differs stands near in the order of these."""
+        normal = self._table.normal[planes]
+        offset = np.einsum("nc,nc->n", normal, self._table.origin[planes]) / self._reach
+        projected: Float64Array = normal @ self._direction[:3] + offset * self._direction[3]
+        return projected
+
+    def _touched(self, body: Int64Array, still: Int64Array) -> Int64Array:
+        """First triangle of scenery, for pairs of planes, whose box the body's face touches; −1: none."""
+        triangles, sizes = self._table.triangles_of(still)
+        own = np.repeat(np.arange(len(still)), sizes)
+        corners = self._table.corners_of(triangles)
+        plane = body[own]
+        touch = (corners.min(1) <= self._table.high[plane] + _TOUCHING) & (
+            self._table.low[plane] <= corners.max(1) + _TOUCHING
+        )
+        hits = touch.all(1)
+        found = np.full(len(body), np.iinfo(np.int64).max)
+        np.minimum.at(found, own[hits], triangles[hits])
+        return np.where(found < np.iinfo(np.int64).max, found, -1)
+
+    def _coplanar(self, one: Int64Array, other: Int64Array) -> BoolArray:
+        """Mask of pairs of planes of which all corners of the one are in the other."""
+        if not len(one):
+            return np.zeros(0, np.bool_)
+        table = self._table
+        across = np.abs(cross(table.normal[one], table.normal[other])).max(1)
+        within: BoolArray = across <= _JOINED_ANGLE
+        rows = np.flatnonzero(within)
+        triangles, sizes = table.triangles_of(one[rows])
+        own = np.repeat(rows, sizes)
+        places = table.corners_of(triangles)
+        height = np.einsum("ntc,nc->nt", places - table.origin[other[own]][:, None], table.normal[other[own]])
+        slack = COPLANAR + COPLANAR_RELATIVE * np.abs(places).max((1, 2))
+        off = np.abs(height).max(1) > slack
+        within[own[off]] = False
+        return within

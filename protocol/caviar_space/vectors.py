@@ -1,10 +1,13 @@
-"""Vectors in arrays: cross products, unit vectors, and numbers of ranges."""
+"""Vectors and rows in arrays: cross products, unit vectors, numbers of ranges, and records of many rows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import ClassVar, Self
+
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 
 
 def cross(one: Float64Array, other: Float64Array) -> Float64Array:
@@ -49,3 +52,56 @@ def ranges(begin: Int64Array, sizes: Int64Array) -> tuple[Int64Array, Int64Array
     """
     own = np.repeat(np.arange(len(begin)), sizes)
     return own, np.arange(len(own)) - np.repeat(np.cumsum(sizes) - sizes - begin, sizes)
+
+
+class Rows:
+    """Base of frozen dataclasses whose arrays have a row for each path, candidate or chain.
+
+    Fields that are neither arrays nor rows are the same for all rows, and stay.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True, eq=False)
+        ... class Points(Rows):
+        ...     x: Float64Array
+        ...     unit: str
+        >>> points = Points(np.array([1.0, 2.0]), "m")
+        >>> Points.joined([points, points]).take(np.array([3, 0]))
+        Points(x=array([2., 1.]), unit='m')
+    """
+
+    by_carrier: ClassVar[frozenset[str]] = frozenset()
+    """Arrays whose second axis has the rows."""
+    shared: ClassVar[frozenset[str]] = frozenset()
+    """Arrays that are of all rows together."""
+
+    def take(self, which: Int64Array | BoolArray) -> Self:
+        """These rows, in this order.
+
+        Args:
+            which: Numbers of rows, or for each row whether it is taken.
+        """
+        # Without __init__, which sets each field of a frozen dataclass by a call.
+        taken = object.__new__(type(self))
+        for name, value in self.__dict__.items():
+            if isinstance(value, np.ndarray) and name not in self.shared:
+                value = value[:, which] if name in self.by_carrier else value[which]
+            elif isinstance(value, Rows):
+                value = value.take(which)
+            taken.__dict__[name] = value
+        return taken
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of several, one at least, part by part; what is no array is that of the first.
+
+        Args:
+            parts: With arrays of one width.
+        """
+        made = object.__new__(cls)
+        for name, value in parts[0].__dict__.items():
+            if isinstance(value, np.ndarray) and name not in cls.shared:
+                columns = [part.__dict__[name] for part in parts]
+                value = np.concatenate(columns, axis=int(name in cls.by_carrier))
+            made.__dict__[name] = value
+        return made

@@ -3,16 +3,20 @@
 From messages: what the service knows about the run, the frame with its inputs, what products are checked for.
 To messages: DONE with products, encoded or as they are, and FAULT. The newest answers are kept, for a GRANT
 that is repeated.
+
+The line of a service's own code, for texts that say where it waits or failed.
 """
 
 from __future__ import annotations
 
 import logging
+import sys
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import CodeType, TracebackType
 from typing import Any, TypeAlias
 
 import msgspec
@@ -27,7 +31,6 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.codebooks import codebook_digest, codebook_file
 from caviar_protocol.topics import PAYLOADS, Carrier
 from caviar_protocol.validation import ContentCheck, ContentRules
-from caviar_services.places import place_of_error
 from caviar_services.service import (
     Frame,
     FrameInput,
@@ -37,6 +40,40 @@ from caviar_services.service import (
     StepResult,
     no_orders,
 )
+
+
+def place_in(cls: type | None, lines: Iterable[tuple[CodeType, int]]) -> str:
+    """The first of some lines that is in a module of a class or of its bases.
+
+    Args:
+        cls: Implementation of a service.
+        lines: Code and number of each line, the innermost call first.
+
+    Returns:
+        ``my_agent.py:7 in step``, relative to the present folder where it lies there; empty where no line is.
+    """
+    modules = (sys.modules.get(base.__module__) for base in (cls.__mro__ if cls else ()))
+    files = {getattr(module, "__file__", None) for module in modules} - {None}
+    found = next(((code, line) for code, line in lines if code.co_filename in files), None)
+    if found is None:
+        return ""
+    code, line = found
+    file = Path(code.co_filename)
+    if file.is_relative_to(Path.cwd()):
+        file = file.relative_to(Path.cwd())
+    return f"{file}:{line} in {code.co_name}"
+
+
+def place_of_error(cls: type | None, trace: TracebackType | None) -> str:
+    """The line of a class's modules at which an exception left them.
+
+    Args:
+        cls: Implementation of a service.
+        trace: Of the exception.
+    """
+    lines = [(frame.f_code, line) for frame, line in traceback.walk_tb(trace)]
+    return place_in(cls, reversed(lines))
+
 
 _log = logging.getLogger("caviar.service")
 

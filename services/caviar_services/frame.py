@@ -235,7 +235,7 @@ class StepResult(msgspec.Struct, frozen=True, kw_only=True):
     """Agents: this frame is the last of the episode."""
     meshes: Mapping[str, Path | bytes] | None = None
     """Worlds with ``changes_geometry``: files of all meshes, beside those of `Service.scenery`, that objects
-    may have, by their names (`caviar_protocol.geometry.mesh_name`); None: as before."""
+    may have, by their names (`caviar_protocol.assets.mesh_name`); None: as before."""
     meshes_from: int = -1
     """First frame in which they may; −1: this one."""
     seed: int = -1

@@ -234,7 +234,13 @@ def _planet(file: Path, lines: list[str]) -> PatternTable:
         if key in _CUTS:
             if key in cuts:
                 raise AssetError(f"{file}:{number}: is a second {key}; remove one")
-            cut = cuts[key] = _CutLines(file, number, key, _count(file, number, parts))
+            # How many lines follow a cut's key.
+            if len(parts) < 2 or not parts[1].isdecimal() or not 1 <= int(parts[1][:9]) <= _MOST_ANGLES:
+                raise AssetError(
+                    f"{file}:{number}: is {' '.join(parts)!r:.80}; write {parts[0]} and how many lines "
+                    f"follow, up to {_MOST_ANGLES}"
+                )
+            cut = cuts[key] = _CutLines(file, number, key, int(parts[1]))
         elif key == "GAIN":
             if gain_dbi is not None:
                 raise AssetError(f"{file}:{number}: is a second GAIN; remove one")
@@ -263,16 +269,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _count(file: Path, line: int, parts: list[str]) -> int:
-    """How many lines follow a cut's key."""
-    if len(parts) < 2 or not parts[1].isdecimal() or not 1 <= int(parts[1][:9]) <= _MOST_ANGLES:
-        raise AssetError(
-            f"{file}:{line}: is {' '.join(parts)!r:.80}; write {parts[0]} and how many lines follow, up to "
-            f"{_MOST_ANGLES}"
-        )
-    return int(parts[1])
 
 
 def _gain(file: Path, line: int, parts: list[str]) -> float:

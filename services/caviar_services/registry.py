@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 BUILT_IN: dict[str, str] = {
     "world:sumo": "caviar_services.world.sumo:SumoWorld",
-    "world:sumo-actuated": "caviar_services.world.sumo_actuated:ActuatedSumoWorld",
+    "world:sumo-actuated": "caviar_services.world.sumo:ActuatedSumoWorld",
     "world:trajectory": "caviar_services.world.trajectory:TrajectoryWorld",
     "world:flight": "caviar_services.world.flight:FlightWorld",
     "channel:adaptive": "caviar_services.channel.adaptive.channel:AdaptiveChannel",
@@ -55,7 +55,7 @@ BUILT_IN: dict[str, str] = {
     "agent:hierarchical-sweep": "caviar_services.agent.sweeps:HierarchicalSweepAgent",
     "agent:last-sweep": "caviar_services.agent.sweeps:LastSweepAgent",
     "agent:fingerprint": "caviar_services.agent.fingerprint:FingerprintAgent",
-    "agent:out-of-band": "caviar_services.agent.out_of_band:OutOfBandAgent",
+    "agent:out-of-band": "caviar_services.agent.sweeps:OutOfBandAgent",
     "agent:ucb": "caviar_services.agent.bandits:UcbAgent",
     "agent:thompson": "caviar_services.agent.bandits:ThompsonAgent",
     "agent:learner": "caviar_services.agent.learner:LearnerAgent",
@@ -288,7 +288,22 @@ def scenario_schema() -> dict[str, Any]:
         if {"use", "settings"} <= definition.get("properties", {}).keys():
             definition["allOf"] = list(_conditions(definition, by_implementation))
     _describe_noise(definitions, by_implementation, noises)
-    _accept_instants(definitions[Run.__name__])
+    # Add the forms of ``instants`` that a scenario may have in place of ``frames``.
+    run = definitions[Run.__name__]
+    properties = run["properties"]
+    file = {"type": "string", "pattern": "^file:"}
+    listed = {key: value for key, value in properties["instants_s"].items() if key != "description"}
+    properties["instants_s"] = {
+        "description": properties["instants_s"]["description"],
+        "anyOf": [listed, file],
+    }
+    properties["instants_ns"] = {
+        "description": "Instants of the frames of an episode, as whole numbers, in place of instants_s [ns]",
+        "type": "array",
+        "items": {"type": "integer", "minimum": 0},
+    }
+    run["required"] = [name for name in run["required"] if name != "frames"]
+    run["anyOf"] = [{"required": [name]} for name in ("frames", "instants_s", "instants_ns")]
     del definitions[Scenario.__name__]["properties"]["source"]  # where the file was read from
     del definitions["Source"]
     head: dict[str, Any] = {"$schema": DIALECT, "title": "CAVIAR scenario"}
@@ -348,21 +363,3 @@ def _describe_noise(
     for sensor, choices in tables.items():
         settings = definitions[references["sensors", sensor]["$ref"].rpartition("/")[2]]
         settings["properties"]["noise"]["anyOf"] = choices
-
-
-def _accept_instants(run: dict[str, Any]) -> None:
-    """Add the forms of ``instants`` that a scenario may have in place of ``frames``."""
-    properties = run["properties"]
-    file = {"type": "string", "pattern": "^file:"}
-    listed = {key: value for key, value in properties["instants_s"].items() if key != "description"}
-    properties["instants_s"] = {
-        "description": properties["instants_s"]["description"],
-        "anyOf": [listed, file],
-    }
-    properties["instants_ns"] = {
-        "description": "Instants of the frames of an episode, as whole numbers, in place of instants_s [ns]",
-        "type": "array",
-        "items": {"type": "integer", "minimum": 0},
-    }
-    run["required"] = [name for name in run["required"] if name != "frames"]
-    run["anyOf"] = [{"required": [name]} for name in ("frames", "instants_s", "instants_ns")]

@@ -15,10 +15,10 @@ from typing import Annotated, Any, cast, get_args
 import msgspec
 from msgspec import Meta
 
+from caviar_protocol.assets import recorded_meshes
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.geometry import recorded_meshes
-from caviar_protocol.messages import GeometryChange, GrantInput, Role, Status
-from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.messages import GeometryChange, Role, Status
+from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import PAYLOADS
@@ -112,13 +112,26 @@ class Replayer(Service[ReplaySettings]):
         """What the service made of this frame. `RecordingError` where the frame was not recorded."""
         # The recording ends with the last frame; the agent's extra grant after it was not recorded.
         if frame.final:
-            return StepResult(seed=self._next_seed(frame.episode))
+            # Seed that the agents of the recorded run chose; −1 where the one before went on.
+            here, following = self._episodes.get(frame.episode), self._episodes.get(frame.episode + 1)
+            return StepResult(seed=following[1] if here and following and following[1] != here[1] else -1)
         recorded = self._recording.frame(frame.episode, frame.number)
         report = next((r for r in recorded.reports if r.source == self.run.name), None)
         last = self._episodes[frame.episode][0]
         change = report.geometry if report else None
         return StepResult(
-            products=self._products(recorded),
+            products={
+                item.provenance.topic: Encoded(
+                    topic=item.provenance.topic,
+                    header=bytes(item.header),
+                    body=bytes(item.body),
+                    fidelity=item.provenance.fidelity,
+                )
+                for item in recorded.products
+                if item.provenance.source == self.run.name
+                and item.provenance.topic in self.outputs
+                and item.provenance.status in (Status.FRESH, Status.HELD)
+            },
             decisions=report.decisions if report else {},
             counts=report.counts if report else {},
             end_episode=self.role == "agent" and frame.number == last,
@@ -136,30 +149,6 @@ class Replayer(Service[ReplaySettings]):
                     f"announced; run the world again, as in caviar replay --keep {self.run.name}"
                 )
         return {asset.name: there[asset.name] for asset in change.assets}
-
-    def _products(self, recorded: RecordedFrame) -> dict[str, Encoded]:
-        return {
-            item.provenance.topic: Encoded(
-                topic=item.provenance.topic,
-                header=bytes(item.header),
-                body=bytes(item.body),
-                fidelity=item.provenance.fidelity,
-            )
-            for item in recorded.products
-            if self._is_own(item.provenance)
-        }
-
-    def _is_own(self, entry: GrantInput) -> bool:
-        return (
-            entry.source == self.run.name
-            and entry.topic in self.outputs
-            and entry.status in (Status.FRESH, Status.HELD)
-        )
-
-    def _next_seed(self, episode: int) -> int:
-        """Seed that the agents of the recorded run chose; −1 where the one before went on."""
-        here, following = self._episodes.get(episode), self._episodes.get(episode + 1)
-        return following[1] if here and following and following[1] != here[1] else -1
 
     def _check_scenery(self) -> None:
         recording, there = self._recording, self._recording.assets

@@ -142,7 +142,12 @@ class Runner:
             self._session.leave(str(order) or "SIGTERM")
             return TERMINATED
         finally:
-            self._close()
+            # The connection last, and in any case: BYE may still be on its way.
+            try:
+                self._session.close()
+            finally:
+                self._broker.close()
+                self._termination.finished()
 
     def _serve(self) -> None:
         """Pass messages to the session until an order or a loss ends that."""
@@ -243,14 +248,6 @@ class Runner:
                 _log.warning("back after %.1f s as attempt %d", away_s, self._session.attempt)
                 return
 
-    def _close(self) -> None:
-        # The connection last, and in any case: BYE may still be on its way.
-        try:
-            self._session.close()
-        finally:
-            self._broker.close()
-            self._termination.finished()
-
 
 class SignalTermination(Termination):
     """SIGTERM and SIGINT as such an order.
@@ -341,7 +338,11 @@ def serve(
         The exit status of the process; what is wrong is written to standard error.
     """
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s")
-    _keep_last_words()
+    # See to it that what a process says before it dies stands in its log.
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a test, or a notebook, may have put something else there
+        sys.stdout.reconfigure(line_buffering=True)
+    if sys.stderr is sys.__stderr__:
+        faulthandler.enable()
     role, separator, implementation = use.partition(":")
     if not separator:
         sys.stderr.write(f"caviar service: --use {use!r} is not ROLE:NAME, for example world:sumo\n")
@@ -359,18 +360,6 @@ def serve(
         sys.stderr.write(f"caviar service {name}: {error}\n")
         return 1
     return restart_status(status, runner.ended) if restarted else status
-
-
-def _keep_last_words() -> None:
-    """See to it that what a process says before it dies stands in its log.
-
-    Into a file Python writes by the block, and what `print` was given last is lost with a process that is
-    killed. Of a crash in a library of C it says nothing at all unless told to.
-    """
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a test, or a notebook, may have put something else there
-        sys.stdout.reconfigure(line_buffering=True)
-    if sys.stderr is sys.__stderr__:
-        faulthandler.enable()
 
 
 def main() -> int:

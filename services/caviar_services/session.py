@@ -25,7 +25,6 @@ from caviar_protocol.host import trim_memory
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.codebooks import add_codebook_files
 from caviar_protocol.validation import ContentCheck
-from caviar_services.asset_fetcher import AssetFetcher, FetchedFile
 from caviar_services.conversion import (
     Answer,
     Answers,
@@ -40,8 +39,7 @@ from caviar_services.conversion import (
     run_info,
     sorted_products,
 )
-from caviar_services.returned import returned
-from caviar_services.run_time_geometry import AnnouncedMeshes, FollowedMeshes
+from caviar_services.run_time_geometry import AnnouncedMeshes, AssetFetcher, FetchedFile, FollowedMeshes
 from caviar_services.service import (
     Frame,
     Preparation,
@@ -51,6 +49,7 @@ from caviar_services.service import (
     StepResult,
     no_orders,
     no_progress,
+    returned,
 )
 
 TRIM_EVERY = 10

@@ -33,7 +33,7 @@ from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, Service
 
 PERIOD_NS = 10_000_000

@@ -29,11 +29,10 @@ from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask
-from caviar_clients.datasets.plan import plan_dataset
-from caviar_clients.datasets.presets import PRESETS, apply_preset
+from caviar_clients.datasets.generate import SharedTraffic
+from caviar_clients.datasets.plan import PRESETS, apply_preset, plan_dataset
 from caviar_clients.datasets.rows import EpisodeRows
-from caviar_clients.datasets.traffic import SharedTraffic
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 
 WORKERS = (1, 10, 100, 1000, 10_000)
 TASKS_OF_A_WORKER = 30
@@ -73,7 +72,7 @@ class Cost:
 def measure(name: str, seconds: float, out: Path) -> Cost:
     """Play episodes of a preset at one worker."""
     preset = PRESETS[name]
-    scenario = apply_preset(preset, checked_scenario(preset.scenario))
+    scenario = apply_preset(preset, prepare(preset.scenario).scenario)
     plan = plan_dataset(scenario, episodes=preset.episodes)
     directory = DatasetDirectory(out / name)
     traffic = SharedTraffic(plan.scenario)

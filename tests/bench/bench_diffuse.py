@@ -25,9 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.session.scenes import Scenes, scenes_of
+from caviar_clients.session.scenes import Scenes
 from caviar_labs.tradeoff.errors import Key, UserChannel, differences, error_fields
 from caviar_labs.tradeoff.ladder import Setting
+from caviar_labs.tradeoff.scenes import scenes_of
 from caviar_labs.tradeoff.worker import Rung
 
 SCENARIO = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "street-canyon.toml"

@@ -24,8 +24,7 @@ from pathlib import Path
 
 from caviar_broker.core.events import Journal, Product
 from caviar_broker.core.run import Snapshot
-from caviar_broker.journal import CheckpointFiles, JournalFile
-from caviar_broker.journal_writer import JournalWriter
+from caviar_broker.journal import CheckpointFiles, JournalFile, JournalWriter
 from caviar_broker.resume import read_resumption
 from caviar_protocol.digest import RunDigest, payload_digest
 from caviar_protocol.files import Durability

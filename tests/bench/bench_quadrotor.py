@@ -21,7 +21,7 @@ from caviar_protocol.spec import table
 from caviar_protocol.topics import Action, WaypointCommand
 from caviar_services.service import Frame, FrameInput, RunInfo
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
-from caviar_services.world.quadrotor.wind import Wind
+from caviar_services.world.quadrotor.surroundings import Wind
 from caviar_space.obstacles import Obstacles
 
 PERIOD_NS = 100_000_000

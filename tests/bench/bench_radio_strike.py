@@ -30,9 +30,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 import caviar_clients.envs
-from caviar_clients.envs.radio_strike.env import RadioStrikeEnv
-from caviar_clients.envs.radio_strike.rules import USERS
-from caviar_clients.envs.radio_strike.sources import synthetic_episode
+from caviar_labs.radio_strike.env import RadioStrikeEnv
+from caviar_labs.radio_strike.rules import USERS
+from caviar_labs.radio_strike.sources import synthetic_episode
 
 gymnasium.register_envs(caviar_clients.envs)
 

@@ -23,10 +23,10 @@ import numpy as np
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.sionna import model as sionna_model
-from caviar_services.channel.sionna.materials import UsedSurfaces
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.materials import UsedSurfaces
 from caviar_space.scenery import scenery_assets
 
 METAL = {

@@ -38,12 +38,11 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, quaternion_from_eu
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.arrays.channel_matrices import Located, PlaneWaves, bins_of, wideband_parts
-from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.geometry import PathGeometry
+from caviar_services.channel.paths import Antenna, PathGeometry
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.link.base import users_of
-from caviar_services.link.beam_sweep import beam_responses
+from caviar_services.link.beam_scores import beam_responses
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 NUMEROLOGY = {"subcarriers": 264, "subcarrier_spacing_hz": 120e3, "taps": 64}

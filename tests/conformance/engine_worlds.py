@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import socket
 import struct
 import subprocess
@@ -26,9 +27,9 @@ from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
 
 from caviar_protocol.arrays import WIRE_DTYPES
+from caviar_protocol.assets import digest_in
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.geometry import digest_in
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import (
     Action,
@@ -41,9 +42,9 @@ from caviar_protocol.topics import (
     VelocityCommand,
     WaypointCommand,
 )
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.world.assets import RunTimeMeshes
 
-FRAMES = 300
+FRAMES = 150
 ARRIVALS = (("car.2", "uav"), ("car.1",), ("car.0",), (), ("car.2",))
 """Objects that come in each frame of the vectors ``mounts_0`` to ``mounts_4``."""
 Ask = Callable[[str, Sequence[str]], list[str]]
@@ -469,6 +470,17 @@ def waiting_run(scenario: Path, folder: Path, *options: str, frames: int = FRAME
         yield WebRun(process, mark, out)
 
 
+def light(scenario: Path, folder: Path) -> Path:
+    """A scenario with a recorder for its world, and no service that loads large libraries."""
+    text = scenario.read_text("utf-8")
+    for name in ("channel", "lidar", "link", "agent"):
+        text, count = re.subn(rf"^\[services\.{name}\]\n(.+\n)*\n", "", text, flags=re.MULTILINE)
+        assert count == 1, name
+    path = folder / "light.toml"
+    path.write_text(re.sub("^record = .*", 'record = ["scene"]', text, flags=re.MULTILINE), "utf-8")
+    return path
+
+
 def token_of(folder: Path) -> str:
     """Token of a world, in a new directory of keys."""
     base = [sys.executable, "-m", "caviar_clients", "keys"]
@@ -480,11 +492,11 @@ def token_of(folder: Path) -> str:
     return done.stdout.strip()
 
 
-def whole_run(scenario: Path, folder: Path, command: Sequence[str]) -> tuple[str, Path]:
+def whole_run(scenario: Path, folder: Path, command: Sequence[str], *options: str) -> tuple[str, Path]:
     """Digest and directory of a run whose broker asks for the world's token."""
     keys = folder / "keys"
     token = token_of(keys)
-    with waiting_run(scenario, folder, "--keys", str(keys)) as run:
+    with waiting_run(scenario, folder, "--keys", str(keys), *options) as run:
         env = environment(run.mark, CAVIAR_TOKEN=token)
         with subprocess.Popen([*command, run.url, "world"], env=env) as world:
             try:
@@ -564,9 +576,9 @@ class Line:
             target.shutdown(socket.SHUT_RDWR)
 
 
-def check_kill(scenario: Path, folder: Path, command: Sequence[str], digest: str) -> None:
+def check_kill(scenario: Path, folder: Path, command: Sequence[str], digest: str, *options: str) -> None:
     """Cut off, it comes back by itself; killed and started again, it goes on: the run is the same."""
-    with waiting_run(scenario, folder) as run, closing(Line(run.url)) as line:
+    with waiting_run(scenario, folder, *options) as run, closing(Line(run.url)) as line:
         with run.agent(*command, line.url, "world") as first:
             eventually(lambda: recorded_below(run.out) >= 25, WITHIN_S, "some frames are recorded")
             before = recorded_below(run.out)

@@ -27,9 +27,9 @@ from caviar_labs.conform.canonical import Answer
 from caviar_labs.conform.client import Received, Rules, Started, Wire
 from caviar_labs.conform.session import Seen, Session
 from caviar_labs.conform.street import Inputs
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import RunError
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.keys import Pair, write_pair
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Scene

@@ -137,6 +137,14 @@ def test_the_node_of_its_page_tells_where_physics_move_a_body(godot: str, tmp_pa
     assert last.velocity[0, 2] < first.velocity[0, 2] <= 0
 
 
+def test_killed_and_started_again_it_goes_on_with_the_same_digest(command: list[str], tmp_path: Path) -> None:
+    """At a pace at which the frames are not over before the kill."""
+    scenario = worlds.light(SCENARIO, tmp_path)
+    digest, _ = worlds.whole_run(scenario, tmp_path / "whole", command, "--pace", "10")
+    worlds.check_kill(scenario, tmp_path / "killed", command, digest, "--pace", "10")
+
+
+@pytest.mark.exhaustive
 def test_a_run_with_channel_lidar_link_and_recorder_and_the_same_digest_after_a_kill(
     command: list[str], tmp_path: Path
 ) -> None:

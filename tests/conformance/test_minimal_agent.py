@@ -74,7 +74,7 @@ exec(compile(open(sys.argv[0]).read(), sys.argv[0], "exec"))
 
 def test_sigterm_amid_a_message_does_not_cut_it_off() -> None:
     command = [sys.executable, "-c", STUB, str(AGENT), "tcp://nowhere:1", "mine"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert json.loads(ended.stdout) == [["HELLO"], ["RESET_DONE"], ["DONE", "part", "part"], ["BYE"]], (
         ended.stderr
     )

@@ -10,7 +10,7 @@ import engine_worlds as worlds
 import pytest
 from scenarios_support import ROOT, blocks, eventually, recorded_below
 
-from caviar_protocol.geometry import is_mesh_name
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Lidar
 

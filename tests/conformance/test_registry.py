@@ -7,8 +7,14 @@ scenario that uses it, or none; its role's class says what is asked of it.
 from __future__ import annotations
 
 import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -18,6 +24,7 @@ from caviar_protocol.scenario.rules import world_of
 from caviar_services.recorder.mcap import McapRecorder
 from caviar_services.registry import load, registered
 from caviar_services.testing import CONFORMANCE, ServiceConformance, samples
+from caviar_services.testing.base import HEAVY
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "caviar_scenarios"
 
@@ -45,6 +52,7 @@ OVERRIDES: dict[str, dict[str, object]] = {
         "calibrate_every": 2,
     },
     "channel:sionna-rt": {"samples": 2000, "pool": {}, "bodies": 2},
+    "world:sumo-actuated": {"begin_s": 15.0},  # each life simulates until then
     "sensors:lidar": {"grid": {"minimum_m": [-60, -40, 0], "maximum_m": [80, 30, 12], "cells": [28, 14, 6]}},
 }
 """What the small street of the tests needs in other sizes than the scenario."""
@@ -58,6 +66,47 @@ FOLLOWING: dict[str, dict[str, object]] = {
 
 # Of files that settings name; removed when the process ends.
 _FOLDER = TemporaryDirectory(prefix="caviar-registry-")
+
+
+class _Made:
+    """Settings that take a while: made when the first test asks for them, not when tests are collected."""
+
+    def __init__(self, make: Callable[[], Mapping[str, Any]]) -> None:
+        self._make = cache(make)
+
+    def __get__(self, instance: object, owner: type) -> Mapping[str, Any]:
+        return self._make()
+
+
+@cache
+def _heavy_imports() -> dict[str, list[str]]:
+    """Heavy libraries that each implementation's module imports in a process of its own, by module.
+
+    The processes are forks of one that has imported what all of them do.
+    """
+    modules = sorted({load(*key.split(":")).__module__ for key in registered()})
+    program = f"""
+import json, os, sys
+import caviar_services.service
+for module in {modules!r}:
+    sys.stdout.flush()
+    if os.fork() == 0:
+        __import__(module)
+        print(json.dumps([module, sorted({{m.partition(".")[0] for m in sys.modules}} & set({HEAVY!r}))]))
+        sys.exit()
+    if os.wait()[1]:
+        sys.exit(f"{{module}} cannot be imported")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return dict(map(json.loads, done.stdout.splitlines()))
+
+
+def _test_importing_it_imports_nothing_heavy(self: ServiceConformance) -> None:
+    """So that an agent or a broker does not carry a ray tracer."""
+    assert _heavy_imports()[self.service_class.__module__] == []
 
 
 def _example(role: str, name: str) -> tuple[Scenario, str] | None:
@@ -100,12 +149,16 @@ def _recorded_street() -> Path:
 
 def _tests_of(key: str) -> type[ServiceConformance]:
     role, _, name = key.partition(":")
-    members: dict[str, object] = {"service_class": load(role, name), "__module__": __name__}
+    members: dict[str, object] = {
+        "service_class": load(role, name),
+        "__module__": __name__,
+        "test_importing_it_imports_nothing_heavy": _test_importing_it_imports_nothing_heavy,
+    }
     example = _example(role, name)
     if key == "agent:policy" and importlib.util.find_spec("onnx") is not None:
-        members["settings"] = {"file": f"file:{_first_beams()}", "observe": ["aod"]}
+        members["settings"] = _Made(lambda: {"file": f"file:{_first_beams()}", "observe": ["aod"]})
     if key == "agent:fingerprint":
-        members["settings"] = {"file": f"file:{_recorded_street()}"}
+        members["settings"] = _Made(lambda: {"file": f"file:{_recorded_street()}"})
     if key == "agent:mavlink":
         members["settings"] = {"object": "car.a", "listen": "127.0.0.1:0"}
     if key == "agent:out-of-band":  # the street's channel has one carrier, of which it takes the spectrum
@@ -132,6 +185,7 @@ def _tests_of(key: str) -> type[ServiceConformance]:
 for _key in registered():
     _tests = _tests_of(_key)
     globals()[_tests.__name__] = _tests
+del _tests  # pytest would collect it by this name, too
 
 
 @pytest.mark.parametrize("key", FOLLOWING)

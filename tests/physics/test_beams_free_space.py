@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.space.antenna_arrays import element_positions, steering_vector
+from caviar_protocol.space.antenna_arrays import dft_codebook, element_positions, steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, quaternion_from_euler, rotation_matrix
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import Action, AntennaArray, AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.agent.baselines import LosBeamAgent, OracleAgent

@@ -314,7 +314,7 @@ def test_a_pattern_that_no_world_brought_is_named() -> None:
     from caviar_protocol.errors import AssetError
 
     with pytest.raises(AssetError, match=r"no pattern 'patterns/x.csv' among the assets"):
-        Patterns().of(AntennaArray(pattern_file="patterns/x.csv"))
+        Patterns().element(AntennaArray(pattern_file="patterns/x.csv"))
 
 
 def test_a_table_of_gains_is_the_formula_it_was_made_of(tmp_path: Path) -> None:
@@ -322,7 +322,7 @@ def test_a_table_of_gains_is_the_formula_it_was_made_of(tmp_path: Path) -> None:
     pattern = Patterns({"patterns/a.csv": read_pattern(write_gain(tmp_path / "a.csv"))})
     k = np.random.default_rng(1).normal(size=(500, 3))
     k /= np.linalg.norm(k, axis=1, keepdims=True)
-    found = pattern.of(AntennaArray(pattern_file="patterns/a.csv")).amplitude(k)
+    found = pattern.element(AntennaArray(pattern_file="patterns/a.csv")).amplitude(k)
     error = 20 * np.log10(found / element_amplitude("tr38901", k))
     assert np.abs(error[found > 10 ** (-21 / 20)]).max() < 2e-3
     assert np.abs(error).max() < 0.2

@@ -22,8 +22,7 @@ from caviar_labs.stability.lab import (
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.propagation import utd as module
-from caviar_services.channel.propagation.fresnel import Media
-from caviar_services.channel.propagation.utd import edge_fields, wedges_of
+from caviar_services.channel.propagation.utd import Media, edge_fields, wedges_of
 from caviar_services.channel.sionna import path_table
 
 pytestmark = pytest.mark.channel
@@ -87,9 +86,7 @@ def test_a_diffracted_path_is_as_strong_wherever_the_scene_stands(tmp_path: Path
     Where nothing is turned, all but those over an edge's end are found; turned, other rays meet the car."""
     cases = [
         ((0, 0, 0), (0, 0, 0), 0.0),
-        ((100, 37, 0), (0, 0, 0), 0.0),
-        ((-60.3, 141.7, 0), (100, 37, 0), 0.7),
-        ((0, 0, 0), (1000.0, -430.0, 0), 0.0),
+        ((-60.3, 141.7, 0), (1000.0, -430.0, 0), 0.0),
         ((15.0, -90.0, 0), (-9000.0, 7000.0, 0), 0.4),
     ]
     found = [
@@ -133,7 +130,9 @@ def both_fields(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Array, Array]]:
     return seen
 
 
-@pytest.mark.parametrize("depth", [1, 2, 3])
+@pytest.mark.parametrize(
+    "depth", [pytest.param(1, marks=pytest.mark.exhaustive), 2, pytest.param(3, marks=pytest.mark.exhaustive)]
+)
 def test_but_for_a_sign_fields_are_those_of_the_ray_tracer_where_its_legs_are_right(
     tmp_path: Path, both_fields: list[tuple[Array, Array]], depth: int
 ) -> None:

@@ -285,7 +285,7 @@ def test_there_are_the_paths_of_all_sequences_of_faces(tmp_path: Path) -> None:
     assert deepest > 10
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 def test_there_are_as_many_where_no_chain_of_scenery_is_as_long_as_others(tmp_path: Path, count: int) -> None:
     plates = PLATES[:count]
     model, _ = street(tmp_path, plates=plates)
@@ -345,7 +345,7 @@ def test_another_scenery_is_another_file_and_none_is_kept_that_need_not(
     assert len(list(own_cache.iterdir())) == 3
 
 
-@pytest.mark.parametrize(("few", "rays"), [(64, 1), (0, 100_000)])
+@pytest.mark.parametrize(("few", "rays"), [pytest.param(64, 1, marks=pytest.mark.exhaustive), (0, 100_000)])
 def test_from_a_transmitter_that_moves_the_same_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, few: int, rays: int
 ) -> None:

@@ -202,7 +202,9 @@ def test_objects_are_foliage_within_their_bounding_boxes(lab: Lab) -> None:
     assert lost_db(channel, 0) == pytest.approx([expected], abs=1e-6)
 
 
-@pytest.mark.parametrize("rung", ["siso-rt", "spherical", "mimo-rt"])
+@pytest.mark.parametrize(
+    "rung", [pytest.param("siso-rt", marks=pytest.mark.exhaustive), "spherical", "mimo-rt"]
+)
 def test_matrices_on_every_rung(lab: Lab, rung: str) -> None:
     """H of the line of sight: on mimo-rt each pair of elements has a length of its own, elsewhere it is that
     between the arrays' centres. A hedge at 40° to the line."""

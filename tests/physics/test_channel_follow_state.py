@@ -47,7 +47,7 @@ def leaving(frame: int) -> Scene:
         pytest.param(street, marks=pytest.mark.exhaustive),
         leaving,
         pytest.param(standing, marks=pytest.mark.exhaustive),
-        to_and_fro,
+        pytest.param(to_and_fro, marks=pytest.mark.exhaustive),
     ],
 )
 def test_another_channel_goes_on_bit_by_bit(scene: Callable[[int], Scene]) -> None:

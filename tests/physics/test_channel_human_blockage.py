@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caviar_protocol.topics import Carrier, Interaction
-from caviar_services.channel.propagation.human_blockage import HumanBlockage, HumanBlockageSettings
+from caviar_services.channel.propagation.attenuation import HumanBlockage, HumanBlockageSettings
 from caviar_services.channel.sionna.settings import SionnaSettings
 
 C = 299792458.0

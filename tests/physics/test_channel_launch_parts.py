@@ -39,7 +39,7 @@ def _pairs(channel: Channel) -> list[int]:
     return np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets)).tolist()
 
 
-@pytest.mark.parametrize("settings", [{}, {"follow": 4}])
+@pytest.mark.parametrize("settings", [pytest.param({}, marks=pytest.mark.exhaustive), {"follow": 4}])
 def test_reflections_of_four_parts_are_those_of_one_launch(settings: dict[str, Any]) -> None:
     settings = {"samples": SAMPLES, "candidates": "launched", **settings}
     whole, parts = model(CANYON, **settings), model(CANYON, **settings, memory_gib=TEN_THOUSAND_AT_ONCE)

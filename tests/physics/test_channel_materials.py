@@ -36,15 +36,15 @@ from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.materials import (
+from caviar_services.channel.sionna.model import SionnaChannel
+from caviar_services.channel.sionna.settings import SionnaSettings
+from caviar_services.service import Preparation, RunInfo
+from caviar_space.materials import (
     ItuMaterial,
     MaterialPolicy,
     MaterialSettings,
     itu_material,
 )
-from caviar_services.channel.sionna.model import SionnaChannel
-from caviar_services.channel.sionna.settings import SionnaSettings
-from caviar_services.service import Preparation, RunInfo
 from caviar_space.scenery import scenery_assets
 
 pytestmark = pytest.mark.channel
@@ -217,7 +217,7 @@ def test_these_are_all_bundled_scenes() -> None:
     [
         pytest.param(
             name,
-            marks=[pytest.mark.exhaustive] if name not in ("etoile", "floor_wall", "simple_wedge") else [],
+            marks=[pytest.mark.exhaustive] if name != "etoile" else [],
         )
         for name in BUNDLED
     ],
@@ -237,7 +237,13 @@ def test_bundled_scenes_run_on_four_carriers(name: str) -> None:
         assert encode_payload(nearest)[1] == encode_payload(extrapolated)[1]
 
 
-@pytest.mark.parametrize("name", sorted(WITH_BRICK))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "floor_wall" else pytest.mark.exhaustive)
+        for name in sorted(WITH_BRICK)
+    ],
+)
 def test_bundled_scenes_with_brick_are_refused_at_60_ghz_by_default(name: str) -> None:
     with pytest.raises(ScenarioError, match=r"'brick' \(ITU brick\) is defined for 1–40 GHz, 110–330 GHz"):
         sionna(60e9, scenery_assets(f"sionna:{name}"), bodies=0)
@@ -276,7 +282,12 @@ def pair(tx: Array, rx: Array) -> Scene:
 
 @pytest.mark.parametrize("candidates", ["launched", "enumerated"])
 @pytest.mark.parametrize(
-    ("permittivity", "conductivity", "thickness"), [(1e12, 0.0, 1000.0), (1.0, 1e12, 1000.0), (1e9, 1e9, 0.1)]
+    ("permittivity", "conductivity", "thickness"),
+    [
+        pytest.param(1e12, 0.0, 1000.0, marks=pytest.mark.exhaustive),
+        pytest.param(1.0, 1e12, 1000.0, marks=pytest.mark.exhaustive),
+        (1e9, 1e9, 0.1),
+    ],
 )
 def test_the_greatest_constants_reflect_everything(
     tmp_path: Path, permittivity: float, conductivity: float, thickness: float, candidates: str

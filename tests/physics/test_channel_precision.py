@@ -32,8 +32,8 @@ LIMIT = 1e-3
 """[rad]"""
 
 AT = [
-    pytest.param(60e9, 2000.0, np.zeros(3), id="60 GHz, 2 km"),
-    pytest.param(300e9, 1000.0, np.zeros(3), id="300 GHz, 1 km"),
+    pytest.param(60e9, 2000.0, np.zeros(3), id="60 GHz, 2 km", marks=pytest.mark.exhaustive),
+    pytest.param(300e9, 1000.0, np.zeros(3), id="300 GHz, 1 km", marks=pytest.mark.exhaustive),
     pytest.param(60e9, 2000.0, np.array([7931.37, -6112.83, 311.19]), id="60 GHz, 2 km, 10 km out"),
     pytest.param(300e9, 1000.0, np.array([-6207.91, 7846.23, 87.31]), id="300 GHz, 1 km, 10 km out"),
 ]

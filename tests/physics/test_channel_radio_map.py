@@ -21,13 +21,12 @@ from caviar_labs.stability.lab import (
     write_scenery,
 )
 from caviar_protocol.errors import RunError
-from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.antenna_arrays import dft_codebook, steering_vector
 from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import AntennaArray, Scene
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.radio_map.cell_gains import MeasurementSurface
-from caviar_services.channel.radio_map.mapping import (
+from caviar_services.channel.radio_map import (
+    MeasurementSurface,
     RadioMap,
     draped_surface,
     level_surface,

@@ -15,7 +15,7 @@ import pytest
 from same_paths import EVERYTHING, POSITIONS, SCENES, SPECULAR, asked, digest, model, of_receiver, places
 
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.sionna.candidate_visibility import Planes
+from caviar_services.channel.sionna.candidates import Planes
 
 pytestmark = pytest.mark.channel
 

@@ -206,7 +206,11 @@ def test_parked_bodies_and_receivers_do_not_matter(tmp_path: Path) -> None:
     assert (one.interactions == Interaction.TRANSMISSION).any()
 
 
-@pytest.mark.parametrize("settings", [{}, {"candidates": "enumerated"}], ids=["launched", "enumerated"])
+@pytest.mark.parametrize(
+    "settings",
+    [pytest.param({}, marks=pytest.mark.exhaustive), {"candidates": "enumerated"}],
+    ids=["launched", "enumerated"],
+)
 def test_more_objects_than_bodies_have_bodies_made(tmp_path: Path, settings: dict[str, Any]) -> None:
     """The channel is that of a pool which was large enough, in the frame that is short and in those after."""
     assets = write_scenery(tmp_path, [GROUND, WALL])
@@ -229,9 +233,16 @@ def test_more_receivers_than_one_launch_takes(tmp_path: Path) -> None:
     assert digest(one) == digest(two)
 
 
-@pytest.mark.parametrize("everything", [False, True], ids=["reflection", "everything"])
 @pytest.mark.parametrize(
-    "rung", [pytest.param("siso-rt", marks=pytest.mark.exhaustive), "spherical", "mimo-rt"]
+    "everything", [pytest.param(False, marks=pytest.mark.exhaustive), True], ids=["reflection", "everything"]
+)
+@pytest.mark.parametrize(
+    "rung",
+    [
+        pytest.param("siso-rt", marks=pytest.mark.exhaustive),
+        pytest.param("spherical", marks=pytest.mark.exhaustive),
+        "mimo-rt",
+    ],
 )
 def test_no_frame_compiles_a_kernel(tmp_path: Path, rung: str, everything: bool) -> None:
     """Neither moving, coming and going, nor numbers of objects, receivers, elements and paths: all was

@@ -91,7 +91,7 @@ def same_paths(a: Channel, b: Channel) -> bool:
     [
         pytest.param("metal", 0.1, "refraction", {}, marks=pytest.mark.exhaustive),
         ("concrete", 20.0, "refraction", {}),
-        ("metal", 0.1, "refraction", {"reflection": False}),
+        pytest.param("metal", 0.1, "refraction", {"reflection": False}, marks=pytest.mark.exhaustive),
         pytest.param("concrete", 0.1, "scattering", {}, marks=pytest.mark.exhaustive),
         ("glass", 0.1, "scattering", {"refraction": True}),
         pytest.param("concrete", 0.1, "diffraction", {"bodies": 0}, marks=pytest.mark.exhaustive),
@@ -160,7 +160,7 @@ def test_without_surfaces_nothing_is_launched(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("material", "thickness", "settings"),
     [
-        ("concrete", 0.1, {"refraction": True}),
+        pytest.param("concrete", 0.1, {"refraction": True}, marks=pytest.mark.exhaustive),
         pytest.param("metal", 0.1, {"diffraction": True}, marks=pytest.mark.exhaustive),
         (
             "concrete",

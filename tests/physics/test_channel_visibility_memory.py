@@ -67,6 +67,7 @@ def diffuse(
     return channel, max(peaks)
 
 
+@pytest.mark.exhaustive
 def test_memory_is_bounded_and_changes_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """With 32 MiB allowed, three times as many paths take no more than 48 MiB; with 4 GiB, H is the same."""
     few, low = diffuse(monkeypatch, tmp_path / "few", 1000, 1 / 32)

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.channel
 DOCUMENT = Path(__file__).parents[2] / "docs" / "topics" / "channel-stability.md"
 GROUPS = sorted({case.group for case in cases() if case.traced})
 
-LONG = {"mesh", "place", "paths", "edge", "material"}
+LONG = {"mesh", "place", "paths", "edge", "material", "frequency", "distance", "flush"}
 """Groups that take most of the time."""
 
 

@@ -9,10 +9,9 @@ import pytest
 
 from caviar_services.world.flight_dynamics import Limits
 from caviar_services.world.quadrotor.airframe import Airframe
-from caviar_services.world.quadrotor.control import Controller
+from caviar_services.world.quadrotor.control import Battery, Controller
 from caviar_services.world.quadrotor.flyer import Quadrotor
-from caviar_services.world.quadrotor.state import Battery
-from caviar_services.world.quadrotor.wind import NOISES, Gusts, Wind, scales
+from caviar_services.world.quadrotor.surroundings import NOISES, Gusts, Wind, scales
 
 pytestmark = pytest.mark.slow
 

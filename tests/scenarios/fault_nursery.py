@@ -37,7 +37,7 @@ IMPORTED = (
     "caviar_services.runner",
     "caviar_services.agent.baselines",
     "caviar_services.channel.statistical.free_space",
-    "caviar_services.link.beam_sweep",
+    "caviar_services.link.beam_scores",
     "caviar_services.recorder.mcap",
     "caviar_services.world.trajectory",
 )
@@ -204,16 +204,16 @@ _case = Case(scenario="", directory="")
 
 def follow(case: Case) -> Result:
     """Run a case as ``caviar run`` would."""
-    from caviar_clients.cli import launch, processes
+    from caviar_clients.cli import launch
+    from caviar_clients.session.prepared import implemented
     from caviar_protocol.errors import CaviarError
     from caviar_protocol.scenario import load_scenario
 
     global _case
     _case = case
-    for module in (launch, processes):  # of the broker, and of the services
-        module.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": Forked})  # type: ignore[attr-defined]
+    launch.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": Forked})  # type: ignore[attr-defined]
     path, directory = Path(case.scenario), Path(case.directory)
-    launcher = launch.Launcher(load_scenario(path), path, directory)
+    launcher = launch.Launcher(implemented(load_scenario(path)), path, directory)
     notices: list[dict[str, Any]] = []
     remotes: list[Forked] = []
     outcome: Mapping[str, Any] = {}

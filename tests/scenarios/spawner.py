@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.geometry import mesh_name
+from caviar_protocol.assets import mesh_name
 from caviar_services.service import Frame, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_space.meshes import Mesh, fitted, loft, ply, unit_box

@@ -190,6 +190,7 @@ def test_recorded_decisions_imposed_repeat_a_run(tmp_path: Path) -> None:
     assert recorded_decisions(recording) == decisions
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sumo
 def test_stated_errors_hold_in_most_frames_of_a_run(tmp_path: Path) -> None:
     """Errors of successive frames are not independent, so less is asked for than the nine in ten stated."""

@@ -19,7 +19,7 @@ OVERRIDES = ("docker-compose.gpu.yml", "docker-compose.remote-agent.yml")
 def says(*command: str) -> str | None:
     """Output of a command; None where it fails or is not there."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=DEPLOY, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=DEPLOY, check=False)
     except FileNotFoundError:
         return None
     return done.stdout if done.returncode == 0 else None

@@ -35,6 +35,7 @@ def test_each_example_is_tried_here_and_on_the_page(program: str) -> None:
     assert f"({program})" in (EXAMPLES / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.exhaustive
 def test_train_and_evaluate(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
     printed = started(tmp_path, "train_and_evaluate.py", "--steps", "300")
@@ -101,7 +102,7 @@ def test_the_remote_trainer_plays_all_episodes(tmp_path: Path) -> None:
             assert time.monotonic() < until, f"no endpoint came: {output}"
             output += os.read(process.stdout.fileno(), 65536).decode()
         printed = started(tmp_path, "remote_trainer.py", str(scenario), found[1])
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
     assert process.returncode == 0
     assert "episode 2: mean |y| 0." in printed
     assert "the run is over" in printed
@@ -116,6 +117,7 @@ def test_the_guide_makes_keys_as_the_remote_trainer_does() -> None:
     assert not [command for command in commands if f"    {command}\n" not in described]
 
 
+@pytest.mark.exhaustive
 def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
     """As they stand in its file, one after the other; but for the port, and the length of the run."""
     here, there = tmp_path / "here", tmp_path / "there"
@@ -133,7 +135,7 @@ def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
 
     def ended(command: str, folder: Path) -> str:
         done = subprocess.run(
-            shlex.split(command), cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+            shlex.split(command), cwd=folder, capture_output=True, text=True, timeout=120, check=False,
             env={**os.environ, "PATH": bin_folder},
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
@@ -153,7 +155,7 @@ def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
     )  # fmt: skip
     try:
         assert "the run is over" in ended(train, here)
-        assert run.wait(timeout=30) == 0
+        assert run.wait(timeout=120) == 0
     finally:
         run.kill()
         run.communicate()
@@ -162,6 +164,6 @@ def test_the_commands_of_the_remote_trainer_are_right(tmp_path: Path) -> None:
 def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None:
     program = str(EXAMPLES / "remote_trainer.py")
     command = [sys.executable, program, "remote", "tcp://127.0.0.1:9", "--wait", "0.5"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     assert "tcp://127.0.0.1:9 within 0.5 s" in done.stdout + done.stderr

@@ -23,7 +23,7 @@ command.main()
 
 def test_too_few_open_files_are_refused_with_the_limit_and_the_remedy(tmp_path: Path) -> None:
     command = f"ulimit -n 30 && exec {sys.executable} -m caviar_clients run smoke --frames 2 --out {tmp_path}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert "may have 30 files open, and a run of 5 services needs 60" in done.stdout + done.stderr
     assert "ulimit -n" in done.stdout + done.stderr
@@ -34,7 +34,7 @@ def test_a_low_limit_that_may_be_raised_is_raised(tmp_path: Path) -> None:
     command = (
         f"ulimit -Sn 30 && exec {sys.executable} -m caviar_clients run smoke --frames 2 --out {tmp_path}"
     )
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

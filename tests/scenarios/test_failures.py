@@ -50,6 +50,7 @@ settings = {{ {settings} }}
 stall_s = 1.0
 {extra}
 """,
+        radio=False,
     )
 
 
@@ -80,7 +81,7 @@ def test_a_service_that_raises_is_named_with_its_exception_and_frame(tmp_path: P
 def test_a_service_that_exits_is_named_with_its_status_and_last_line(tmp_path: Path) -> None:
     started = time.monotonic()
     finished = run(faulty(tmp_path, "Exits"), tmp_path / "out")
-    assert time.monotonic() - started < 30.0
+    assert time.monotonic() - started < 120.0
     assert_blamed(finished, "sensors 'sick'", "frame 5", "status 3", "segmentation of the world failed")
     assert_readable(finished, 5)
 
@@ -116,20 +117,20 @@ def test_a_service_killed_or_stopped_from_outside_is_named_with_the_signal(
     scenario = faulty(tmp_path, "Raises", "frame = 1000000")
     with running(scenario, tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
-        os.kill(pid_of(mark, "caviar_services channel"), number)
-        output, _ = process.communicate(timeout=20)
+        os.kill(pid_of(mark, "caviar_services sick"), number)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 1
-        assert "channel 'channel' died" in output
+        assert "sensors 'sick' died" in output
         assert words in output
         assert marked(mark) == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_ends_everything_cleanly(tmp_path: Path, number: signal.Signals) -> None:
-    with running(scenario_file(tmp_path), tmp_path, "--frames", "100000") as (process, mark):
+    with running(scenario_file(tmp_path, radio=False), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         process.send_signal(number)
-        output, _ = process.communicate(timeout=10)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 130
         assert "stopped by" in output
         assert marked(mark) == []
@@ -142,7 +143,7 @@ def test_a_run_that_ctrl_c_ends_before_its_first_frame_leaves_no_directory(tmp_p
         log = "out/*/logs/broker.log"
         eventually(lambda: list(tmp_path.glob(log)), 20, "the broker starts")
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 130
         assert "no frame was simulated" in output
         assert marked(mark) == []
@@ -150,7 +151,7 @@ def test_a_run_that_ctrl_c_ends_before_its_first_frame_leaves_no_directory(tmp_p
 
 
 def test_a_launcher_that_is_killed_leaves_no_process_behind(tmp_path: Path) -> None:
-    with running(scenario_file(tmp_path), tmp_path, "--frames", "100000") as (process, mark):
+    with running(scenario_file(tmp_path, radio=False), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         process.kill()
         process.wait()
@@ -158,10 +159,10 @@ def test_a_launcher_that_is_killed_leaves_no_process_behind(tmp_path: Path) -> N
 
 
 def test_a_broker_that_is_killed_is_named_and_leaves_no_process_behind(tmp_path: Path) -> None:
-    with running(scenario_file(tmp_path), tmp_path, "--frames", "100000") as (process, mark):
+    with running(scenario_file(tmp_path, radio=False), tmp_path, "--frames", "100000") as (process, mark):
         eventually(lambda: recorded_below(tmp_path) > 3, 20, "a few frames are recorded")
         os.kill(pid_of(mark, "caviar_broker"), signal.SIGKILL)
-        output, _ = process.communicate(timeout=20)
+        output, _ = process.communicate(timeout=120)
         assert process.returncode == 1
         assert "the broker died: it was killed by SIGKILL" in output
         assert marked(mark) == []
@@ -169,9 +170,6 @@ def test_a_broker_that_is_killed_is_named_and_leaves_no_process_behind(tmp_path:
 
 SMOKE_SERVICES = {
     "world": "world:trajectory",
-    "channel": "channel:free-space",
-    "link": "link:beams",
-    "agent": "agent:los-beam",
     "recorder": "recorder:mcap",
 }
 
@@ -217,7 +215,7 @@ def test_a_service_that_answers_garbage_is_named(tmp_path: Path, garbage: str) -
         for name, use in SMOKE_SERVICES.items():
             command = [sys.executable, "-m", "caviar_services", name, "--use", use, "--broker", endpoint]
             services.append(subprocess.Popen(command, env=env, stdout=DEVNULL, stderr=DEVNULL))
-        output, errors = broker.communicate(timeout=30)
+        output, errors = broker.communicate(timeout=120)
     for service in services:
         service.wait(10)
     leftovers = marked(env[MARK])
@@ -229,7 +227,9 @@ def test_a_service_that_answers_garbage_is_named(tmp_path: Path, garbage: str) -
 def test_a_port_in_use_is_named_with_the_remedy(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        finished = run(scenario_file(tmp_path), tmp_path / "out", "--bind", f"tcp://127.0.0.1:{port}")
+        finished = run(
+            scenario_file(tmp_path, radio=False), tmp_path / "out", "--bind", f"tcp://127.0.0.1:{port}"
+        )
     assert_blamed(finished, f"127.0.0.1:{port}", "Address already in use", "--bind")
 
 
@@ -247,7 +247,7 @@ def test_a_missing_mesh_is_named_with_its_scene(tmp_path: Path) -> None:
     (tmp_path / "town.xml").write_text(TOWN)
     objects = "[[services.world.settings.objects]]"
     scenery = '[services.world.settings]\nscenery = "file:town.xml"\n\n'
-    scenario = scenario_file(tmp_path, [(objects, scenery + objects)])
+    scenario = scenario_file(tmp_path, [(objects, scenery + objects)], radio=False)
     assert_blamed(run(scenario, tmp_path / "out"), "world 'world'", "tower.ply", "town.xml")
 
 
@@ -272,7 +272,7 @@ def test_an_unknown_setting_of_a_service_is_named_with_file_line_and_suggestion(
 
 @pytest.mark.parametrize("how", ["", "--embedded"])
 def test_what_only_a_service_finds_wrong_is_named_with_file_and_line(tmp_path: Path, how: str) -> None:
-    scenario = scenario_file(tmp_path, [('name = "uav"', 'name = "car"')])
+    scenario = scenario_file(tmp_path, [('name = "uav"', 'name = "car"')], radio=False)
     line = 1 + scenario.read_text()[: scenario.read_text().rindex("[[services.world")].count("\n")
     key = "services.world.settings.objects[1]: a second object is named 'car'"
     finished = run(scenario, tmp_path / "out", *filter(None, [how]))
@@ -310,6 +310,7 @@ kind = "car"
 dimensions_m = [4.0, 1.8, 1.5]
 waypoints = [[0.0, 0.0, 0.0, 0.75], [1.0, 1.0, 0.0, 0.75]]
 """,
+        radio=False,
     )
     text = scenario.read_text().replace("[[devices]]\n", '[[devices]]\nworld = "world"\n')
     scenario.write_text(text)

@@ -14,7 +14,7 @@ from scenarios_support import caviar, eventually, pid_of, recorded_below, run, r
 
 from caviar_broker.core import events as ev
 from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.geometry import is_mesh_name
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario
 

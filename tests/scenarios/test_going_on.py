@@ -81,7 +81,7 @@ def test_a_service_that_is_killed_twice_is_started_again_and_the_digest_is_the_s
         for frame in (10, 35):
             eventually(lambda f=frame: recorded_below(tmp_path) > f, 30, f"frame {frame} is recorded")
             os.kill(pid_of(mark, f"caviar_services {service}"), number)
-        output, _ = process.communicate(timeout=40)
+        output, _ = process.communicate(timeout=120)
         assert marked(mark) == []
     directory = assert_same(tmp_path, output, process.returncode, digest)
     told = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]
@@ -97,7 +97,7 @@ def test_a_broker_that_is_killed_is_followed_by_another_and_the_digest_is_the_sa
         for frame in (10, 35):
             eventually(lambda f=frame: recorded_below(tmp_path) > f, 30, f"frame {frame} is recorded")
             os.kill(pid_of(mark, "caviar_broker"), signal.SIGKILL)
-        output, _ = process.communicate(timeout=40)
+        output, _ = process.communicate(timeout=120)
         assert marked(mark) == []
     assert_same(tmp_path, output, process.returncode, digest)
     assert output.count("another one resumes the run") == 2
@@ -109,7 +109,7 @@ def test_a_run_whose_machine_went_down_is_resumed(scenario: Path, digest: str, t
         for entry in [f"{process.pid} ", *marked(mark)]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(entry.split()[0]), signal.SIGKILL)
-        process.communicate(timeout=10)
+        process.communicate(timeout=120)
     resumed = caviar("run", "--resume", next(tmp_path.glob("*/")))
     assert resumed.leftovers == []
     assert_same(tmp_path, resumed.output, resumed.status, digest)

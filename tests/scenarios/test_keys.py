@@ -90,7 +90,7 @@ def minimal(port: str, shown: dict[str, str]) -> Finished:
     """The minimal agent, in a process of its own."""
     done = subprocess.run(
         [sys.executable, str(AGENT), f"tcp://127.0.0.1:{port}", "agent"],
-        env=os.environ | shown, capture_output=True, text=True, timeout=60.0, check=False,
+        env=os.environ | shown, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     return Finished(done.returncode, done.stdout + done.stderr, Path())
 

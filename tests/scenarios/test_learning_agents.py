@@ -57,7 +57,7 @@ def killed_twice(scenario: Path, out: Path) -> Path:
         for frame in (30, 120):
             eventually(lambda f=frame: recorded_below(out) > f, 30, f"frame {frame} is recorded")
             os.kill(pid_of(mark, "caviar_services agent"), signal.SIGKILL)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     directory = next(out.glob("*/"))
     told = [json.loads(line) for line in (directory / "events.jsonl").read_text().splitlines()]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from scenarios_support import ROOT, run, run_as_printed
 
-from caviar_clients.cli.radio_map_inputs import channel_of
+from caviar_clients.cli.radio_map import channel_of
 from caviar_clients.cli.scenarios import new_scenario
 from caviar_clients.session.scenes import scene_at
 from caviar_protocol.errors import RunError

@@ -33,7 +33,7 @@ def decided(directory: Path) -> list[str]:
 def posted(url: str, content: bytes) -> tuple[int, dict[str, Any]]:
     request = urllib.request.Request(f"{url}/policies/agent", content, method="POST")  # noqa: S310
     try:
-        with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310
+        with urllib.request.urlopen(request, timeout=120) as answer:  # noqa: S310
             return answer.status, json.loads(answer.read())
     except urllib.error.HTTPError as error:
         return error.code, json.loads(error.read())
@@ -67,7 +67,7 @@ def test_a_policy_is_swapped_while_the_run_goes_on_and_the_replay_is_the_same(tm
         assert (status, "no ONNX model" in answer["detail"]) == (409, True)
         assert caviar("policy", "swap", first, "--run", directory, "--agent", "link").status == 1
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=120)
     before = decided(directory)
     assert sorted({*before}) == sorted(digests), output
     # Each in one piece: also after the kill it served the policy that it had been given.

@@ -148,7 +148,7 @@ def test_a_broker_that_dies_after_a_swap_is_followed_by_one_that_knows_it(tmp_pa
         for entry in [f"{process.pid} ", *marked(mark)]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(entry.split()[0]), signal.SIGKILL)
-        process.communicate(timeout=10)
+        process.communicate(timeout=120)
     second.unlink()
     resumed = caviar("run", "--resume", directory, timeout=180)
     assert resumed.status == 0, resumed.output
@@ -181,7 +181,7 @@ def test_at_a_given_pace_no_frame_is_missed_while_policies_are_swapped(tmp_path:
         assert refused.status == 1
         assert "no observation is called 'xxx" in refused.output
         assert len(refused.output) < 1000
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     assert len({*decided(directory)}) == 3
     summary = json.loads((directory / "summary.json").read_text())
@@ -214,7 +214,7 @@ def test_swaps_while_a_run_is_paused_and_its_agent_dies_begin_with_its_next_fram
         seen = recorded_below(out)
         eventually(lambda: recorded_below(out) > seen + 5, WITHIN_S, "the run goes on")
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate(timeout=120)
     before = decided(directory)
     assert len(before) > seen, output
     # The one in between was overtaken before it could decide a frame.
@@ -235,5 +235,5 @@ def noted_url(directory: Path) -> str:
 def post(url: str, content: bytes = b"") -> tuple[int, dict[str, Any]]:
     """Give an order over HTTP."""
     request = urllib.request.Request(url, content, method="POST")  # noqa: S310
-    with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310
+    with urllib.request.urlopen(request, timeout=120) as answer:  # noqa: S310
         return answer.status, json.loads(answer.read())

@@ -75,7 +75,7 @@ def interpreter(version: str) -> Path | None:
 def _answers(python: Path, version: str) -> bool:
     """Whether it runs and is that version: a shim of pyenv may name one that is not selected."""
     show = "import sys, venv; print(*sys.version_info[:2], sep='.')"
-    done = subprocess.run([python, "-c", show], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([python, "-c", show], capture_output=True, text=True, timeout=120)
     return done.returncode == 0 and done.stdout.strip() == version
 
 

@@ -63,7 +63,7 @@ def test_a_mistake_is_told_as_the_readme_shows(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace("normalization", "normalisation"))
     refused = subprocess.run(
         [sys.executable, "-m", "caviar_clients", "run", "crossing.toml"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=60,
+        cwd=tmp_path, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert refused.returncode == 1
     assert shown[1] in refused.stderr

@@ -12,12 +12,12 @@ from rich.console import Console
 from scenarios_support import SCENARIOS, caviar, run, scenario_file
 
 from caviar_clients.cli import shared
-from caviar_clients.session.scenes import scenes_of
 from caviar_labs.cli import measure
 from caviar_labs.cli.measure import trade
 from caviar_labs.tradeoff import ladder
 from caviar_labs.tradeoff.ladder import Setting
 from caviar_labs.tradeoff.report import Options
+from caviar_labs.tradeoff.scenes import scenes_of
 from caviar_protocol.errors import RunError, SetupError
 
 KEYS = ("time_ms_median", "factor", "nmse_db", "beam_top1", "beam_top5", "capacity_error_bps_hz")
@@ -172,7 +172,7 @@ def test_a_comparison_that_fails_leaves_no_empty_files(
     def fails(*_: object) -> None:
         raise RunError("the worlds fail")
 
-    monkeypatch.setattr("caviar_clients.session.scenes.scenes_of", fails)
+    monkeypatch.setattr("caviar_labs.tradeoff.scenes.scenes_of", fails)
     monkeypatch.setattr(measure, "has_extra", lambda _: True)
     json_file, kept = tmp_path / "t.json", tmp_path / "trade" / "kept"
     kept.parent.mkdir()

@@ -16,8 +16,7 @@ from caviar_bridges.airsim.sensor_calls import SensorCalls
 from caviar_bridges.manoeuvres import Flown
 from caviar_protocol.space.coordinates import Vector, quaternion_from_euler
 from caviar_protocol.topics import CameraDevice, LidarDevice, Scene, VelocityCommand, WaypointCommand
-from caviar_services.world.flight_commands import motion_of
-from caviar_services.world.flight_dynamics import Flyer, Limits, Motion
+from caviar_services.world.flight_dynamics import Flyer, Limits, Motion, motion_of
 
 PERIOD_NS = 100_000_000
 START: Vector = (35.0, 75.0, 1.5)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from link_builders import antenna, channel_of, frame_of, given, random_h, scene_of
 
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import DeviceSpec, load_scenario, parse_scenario
-from caviar_protocol.space.dft import dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Scene
 from caviar_services.agent.fingerprint import (
     UNKNOWN,
@@ -23,8 +23,8 @@ from caviar_services.agent.fingerprint import (
     Fingerprints,
     FingerprintSettings,
 )
-from caviar_services.agent.out_of_band import OutOfBandAgent, OutOfBandSettings
 from caviar_services.agent.pilots import PILOTS
+from caviar_services.agent.sweeps import OutOfBandAgent, OutOfBandSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Preparation, RunInfo, StepResult
 
@@ -193,7 +193,7 @@ def test_a_recording_of_something_else_is_refused(tmp_path: Path, recorded: Path
     file, use = tmp_path / "s.toml", 'use = "fingerprint"\nsettings.file = "/nowhere/run"'
     file.write_text((SCENARIOS / "smoke.toml").read_text().replace('use = "los-beam"', use, 1))
     with pytest.raises(CaviarError, match=r"settings\.file: there is no"):
-        checked_scenario(file)
+        prepare(file)
     with pytest.raises(CaviarError, match=r"settings\.file: .*none"):
         served(tmp_path / "run", tmp_path / "none")
 

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from caviar_bridges.airsim.agent import AirSimAgent, AirSimSettings
 from caviar_bridges.airsim.attachment import attach
 from caviar_bridges.airsim.rpc import RpcClient
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import load_scenario
 from caviar_protocol.topics import Action, VelocityCommand, WaypointCommand
@@ -199,7 +199,7 @@ def test_settings_that_cannot_be_are_refused_with_their_key(
     file = tmp_path / "scenario.toml"
     file.write_text(source.replace(old, new, 1))
     with pytest.raises(ScenarioError) as error:
-        checked_scenario(file)
+        prepare(file)
     assert f"services.pilot.{key}" in str(error.value)
     assert words in str(error.value)
 

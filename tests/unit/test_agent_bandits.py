@@ -7,7 +7,7 @@ import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
 
 from caviar_protocol.messages import Status
-from caviar_protocol.space.dft import dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.topics import Action, BeamChoice, Link
 from caviar_services.agent.bandits import Bandit, BanditAgent, BanditSettings, ThompsonAgent, UcbAgent
 from caviar_services.link.beams import BeamLink, BeamLinkSettings

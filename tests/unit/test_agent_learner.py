@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
 
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, ScenarioError
 from caviar_protocol.messages import Status
 from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.space.beams import straight_beams
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Link, Scene
-from caviar_services.agent.learner import LearnerAgent, LearnerSettings
-from caviar_services.agent.perceptron import Perceptron
+from caviar_services.agent.learner import LearnerAgent, LearnerSettings, Perceptron
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Preparation, RunInfo
 
@@ -193,7 +192,7 @@ def test_what_the_scenario_does_not_have_is_refused_when_it_is_read(
     path.write_text(text.replace('use = "los-beam"', f'use = "learner"\nsettings.{settings}'))
     line = path.read_text().splitlines().index(f"settings.{settings}") + 1
     with pytest.raises(ScenarioError) as refused:
-        checked_scenario(path)
+        prepare(path)
     assert f"my.toml:{line}: services.agent.settings.{words}" in str(refused.value)
 
 

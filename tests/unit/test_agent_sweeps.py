@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, random_h, scene_of
 
 from caviar_protocol.arrays import Complex128Array
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.space.beams import beam_gains
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Panel, Scene
 from caviar_services.agent.pilots import PILOT_TIME, PILOTS, PilotAgent, PilotSettings, share_left
 from caviar_services.agent.sweeps import (

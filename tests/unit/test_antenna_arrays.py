@@ -11,8 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.space.antenna_arrays import element_positions, steering_vector
-from caviar_protocol.space.dft import beam_towards, dft_codebook, pointing_directions
+from caviar_protocol.space.antenna_arrays import (
+    beam_towards,
+    dft_codebook,
+    element_positions,
+    pointing_directions,
+    steering_vector,
+)
 from caviar_protocol.topics import AntennaArray
 
 SIZES = [(1, 1), (1, 8), (8, 1), (1, 5), (4, 3), (2, 7), (1, 64)]

@@ -12,8 +12,8 @@ import pytest
 from broker_harness import MS, Client, Serving, plan, serving
 
 from caviar_protocol import messages as m
+from caviar_protocol.assets import mesh_name
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.geometry import mesh_name
 from caviar_space.meshes import Mesh, ply, unit_box
 
 pytestmark = pytest.mark.slow

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from caviar_broker import router as port_module
-from caviar_broker.router import Router, free_endpoints
+from caviar_broker import connections as port_module
+from caviar_broker.connections import Router, free_endpoints
 
 LIVENESS_NS = 1_500_000_000
 

@@ -17,7 +17,7 @@ FLOODS = r"""
 import socket, struct, sys, time
 import zmq
 from caviar_broker.event_loop import EventLoop
-from caviar_broker.router import Router
+from caviar_broker.connections import Router
 GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL" + bytes(16) + b"\0" + bytes(31)
 READY = b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER"
 port, loop = Router("tcp://127.0.0.1:0", 60_000_000), EventLoop()  # a heartbeat every 20 ms

@@ -15,7 +15,7 @@ from broker_harness import MS, Client, eventually, plan, serving
 from security_harness import ring
 
 from caviar_broker import launch as broker_main
-from caviar_broker.router import Router
+from caviar_broker.connections import Router
 from caviar_broker.security.access import BAR_NS, Access
 from caviar_broker.security.limits import PeerLimits
 from caviar_broker.security.tcp import TcpConnection, TcpConnections, _identity

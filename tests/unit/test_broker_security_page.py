@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from caviar_broker.router import HANDSHAKE_MS
+from caviar_broker.connections import HANDSHAKE_MS
 from caviar_broker.security.access import BAR_NS
 from caviar_broker.security.limits import PeerLimits
 from caviar_protocol.scenario import Limits

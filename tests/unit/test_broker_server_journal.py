@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from broker_harness import PAIR, Client, eventually, finishes_well, plan, play_to_the_end, playing, serving
 
-from caviar_broker import journal_writer, server
+from caviar_broker import journal, server
 from caviar_broker.core.events import Journal, StopRequested
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import JournalReader
@@ -144,7 +144,7 @@ def test_a_disk_that_does_not_answer_is_told_of_and_holds_up_only_what_relies_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thaws: bool
 ) -> None:
     monkeypatch.setattr(server, "DISK_NOTE_S", 0.5)
-    monkeypatch.setattr(journal_writer, "END_S", 0.1)
+    monkeypatch.setattr(journal, "END_S", 0.1)
     made: list[Frozen] = []
 
     def frozen(path: Path) -> Frozen:
@@ -192,7 +192,7 @@ def test_a_write_that_waits_for_a_sync_that_fails_ends_with_its_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No other sync comes after it; the entry is in the file, and does not count as handed over."""
-    monkeypatch.setattr(journal_writer, "SYNC_PERIOD_S", 0.02)
+    monkeypatch.setattr(journal, "SYNC_PERIOD_S", 0.02)
     asked, fails = threading.Event(), threading.Event()
 
     def sync_recording() -> None:
@@ -201,7 +201,7 @@ def test_a_write_that_waits_for_a_sync_that_fails_ends_with_its_error(
         raise RunError("cannot write the recording: input/output error")
 
     file = JournalFile(tmp_path / "journal.msgpack", 1)
-    writer = journal_writer.JournalWriter(file, "periodic", sync_recording)
+    writer = journal.JournalWriter(file, "periodic", sync_recording)
     writer.write([Journal(1, 0, 0, "world", "done")], (0, 0))
     assert asked.wait(30)
     eventually(writer._is_overdue, "the sync takes longer than a period")

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from adaptive_rungs import LADDER, MS, Time, TimedRung, adaptive, channel_of, frame, labels, rung
 
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario.conversion import convert_settings
@@ -72,7 +72,7 @@ class TestLadder:
         path = tmp_path / "adaptive.toml"
         path.write_text(text.replace(right, wrong).replace("file:", f"file:{SCENARIO.parent}/"))
         with pytest.raises(ScenarioError) as error:
-            checked_scenario(path)
+            prepare(path)
         assert f": services.channel.settings.{told}" in str(error.value)
         assert error.value.file == str(path)
         assert error.value.line is not None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.enumeration import scenery_chains
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles, narrowest_sides
 from caviar_services.channel.enumeration.scenery_chains import ChainTree
+from caviar_space.rectangles import FaceRectangles, narrowest_sides
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])
 

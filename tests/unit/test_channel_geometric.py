@@ -14,11 +14,11 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import quaternion_from_euler
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Panel, Scene
-from caviar_services.channel.propagation.clearance import Boxes
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.registry import load
 from caviar_services.service import Preparation, RunInfo, StepResult
+from caviar_space.obstacles import Boxes
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import pytest
 
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.propagation.geometry import path_geometry
+from caviar_services.channel.paths import path_geometry
 from caviar_services.channel.propagation.image_method import distinct, image_points, refined_points
 
 R, S, T = Interaction.REFLECTION, Interaction.SCATTERING, Interaction.TRANSMISSION

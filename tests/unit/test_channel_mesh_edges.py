@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_services.channel.sionna.mesh_edges import MeshEdges, mesh_edges
+from caviar_services.channel.sionna.diffracting_edges import MeshEdges, mesh_edges
 from caviar_space.meshes import Mesh, box, unit_box
 from caviar_space.planes import plane_numbers
 

@@ -17,12 +17,12 @@ from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Scene
 from caviar_services.channel.assemble import outage_counts
 from caviar_services.channel.base import Found
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.clearance import RISING_RAYS, Surfaces
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_space.meshes import box
+from caviar_space.obstacles import RISING_RAYS, Surfaces
 
 HOUSE = box((-5.0, 5.0), (10.0, 20.0), (0.0, 8.0))
 CARRIERS = (Carrier(name="a", frequency_hz=3e9), Carrier(name="b", frequency_hz=28e9))

@@ -7,7 +7,7 @@ import pytest
 
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import AntennaArray
-from caviar_services.channel.radio_map.mapping import (
+from caviar_services.channel.radio_map import (
     Coverage,
     beams_of,
     cell_counts,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.sionna.scene_loading import Shape
-from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
+from caviar_services.channel.sionna.triangle_numbering import closed_walls, coinciding_materials
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.planes import PlaneTable, plane_numbers_of, shared_planes
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from caviar_services.channel.sionna import scene
-from caviar_services.channel.sionna.materials import MaterialPolicy, MaterialSettings
 from caviar_services.channel.sionna.scene import SceneSettings, scene_of, shared_scenes
+from caviar_space.materials import MaterialPolicy, MaterialSettings
 
 ASSETS = {"scenery/scene.xml": Path("/a/scene.xml")}
 

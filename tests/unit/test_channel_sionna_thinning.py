@@ -11,7 +11,7 @@ pytest.importorskip("mitsuba")
 
 from caviar_protocol.topics import AntennaArray
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.sionna.diffuse_paths import Element, Thinning
+from caviar_services.channel.sionna.ray_launcher import Element, Thinning
 
 
 def element(pattern: str, rotation: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Element:

@@ -12,9 +12,9 @@ from rich.console import Console
 from caviar_clients.cli import datasets, shared
 from caviar_clients.cli.datasets import _Screen
 from caviar_clients.cli.main import app
-from caviar_clients.datasets.dask_settings import set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult
 from caviar_clients.datasets.estimate import Estimate
+from caviar_clients.datasets.local_cluster import set_up_dask
 from caviar_protocol.errors import SetupError
 
 

@@ -19,15 +19,21 @@ from rich.console import Console
 
 from caviar_clients.cli import main as command
 from caviar_clients.cli import radio_map as radio_map_command
-from caviar_clients.cli.radio_map import ARRAYS, draw_radio_map, options_of
-from caviar_clients.cli.radio_map_inputs import Wanted, channel_of, noise_of, surface_of
+from caviar_clients.cli.radio_map import (
+    ARRAYS,
+    MapOptions,
+    channel_of,
+    draw_radio_map,
+    noise_of,
+    surface_of,
+)
 from caviar_clients.plots.map import RadioMapView, colour_limits, draw_servers, draw_values
 from caviar_clients.session.plausibility import in_hertz
 from caviar_clients.session.scenes import scene_at
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.topics import Carrier
-from caviar_services.channel.radio_map.mapping import transmitters_of
+from caviar_services.channel.radio_map import transmitters_of
 from caviar_space.meshes import Mesh, box, ply
 
 pytestmark = pytest.mark.slow
@@ -123,9 +129,7 @@ def test_a_channel_that_traces_no_rays_is_refused_and_leaves_nothing_behind(tmp_
     assert 'use = "free-space"' in text
     (tmp_path / "mine.toml").write_text(text.replace('use = "free-space"', 'use = "geometric"'))
     with pytest.raises(RunError, match="channel 'channel' is 'geometric', which traces no rays"):
-        draw_radio_map(
-            tmp_path / "mine.toml", tmp_path / "map.png", options_of(None, Wanted(), "best"), Console()
-        )
+        draw_radio_map(tmp_path / "mine.toml", tmp_path / "map.png", MapOptions(), Console())
     assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
 
 
@@ -162,8 +166,9 @@ def test_noise_is_that_of_the_link() -> None:
 @pytest.mark.channel
 def test_a_scenario_gives_pictures_and_arrays_that_agree(tmp_path: Path) -> None:
     """`smoke` in free space: the arrays have the axes, the units and the numbers that they promise."""
-    cells = Wanted(cell=20.0, area=(-50.0, -40.0, 50.0, 40.0))
-    options = options_of(["gain", "best-server"], cells, "wide", samples=20_000, frame=2)
+    area = (-50.0, -40.0, 50.0, 40.0)
+    metrics = ("gain", "best-server")
+    options = MapOptions(metrics=metrics, cell=20.0, area=area, beam="wide", samples=20_000, frame=2)
     files = draw_radio_map(Path("smoke"), tmp_path / "out" / "smoke.png", options, Console(quiet=True))
     assert [file.name for file in files] == ["smoke-gain.png", "smoke-best-server.png", "smoke.npz"]
     arrays = np.load(files[-1], allow_pickle=False)
@@ -201,8 +206,7 @@ def with_pattern(folder: Path, *changes: tuple[str, str]) -> Path:
 @pytest.mark.channel
 def test_elements_of_a_pattern_file_radiate(tmp_path: Path) -> None:
     """3 dB less than an isotropic element towards everywhere."""
-    cells = Wanted(cell=20.0, area=(-50.0, -40.0, 50.0, 40.0))
-    options = options_of(None, cells, "wide", samples=20_000)
+    options = MapOptions(cell=20.0, area=(-50.0, -40.0, 50.0, 40.0), beam="wide", samples=20_000)
     files = draw_radio_map(with_pattern(tmp_path), tmp_path / "m.png", options, Console(quiet=True))
     arrays = np.load(files[-1], allow_pickle=False)
     about = json.loads(str(arrays["metadata"]))
@@ -232,7 +236,7 @@ def _surface(tmp_path: Path, **wanted: object) -> tuple[str, ...]:
         '<string name="filename" value="slope.ply"/></shape></scene>'
     )
     channel = SimpleNamespace(scene=_Scenery())
-    _, _, notes = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(**wanted))  # type: ignore[arg-type]
+    _, _, notes = surface_of(channel, scene(0), tmp_path / "a.xml", MapOptions(**wanted))  # type: ignore[arg-type]
     return notes
 
 
@@ -259,7 +263,7 @@ def test_a_plane_is_above_the_top_of_a_slab_and_the_lowest_sheet(tmp_path: Path)
         )
         (tmp_path / "a.xml").write_text(f'<scene version="2.1.0">{"".join(shapes)}</scene>')
         channel: Any = SimpleNamespace(scene=_Scenery())
-        surface, _, _ = surface_of(channel, scene(0), tmp_path / "a.xml", Wanted(height=1.5))
+        surface, _, _ = surface_of(channel, scene(0), tmp_path / "a.xml", MapOptions(height=1.5))
         assert np.unique(surface.z).tolist() == [lowest + 1.5]
 
 
@@ -287,7 +291,7 @@ def test_cells_that_cannot_be_are_refused_with_those_that_can(tmp_path: Path, wa
 )
 def test_a_map_goes_into_a_png(tmp_path: Path, name: str, words: str) -> None:
     with pytest.raises(RunError, match=words):
-        draw_radio_map(Path("smoke"), tmp_path / name, options_of(None, Wanted(), "wide"), Console())
+        draw_radio_map(Path("smoke"), tmp_path / name, MapOptions(beam="wide"), Console())
 
 
 def test_a_power_in_another_unit_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,5 +300,5 @@ def test_a_power_in_another_unit_is_warned_of(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(radio_map_command, "_mapped", lambda *_: (_ for _ in ()).throw(RunError("enough")))
     source = with_pattern(tmp_path, ("power_dbm = 30.0", "power_dbm = 150.0"))
     with pytest.raises(RunError, match="enough"):
-        draw_radio_map(source, tmp_path / "m.png", options_of(None, Wanted(), "wide"), Console(file=screen))
+        draw_radio_map(source, tmp_path / "m.png", MapOptions(beam="wide"), Console(file=screen))
     assert "power_dbm: is 150 dBm, beyond any transmitter's" in screen.getvalue()

@@ -13,7 +13,7 @@ from caviar_broker import launch as broker_main
 from caviar_broker.core.plan import SECOND, plan_run
 from caviar_clients.cli import remote
 from caviar_clients.cli.main import app
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.keys import credentials, read_authorized, read_public
 from caviar_protocol.messages import Role
@@ -50,7 +50,7 @@ def scenario(folder: Path, *changes: tuple[str, str]) -> Path:
 
 def test_a_remote_service_is_not_looked_up_and_its_settings_are_left_as_they_are(tmp_path: Path) -> None:
     settings = ("[timeouts]", '[services.agent.settings]\npolicy = "mine"\nlayers = [64, 64]\n\n[timeouts]')
-    checked = checked_scenario(scenario(tmp_path, settings))
+    checked = prepare(scenario(tmp_path, settings)).scenario
     assert checked.services["agent"].settings == {"policy": "mine", "layers": [64, 64]}
     plan = plan_run(checked, "run", {})
     agent = next(service for service in plan.services if service.name == "agent")
@@ -78,9 +78,9 @@ def test_only_remote_services_are_waited_for_unless_the_scenario_says_how_long(
 def test_a_topic_that_a_remote_service_may_produce_may_be_recorded(tmp_path: Path) -> None:
     sensors = ("[services.recorder]", '[services.eyes]\nrole = "sensors"\nuse = "remote"\nbudget_ms = 9\n\n')
     record = ('record = ["scene",', 'record = ["lidar", "camera", "scene",')
-    checked_scenario(scenario(tmp_path, record, (sensors[0], sensors[1] + sensors[0])))
+    prepare(scenario(tmp_path, record, (sensors[0], sensors[1] + sensors[0])))
     with pytest.raises(ScenarioError, match="no service of the run produces 'lidar'"):
-        checked_scenario(scenario(tmp_path, record))
+        prepare(scenario(tmp_path, record))
 
 
 def test_remote_services_may_produce_all_that_those_of_their_role_do() -> None:

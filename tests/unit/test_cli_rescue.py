@@ -16,8 +16,8 @@ from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import MAGIC
 from caviar_broker.run_record import RunRecord
 from caviar_clients.cli.recordings import inspect_command, rescue_run
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording import Manifest, Recording, SegmentRecord
 from caviar_protocol.recording.segment import Segment
@@ -114,7 +114,7 @@ def test_a_folder_that_is_no_runs_is_refused_with_the_run_in_it(tmp_path):
 def test_a_run_in_one_process_lacks_nothing(tmp_path, lost):
     """It has a journal, and no record; a run of a broker whose record is lost has another epoch."""
     (tmp_path / "run").mkdir()
-    EmbeddedRun(checked_scenario("smoke", frames=2), tmp_path / "run").run()
+    EmbeddedRun(prepare("smoke", frames=2), tmp_path / "run").run()
     if lost:
         file = tmp_path / "run" / "journal.msgpack"
         file.unlink()

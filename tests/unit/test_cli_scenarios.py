@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from caviar_clients.cli import scenarios, shared
 from caviar_clients.cli.main import app
-from caviar_clients.session.checks import check_implementations, checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol import host
 from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios
@@ -133,7 +133,7 @@ def test_a_new_scenario_runs_as_it_is_and_has_the_name_that_was_given(
     done = runner.invoke(app, ["new", "first"])
     assert done.exit_code == 0
     assert "caviar run first.toml" in done.output
-    scenario = checked_scenario(Path("first.toml"), frames=3)
+    scenario = prepare(Path("first.toml"), frames=3).scenario
     assert (scenario.run.name, scenarios.extras_of(scenario)) == ("first", ())
     outcome = EmbeddedRun(scenario, None).run()
     assert not outcome.error
@@ -161,7 +161,7 @@ def test_every_alternative_that_a_new_scenario_comments_out_is_accepted(tmp_path
     assert len(commented.findall(text)) >= 15
     (tmp_path / "my-city.xml").write_text("<scene/>")
     scenario = parse_scenario(commented.sub(r"\1", text), folder=tmp_path)
-    check_implementations(scenario)
+    prepare(scenario)
     assert scenario.run.pace == "realtime"
     assert "lidar" in scenario.services
 

@@ -14,7 +14,7 @@ import pytest
 from recording_builders import channel, frame, frame_of, lidar, link, product, record, scene
 
 from caviar_clients.cli import main as command
-from caviar_clients.cli.video import film_run
+from caviar_clients.cli.plot import film_run
 from caviar_clients.plots import film
 from caviar_clients.plots.rays import rays
 from caviar_protocol.errors import RecordingError, RunError, SetupError

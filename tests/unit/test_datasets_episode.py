@@ -10,15 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from caviar_clients.datasets.catalogue import fingerprint
-from caviar_clients.datasets.differences import differences
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
 from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.datasets.settings import differences, fingerprint
 from caviar_clients.session.base import failure_of
-from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
@@ -85,7 +84,7 @@ def test_an_episode_is_that_of_a_run_of_many(tmp_path: Path) -> None:
     text = SMOKE.read_text().replace("frames = 100\n", "frames = 3\nepisodes = 4\n", 1)
     folder = tmp_path / "run"
     folder.mkdir()
-    assert EmbeddedRun(check_implementations(parse_scenario(text)), folder).run().error == ""
+    assert EmbeddedRun(prepare(parse_scenario(text)), folder).run().error == ""
     whole = Recording(folder)
     for number in range(4):
         episode = Recording(DatasetDirectory(tmp_path / "d").episode(number))

@@ -15,13 +15,14 @@ import pytest
 
 import caviar
 from caviar_clients.datasets import catalogue as catalogue_module
-from caviar_clients.datasets.catalogue import TABLES, Catalogue, fingerprint
+from caviar_clients.datasets.catalogue import TABLES, Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate
 from caviar_clients.datasets.generate import generate
 from caviar_clients.datasets.ledger import Ledger, MissingEpisodes
 from caviar_clients.datasets.plan import DatasetPlan, plan_dataset
+from caviar_clients.datasets.settings import fingerprint
 from caviar_clients.datasets.verification.verify import verify
 from caviar_protocol.errors import CaviarError, RecordingError, RunError
 from caviar_protocol.scenario import load_scenario

@@ -19,14 +19,11 @@ from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.look import data as look_data
-from caviar_clients.datasets.look import maps, pictures
-from caviar_clients.datasets.look.data import Scan, UserColumns, read_users
-from caviar_clients.datasets.look.distributions import draw_beams
-from caviar_clients.datasets.look.generation import read_throughput
-from caviar_clients.datasets.look.maps import cell_m, draw_gain, map_of
+from caviar_clients.datasets.look import figures, maps
+from caviar_clients.datasets.look.data import Scan, UserColumns, read_throughput, read_users
+from caviar_clients.datasets.look.figures import draw_beams, picture
+from caviar_clients.datasets.look.maps import cell_m, draw_gain, draw_scans, map_of, scans_height
 from caviar_clients.datasets.look.page import write_page
-from caviar_clients.datasets.look.pictures import picture
-from caviar_clients.datasets.look.scans import draw_scans, scans_height
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_protocol.errors import RecordingError, SetupError
@@ -97,7 +94,7 @@ def page(folder: Path) -> Page:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are one pixel each: the texts of a page are looked at."""
     header = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (1).to_bytes(4) * 2
-    monkeypatch.setattr(pictures, "_png", lambda *_: header)
+    monkeypatch.setattr(figures, "_png", lambda *_: header)
 
 
 def test_a_page_has_every_section_that_its_recordings_allow(page: Page) -> None:
@@ -172,7 +169,7 @@ def test_scans_are_drawn_as_points_or_as_a_grid() -> None:
     street = Scan("bus/top", points[:0], (np.zeros((2, 20)), (0.0, 20.0, 0.0, 2.0)), (2.0, 2.0), none)
     assert scans_height([street] * 3) > scans_height([street])
     for scans in ([scan], [scan, grid], [street, street]):
-        shown = picture(draw_scans(scans), "LIDAR", scans_height(scans), map_like=True)
+        shown = picture(draw_scans(scans), scans_height(scans), map_like=True)
         assert shown.light.startswith("data:image/png;base64,")
         assert shown.light != shown.dark
         assert 300 < shown.width < 1000
@@ -198,7 +195,7 @@ def test_many_places_are_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     place = map_of(users, None, set())
     assert place.dots is None
     assert cell_m(place) == 1.0
-    assert picture(draw_gain(users, place), "map", 4.0, map_like=True).light.startswith("data:image/png")
+    assert picture(draw_gain(users, place), 4.0, map_like=True).light.startswith("data:image/png")
 
 
 def test_users_are_read_in_parts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -403,7 +400,7 @@ def test_names_are_no_formulas() -> None:
     beams, name = np.zeros(2, dtype=int), r"$\frac{$"
     shown: list[str] = []
     drawn = draw_beams([(name, beams, beams)], (2, 2))
-    picture(lambda figure, theme: (drawn(figure, theme), shown.append(figure.axes[0].get_title())), "", 3.0)
+    picture(lambda figure, theme: (drawn(figure, theme), shown.append(figure.axes[0].get_title())), 3.0)
     assert shown == [r"\$\frac{\$"] * 2
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.plan import with_cameras, with_own_traffic
-from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
-from caviar_clients.session.checks import check_implementations
+from caviar_clients.datasets.plan import PRESETS, apply_preset, find_preset, with_cameras, with_own_traffic
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario, load_scenario
 
@@ -31,7 +30,7 @@ def receivers(scenario: Scenario) -> list[tuple[bool, int]]:
 def test_a_preset_has_the_columns_of_the_table(name: str) -> None:
     ghz, kind, between_ms, between_s, episodes, scenes = TABLE[name]
     preset = PRESETS[name]
-    scenario = check_implementations(apply_preset(preset, load_scenario(preset.scenario)))
+    scenario = prepare(apply_preset(preset, load_scenario(preset.scenario))).scenario
     assert [carrier.frequency_hz / 1e9 for carrier in scenario.carriers] == pytest.approx(ghz)
     assert receivers(scenario) == ([(True, 10)] if kind == "mobile" else [(False, 1)] * 10)
     assert (scenario.run.episodes, scenario.run.frames) == (episodes, scenes)
@@ -98,7 +97,7 @@ def test_episodes_have_a_traffic_of_their_own_where_that_is_asked_for() -> None:
 
 def test_three_cameras_stand_beside_the_transmitter() -> None:
     base = load_scenario("canyon-mobile")
-    scenario = check_implementations(with_cameras(base))
+    scenario = prepare(with_cameras(base)).scenario
     cameras = [device for device in scenario.devices if device.kind == "camera"]
     assert [(camera.name, camera.yaw_deg, camera.size_px) for camera in cameras] == [
         ("left", 150.0, (960, 540)),

@@ -19,7 +19,7 @@ import caviar
 from caviar_clients.datasets.catalogue import MEASURED_TABLES, TABLES, Catalogue, columns_of
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
-from caviar_clients.datasets.export import export_tables
+from caviar_clients.datasets.formats import export_tables
 from caviar_clients.datasets.generate import _warn_of_equal_episodes
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset, check_level

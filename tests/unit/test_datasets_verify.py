@@ -22,9 +22,8 @@ from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import try_worker
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.rows import rows_of
-from caviar_clients.datasets.verification.findings import Finding, gaps
-from caviar_clients.datasets.verification.recording_checks import lacking_scenery
-from caviar_clients.datasets.verification.verify import verify
+from caviar_clients.datasets.verification import Finding, gaps
+from caviar_clients.datasets.verification.verify import lacking_scenery, verify
 from caviar_protocol.arrays import Payload
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from caviar_clients.cli.launch import Launcher
+from caviar_clients.session.prepared import implemented
 from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import load_scenario
 from caviar_services.drjit_setup import THREADS_VARIABLE, limited_threads, share_of_each
@@ -32,7 +33,7 @@ def test_the_launcher_counts_the_services_that_trace_rays(
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(6)))
     path = SCENARIOS / f"{scenario}.toml"
-    with Launcher(load_scenario(path), path, tmp_path) as launcher:
+    with Launcher(implemented(load_scenario(path)), path, tmp_path) as launcher:
         assert launcher._threads == {THREADS_VARIABLE: threads}
 
 

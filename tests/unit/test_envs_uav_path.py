@@ -18,7 +18,7 @@ import caviar_clients.envs
 from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
-from caviar_protocol.space.dft import beam_towards
+from caviar_protocol.space.antenna_arrays import beam_towards
 from caviar_protocol.topics import Action, BeamChoice
 from caviar_space.meshes import Mesh, box, ply
 

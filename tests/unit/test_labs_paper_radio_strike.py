@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_envs_radio_strike import short_episode
+from test_labs_radio_strike import short_episode
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_labs.tradeoff import errors
+from caviar_protocol.multipath import power_spread
 
 RNG = np.random.default_rng(7)
 
@@ -27,14 +28,14 @@ def test_no_path_has_no_gain() -> None:
 
 def test_delay_spread_of_two_paths() -> None:
     """Powers 3 and 1 at 100 and 180 ns: mean 120 ns, variance (3·20² + 60²)/4 = 1200 ns²."""
-    spread = errors.delay_spread_s(np.array([100e-9, 180e-9]), np.array([3.0, 1.0]))
+    spread = power_spread(np.array([3.0, 1.0]), np.array([100e-9, 180e-9]))
     assert spread == pytest.approx(math.sqrt(1200) * 1e-9)
 
 
 def test_delay_spread_does_not_depend_on_the_first_delay() -> None:
     """A path of 300 km is 1 ms long; picoseconds survive it."""
     tau, power = np.array([0.0, 5e-12, 9e-12]), np.array([1.0, 0.5, 0.1])
-    near, far = errors.delay_spread_s(tau, power), errors.delay_spread_s(1e-3 + tau, power)
+    near, far = power_spread(power, tau), power_spread(power, 1e-3 + tau)
     assert far == pytest.approx(near, rel=1e-6)
 
 
@@ -64,7 +65,7 @@ def test_angular_spread_does_not_see_where_angles_wrap() -> None:
 def test_one_wave_has_no_spread() -> None:
     power = np.array([1e-13])
     assert errors.angular_spread_rad(np.array([0.1]), power) == pytest.approx(0, abs=1e-7)
-    assert errors.delay_spread_s(np.array([3e-7]), power) < 1e-20
+    assert power_spread(power, np.array([3e-7])) < 1e-20
 
 
 @pytest.mark.parametrize("scale", [0.9, 1.25, 1j, -1.0])

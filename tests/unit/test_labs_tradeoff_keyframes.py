@@ -11,10 +11,11 @@ import pytest
 from link_builders import CARRIER, antenna, scene_of
 from msgspec.structs import replace
 
-from caviar_clients.session.scenes import CONSECUTIVE, Instant, Scenes, scenes_of
+from caviar_clients.session.scenes import Instant, Scenes
 from caviar_labs.tradeoff.errors import FLOOR_DB, Noise
 from caviar_labs.tradeoff.keyframes import Traced, keyframe_rows, spaced
 from caviar_labs.tradeoff.ladder import Setting
+from caviar_labs.tradeoff.scenes import CONSECUTIVE, scenes_of
 from caviar_labs.tradeoff.worker import Rung
 from caviar_protocol.errors import RunError
 from caviar_protocol.topics import Channel

@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from caviar_clients.plots.style import Box, place_labels, spots
 from caviar_labs.cli.measure import _other_reference
 from caviar_labs.tradeoff.campaign import Skipped
 from caviar_labs.tradeoff.errors import Row, error_fields
+from caviar_labs.tradeoff.labels import Box, place_labels, spots
 from caviar_labs.tradeoff.ladder import REFERENCES
 from caviar_labs.tradeoff.plot import draw_convergence, draw_pareto, pareto_front
 from caviar_labs.tradeoff.report import Options, Point, Report, answers, pareto_rows

@@ -17,8 +17,8 @@ from caviar_clients.cli.learning import _evaluation_tables, evaluate_command
 from caviar_clients.cli.main import app
 from caviar_clients.learning.contest import Contest, episodes_of, made_player
 from caviar_clients.learning.evaluate import KINDS, Evaluation, Interval, evaluate
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.recording import Recording
 from caviar_services.agent.policy import CARD_KEY, PolicyCard, write_card
@@ -31,7 +31,7 @@ FRAMES = 60
 @pytest.mark.parametrize("use", ["ucb", "last-sweep", "random", "hierarchical-sweep"])
 def test_an_agent_gets_what_it_gets_in_a_run_of_its_own(use: str, tmp_path: Path) -> None:
     """Beside others: with two users, its own feedback and its own random numbers."""
-    scenario = checked_scenario("smoke", frames=FRAMES)
+    scenario = prepare("smoke", frames=FRAMES).scenario
     names = dict.fromkeys(["los-beam", use, "thompson"])
     with Contest(scenario, {name: made_player(scenario, name) for name in names}) as contest:
         played = contest.play(5)[use]
@@ -47,7 +47,7 @@ def test_an_agent_gets_what_it_gets_in_a_run_of_its_own(use: str, tmp_path: Path
 
 
 def test_pilots_are_paid_for_with_spectral_efficiency() -> None:
-    scenario = checked_scenario("geometric", frames=FRAMES)
+    scenario = prepare("geometric", frames=FRAMES).scenario
     dear = {"pilot_us": 500.0}  # 64 of them take 32 ms of 100 ms
     agents = {
         "oracle": made_player(scenario, "oracle"),
@@ -64,7 +64,7 @@ def test_pilots_are_paid_for_with_spectral_efficiency() -> None:
 
 
 def test_episodes_of_one_seed_follow_each_other_and_repeat() -> None:
-    scenario = checked_scenario("geometric", frames=20)
+    scenario = prepare("geometric", frames=20).scenario
     with Contest(scenario, {"ucb": made_player(scenario, "ucb")}) as contest:
         first = [contest.play(seed)["ucb"].abs_y for seed in episodes_of([3, 4, 3], 2)]
     np.testing.assert_array_equal(first[0], first[4])
@@ -74,14 +74,14 @@ def test_episodes_of_one_seed_follow_each_other_and_repeat() -> None:
 
 
 def test_users_that_are_not_served_do_not_count() -> None:
-    scenario = checked_scenario("smoke", frames=10)
+    scenario = prepare("smoke", frames=10).scenario
     one = ("car/rx",)
     with Contest(scenario, {"a": made_player(scenario, "los-beam", {}, one)}, one) as contest:
         assert len(contest.play(1)["a"].abs_y) == 10
 
 
 def test_settings_that_do_not_fit_are_refused_by_name() -> None:
-    scenario = checked_scenario("geometric", frames=10)
+    scenario = prepare("geometric", frames=10).scenario
     with pytest.raises(ScenarioError, match=r"ucb\.discount"):
         made_player(scenario, "ucb", {"discount": 2.0})
     with pytest.raises(ScenarioError, match=r"fingerprint: lacks 'file'"):

@@ -12,9 +12,8 @@ import pytest
 
 from caviar_clients.learning import training
 from caviar_clients.learning.campaign import _differences, check_folder, reached, train_experiment
-from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_clients.learning.checkpoints import locked, newest_checkpoint
 from caviar_clients.learning.experiment import Experiment, parse_experiment
-from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import LinearRate, Progress, read_result, train_seed
 from caviar_protocol.errors import RunError, ScenarioError
 from caviar_protocol.scenario import find_scenario

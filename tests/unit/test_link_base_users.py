@@ -16,7 +16,7 @@ from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel
 from caviar_services.channel.statistical.free_space import FreeSpaceChannel, FreeSpaceSettings
 from caviar_services.link.base import channels_of, users_of
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 BS = antenna("bs", "tx", (1, 4))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.space.dft import dft_beam, dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_beam, dft_codebook
 from caviar_protocol.topics import AntennaArray, Carrier, Channel, Scene
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link.base import Users, users_of
-from caviar_services.link.beam_sweep import beam_responses
+from caviar_services.link.beam_scores import beam_responses
 from caviar_services.service import Preparation, RunInfo
 from caviar_services.testing import samples
 

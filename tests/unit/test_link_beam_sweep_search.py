@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_builders import random_h
 
-from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.antenna_arrays import dft_codebook, pointing_directions, steering_vector
 from caviar_protocol.space.beams import BeamPairs, beam_gains, best_pairs
-from caviar_protocol.space.dft import dft_codebook, pointing_directions
 from caviar_protocol.topics import AntennaArray
 
 

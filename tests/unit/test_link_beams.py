@@ -16,7 +16,7 @@ from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.errors import PayloadError
-from caviar_protocol.space.dft import beam_towards, dft_codebook
+from caviar_protocol.space.antenna_arrays import beam_towards, dft_codebook
 from caviar_protocol.space.scene import directions, pairs_of
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link
 from caviar_services.link.beams import BeamLink, BeamLinkSettings

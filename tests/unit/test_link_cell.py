@@ -11,7 +11,7 @@ import pytest
 from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given, random_h, scene_of
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import decode_payload, encode_payload
@@ -20,8 +20,8 @@ from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.topics import AntennaDevice, Carrier, Link, UserSchedule
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)
@@ -331,7 +331,7 @@ def test_a_key_without_effect_is_refused_at_its_line(given: str, words: str, tmp
     path.write_text(f"{head}{table}{given}\n{rest}")
     line = path.read_text().splitlines().index(given.splitlines()[-1]) + 1
     with pytest.raises(ScenarioError) as refused:
-        checked_scenario(path)
+        prepare(path)
     assert f"my.toml:{line}: services.link.settings." in str(refused.value)
     assert words in str(refused.value)
 

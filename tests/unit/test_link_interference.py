@@ -11,12 +11,12 @@ from link_builders import CARRIER, antenna, channel_of, choices, frame_of, given
 from caviar_protocol.arrays import Complex128Array
 from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.codec import encode_payload
-from caviar_protocol.space.dft import dft_codebook
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.topics import AntennaDevice, Carrier, Link
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, FrameInput, RunInfo
 
 SUB6 = Carrier(name="sub6", frequency_hz=3.5e9, bandwidth_hz=20e6)

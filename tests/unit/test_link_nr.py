@@ -20,9 +20,9 @@ from caviar_protocol.errors import SetupError
 from caviar_protocol.topics import Carrier, Link
 from caviar_services.link import cell as module
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
 from caviar_services.link.nr import Blocks, Numerology, load_tables, numerology
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, Preparation, RunInfo, no_progress
 
 BS = antenna("bs", "tx", power_dbm=30.0)

@@ -15,18 +15,18 @@ from caviar_protocol.cell.traffic import Traffic
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.multipath import slot_offsets, subcarrier_offsets
 from caviar_protocol.scenario.conversion import Place
+from caviar_protocol.space.antenna_arrays import dft_codebook
 from caviar_protocol.space.coordinates import quaternion_from_euler
-from caviar_protocol.space.dft import dft_codebook
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_services.channel.statistical.geometric import GeometricChannel
 from caviar_services.channel.statistical.waves import GeometricSettings
 from caviar_services.link import cell as module
 from caviar_services.link.base import users_of
 from caviar_services.link.cell import CellLink
-from caviar_services.link.cell_settings import CellSettings
 from caviar_services.link.link_budget import noise_power
 from caviar_services.link.nr import Blocks
-from caviar_services.link.slot_channel import band_points, responses
+from caviar_services.link.slot_rates import band_points, responses
+from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, Preparation, RunInfo
 
 CARRIERS = (

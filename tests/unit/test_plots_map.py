@@ -26,7 +26,7 @@ from caviar_clients.plots.map import (
 from caviar_clients.plots.rays import rays
 from caviar_clients.plots.sensors import draw_scan, range_image
 from caviar_clients.plots.style import Labels, common_prefix
-from caviar_protocol.space.dft import beam_towards, pointing_directions
+from caviar_protocol.space.antenna_arrays import beam_towards, pointing_directions
 from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, LidarDevice, LidarScan
 

@@ -14,11 +14,10 @@ from caviar_broker.launch import _begun
 from caviar_broker.launch import parser as broker_parser
 from caviar_clients.cli.launch import Launcher
 from caviar_clients.cli.main import app
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import prepare
 from caviar_protocol import plugins
 from caviar_protocol.errors import CaviarError, DeclarationError
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.scenario.attachments import attached
+from caviar_protocol.scenario import attached, load_scenario
 from caviar_services.registry import load, registered
 from caviar_services.world.quadrotor.airframe import Airframe, Plant, plant_named
 
@@ -81,9 +80,10 @@ def test_what_is_installed_registers_what_the_project_declares(repository: Path)
 
 @pytest.mark.usefixtures("acme")
 def test_launcher_and_broker_attach_the_same(tmp_path: Path) -> None:
-    scenario = checked_scenario("smoke", attachments=["acme=7"])
+    prepared = prepare("smoke", attachments=["acme=7"])
+    scenario = prepared.scenario
     assert scenario.run.frames == 7
-    launcher = Launcher(scenario, Path("smoke"), tmp_path, attachments=["acme=7"])
+    launcher = Launcher(prepared, Path("smoke"), tmp_path, attachments=["acme=7"])
     record, *_ = _begun(broker_parser().parse_args(launcher._broker_arguments()))
     assert record.scenario == scenario
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caviar_protocol.cell.rates import shannon, sinr, slot_bits
-from caviar_protocol.cell.scheduling import (
+from caviar_protocol.cell.buffers import (
     averaged,
     chosen,
     max_rate,
@@ -14,6 +13,7 @@ from caviar_protocol.cell.scheduling import (
     proportional_fair,
     round_robin,
 )
+from caviar_protocol.cell.link_adaptation import shannon, sinr, slot_bits
 
 
 def test_round_robin_serves_each_in_turn_and_passes_over_who_waits_for_nothing() -> None:

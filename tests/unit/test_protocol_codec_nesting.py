@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from caviar_protocol.codec import decode_message
-from caviar_protocol.codec.decoding import HARMLESS, _deeper_than, check_nesting
+from caviar_protocol.codec.messages import HARMLESS, _deeper_than, check_nesting
 from caviar_protocol.errors import LimitError
 from caviar_protocol.fields import MAX_NESTING
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caviar_protocol.assets import AssetStore
-from caviar_protocol.geometry import (
+from caviar_protocol.assets import (
+    AssetStore,
     MeshCheck,
     digest_in,
     is_mesh_name,

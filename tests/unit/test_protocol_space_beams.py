@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from link_builders import random_h
 
-from caviar_protocol.space.antenna_arrays import steering_vector, subarrays
+from caviar_protocol.space.antenna_arrays import (
+    beam_gain,
+    beam_towards,
+    dft_beam,
+    dft_codebook,
+    pointing_directions,
+    steering_vector,
+    subarrays,
+)
 from caviar_protocol.space.beams import beam_gains, coupled_polarizations, straight_beams
-from caviar_protocol.space.dft import beam_gain, beam_towards, dft_beam, dft_codebook, pointing_directions
 from caviar_protocol.topics import AntennaArray, Panel
 
 CROSS = AntennaArray(rows=2, columns=4, polarization="cross")

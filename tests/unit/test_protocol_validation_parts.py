@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from caviar_protocol.errors import ProductError
 from caviar_protocol.messages import GrantInput, Status
-from caviar_protocol.part_validation import PartCheck
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import (
     AntennaArray,
@@ -25,7 +24,7 @@ from caviar_protocol.topics import (
     Intrinsics,
     Panel,
 )
-from caviar_protocol.validation import ContentCheck, ContentRules
+from caviar_protocol.validation import ContentCheck, ContentRules, PartCheck
 
 WIDE = Carrier(name="wide", frequency_hz=28e9, subcarriers=5, subcarrier_spacing_hz=1e5, taps=3, slots=2)
 CARRIERS = (Carrier(name="narrow", frequency_hz=3e9), WIDE)

@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from caviar_clients.datasets.differences import differences
 from caviar_clients.datasets.episode import MEASURED, EpisodeTask, play_episode
 from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.datasets.settings import differences
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario, parse_scenario
 from caviar_services.recorder import provenance

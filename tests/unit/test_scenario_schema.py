@@ -89,9 +89,9 @@ def test_it_refuses_what_the_reader_refuses(text: Callable[[], str], named: str)
 
 def checked(text: str) -> None:
     """Read a scenario as `caviar run` does, the settings of its services included."""
-    from caviar_clients.session.checks import check_implementations
+    from caviar_clients.session.prepared import prepare
 
-    check_implementations(parse_scenario(text, folder=find_scenario("smoke").parent))
+    prepare(parse_scenario(text, folder=find_scenario("smoke").parent))
 
 
 def test_instants_stand_in_place_of_frames() -> None:

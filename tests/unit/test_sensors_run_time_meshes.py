@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from caviar_protocol.geometry import mesh_name
+from caviar_protocol.assets import mesh_name
 from caviar_protocol.topics import Depth, Scene
 from caviar_services.sensors.base import Sensors, SensorSettings, TracedScene
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo

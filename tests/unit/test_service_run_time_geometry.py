@@ -10,15 +10,14 @@ from typing import Any, ClassVar
 import pytest
 
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore
+from caviar_protocol.assets import AssetStore, mesh_name
 from caviar_protocol.digest import geometry_digest
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import mesh_name
 from caviar_services.frame import Frame, StepResult
 from caviar_services.run_time_geometry import AnnouncedMeshes
 from caviar_services.service import NoSettings, Service
 from caviar_services.session import ServiceSession
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.world.assets import RunTimeMeshes
 
 CRATE, BARREL = b"a crate", b"a barrel"
 IDS = {"epoch": 1, "attempt": 1}

@@ -113,7 +113,7 @@ def test_scenery_that_never_comes_is_a_fault_in_time(broker: Broker, tmp_path: P
         broker.expect(m.AssetGet)
         started = time.monotonic()
         assert broker.expect(m.Fault).phase == "prepare"
-        assert 2.5 < time.monotonic() - started < 5.0
+        assert 2.5 < time.monotonic() - started < 30.0
 
 
 def test_shutdown_while_scenery_is_fetched_is_obeyed(broker: Broker, tmp_path: Path) -> None:

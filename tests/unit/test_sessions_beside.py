@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import open_session
 from caviar_clients.session.embedded import EmbeddedSession
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.recording import Recording
@@ -31,7 +31,7 @@ def beams(tx_beam: int) -> Action:
 @contextmanager
 def pair(directory: Path | None = None) -> Iterator[EmbeddedSession]:
     """Pilot and beams of the shipped scenario, decided here."""
-    scenario = checked_scenario(Path("uav-pair"), frames=FRAMES)
+    scenario = prepare(Path("uav-pair"), frames=FRAMES).scenario
     # What is measured is what the agents do: without the scenery nothing has to be loaded.
     world = replace(scenario.services["world"], settings={**scenario.services["world"].settings})
     world.settings.pop("scenery")
@@ -110,4 +110,4 @@ def test_an_agent_that_is_not_beside_is_named() -> None:
 )
 def test_places_that_are_not_there_are_refused(agent: str, beside: tuple[str, ...], expected: str) -> None:
     with pytest.raises(ScenarioError, match=expected):
-        open_session(checked_scenario("uav-pair"), agent, (Input(topic="scene"),), beside=beside)
+        open_session(prepare("uav-pair"), agent, (Input(topic="scene"),), beside=beside)

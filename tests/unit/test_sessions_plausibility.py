@@ -12,8 +12,7 @@ from rich.console import Console
 
 from caviar_clients.cli.run import run_scenario
 from caviar_clients.envs.base import BeamSelectionEnv
-from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.plausibility import implausible_values
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import shipped_scenarios
 from caviar_space.meshes import Mesh, ply
@@ -59,7 +58,7 @@ def test_no_shipped_scenario_is_warned_of() -> None:
     for name in shipped_scenarios():
         if name in ("airsim", "cameras", "uav-munich", "uav-path"):
             pytest.importorskip("sionna.rt", reason="sionna-rt is not installed")
-        assert implausible_values(checked_scenario(Path(name))) == []
+        assert prepare(Path(name)).warnings == []
 
 
 @pytest.mark.parametrize(
@@ -75,7 +74,7 @@ def test_a_carrier_that_can_only_be_of_another_unit_is_refused(
 ) -> None:
     path = scenario(tmp_path, ("28e9", hertz))
     with pytest.raises(ScenarioError, match=rf":\d+: carriers\[0\]\.frequency_hz: {words}"):
-        checked_scenario(path)
+        prepare(path)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +93,7 @@ def test_an_implausible_value_is_named_with_line_and_what_may_be_meant(
 ) -> None:
     name = key.rpartition(".")[2]
     path = scenario(tmp_path, (f"{name} = {old}", f"{name} = {new}"))
-    (warning,) = implausible_values(checked_scenario(path))
+    (warning,) = prepare(path).warnings
     assert warning.startswith(f"{path}:{line_of(path, name)}: {key}: ")
     assert re.search(words, warning), warning
 
@@ -154,7 +153,7 @@ def test_values_of_another_unit_and_of_another_size_are_named(
     tmp_path: Path, key: str, line: str, change: tuple[str, str], words: str
 ) -> None:
     path = scenario(tmp_path, change)
-    (warning,) = implausible_values(checked_scenario(path))
+    (warning,) = prepare(path).warnings
     assert warning.startswith(f"{path}:{line_of(path, line)}: {key}: ")
     assert re.search(words, warning), warning
 
@@ -169,7 +168,7 @@ def test_keys_of_materials_that_nothing_has_are_named(tmp_path: Path) -> None:
     """Objects are called car and uav, of the classes car and uav; a pattern that fits one passes."""
     keys = 'uva = "plastic"\n"cab*" = "plastic"\n"c*" = "glass"\nuav = "plastic"\n'
     path = with_channel(tmp_path, "sionna-rt", f"[services.channel.settings.object_materials]\n{keys}")
-    typo, pattern = implausible_values(checked_scenario(path))
+    typo, pattern = prepare(path).warnings
     key = "services.channel.settings.object_materials"
     assert typo == (
         f"{path}:{line_of(path, 'uva')}: {key}.uva: is no object, class of objects or piece of scenery of "
@@ -187,7 +186,7 @@ settings = { max_depth = 4 }
 label = "exact"
 settings = { max_depth = 2 }
 """
-    (warning,) = implausible_values(checked_scenario(with_channel(tmp_path, "adaptive", ladder)))
+    (warning,) = prepare(with_channel(tmp_path, "adaptive", ladder)).warnings
     assert "settings.reference: has paths of 2 interactions at most, fewer than deep" in warning
 
 
@@ -234,7 +233,7 @@ def test_what_the_file_alone_says_is_refused_before_anything_starts(
 ) -> None:
     path = with_channel(tmp_path, "sionna-rt", settings)
     with pytest.raises(ScenarioError) as refused:
-        checked_scenario(path)
+        prepare(path)
     leaf = key.rpartition(".")[2]
     line = line_of(path, "[services.channel.settings.materials" if leaf == "tin" else leaf)
     assert str(refused.value).startswith(f"{path}:{line}: {key}: {words}")
@@ -245,7 +244,7 @@ def test_scenery_that_is_a_folder_is_refused_with_its_line(tmp_path: Path) -> No
     change = GROUND, f'{GROUND}\n[services.world.settings]\nscenery = "file:{tmp_path}"\n'
     path = scenario(tmp_path, change)
     with pytest.raises(ScenarioError) as refused:
-        checked_scenario(path)
+        prepare(path)
     assert str(refused.value) == (
         f"{path}:{line_of(path, 'scenery')}: services.world.settings.scenery: {tmp_path} is a folder; name "
         "the XML file of the scenery; there is town.xml"
@@ -289,7 +288,7 @@ def test_a_place_where_nothing_can_stand_is_named(
     tmp_path: Path, key: str, start: str, old: str, new: str, words: str
 ) -> None:
     path = scenario(tmp_path, town(tmp_path), (old, new))
-    (warning,) = implausible_values(checked_scenario(path))
+    (warning,) = prepare(path).warnings
     assert warning.startswith(f"{path}:{line_of(path, start)}: {key}: ")
     assert re.search(words, warning), warning
 
@@ -299,13 +298,13 @@ def test_places_in_the_scenery_are_not_warned_of_though_others_of_it_are_higher(
     path = scenario(
         tmp_path, town(tmp_path), ("position_m = [0.0, 0.0, 10.0]", "position_m = [80.0, 0, -5.0]")
     )
-    assert implausible_values(checked_scenario(path)) == []
+    assert prepare(path).warnings == []
 
 
 def test_scenery_that_cannot_be_read_is_for_its_world_to_tell(tmp_path: Path) -> None:
     change = town(tmp_path)
     (tmp_path / "ground.ply").write_bytes(b"no mesh")
-    assert implausible_values(checked_scenario(scenario(tmp_path, change))) == []
+    assert prepare(scenario(tmp_path, change)).warnings == []
 
 
 def test_a_run_with_a_warning_prints_it_keeps_it_and_ends_with_status_0(tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from recording_builders import frame, link, product, record, scene
 
-from caviar_clients.session.scenes import KEEPER, scenes_of, worlds_only
+from caviar_clients.session.prepared import implemented
+from caviar_clients.session.scenes import KEEPER, worlds_only
+from caviar_labs.tradeoff.scenes import scenes_of
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.scenario import load_scenario
 
@@ -34,7 +36,7 @@ def test_a_recording_whose_scenario_cannot_be_read_is_refused(tmp_path: Path) ->
     ],
 )
 def test_worlds_and_agents_that_need_no_channel_are_run(name: str, kept: set[str]) -> None:
-    reduced = worlds_only(load_scenario(SCENARIOS / f"{name}.toml"))
+    reduced = worlds_only(implemented(load_scenario(SCENARIOS / f"{name}.toml"))).scenario
     assert set(reduced.services) == kept | {KEEPER}
     assert reduced.run.episodes == 1
     assert reduced.run.record == ()

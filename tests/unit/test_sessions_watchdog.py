@@ -14,8 +14,8 @@ from msgspec.structs import replace as replace_field
 
 from caviar_broker.core.plan import briefings, plan_run
 from caviar_clients.session import watchdog
-from caviar_clients.session.checks import check_implementations, checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun, EmbeddedSession
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.messages import Grant, Input
 from caviar_protocol.scenario import Scenario, parse_scenario
 from caviar_protocol.topics import Action
@@ -79,7 +79,7 @@ class SlowChannel(FreeSpaceChannel):
 
 
 def test_a_wait_is_told_again_when_its_time_doubles_or_after_so_long() -> None:
-    scenario = check_implementations(parse_scenario(SMOKE.read_text()))
+    scenario = prepare(parse_scenario(SMOKE.read_text())).scenario
     plan = plan_run(scenario, "run", briefings(scenario, Path()))
     work = ("channel", Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0))
 
@@ -109,7 +109,7 @@ def smoke(*changes: tuple[str, str]) -> Scenario:
     for old, new in (("frames = 100\n", "frames = 4\n"), *changes):
         assert old in text
         text = text.replace(old, new, 1)
-    return check_implementations(parse_scenario(text))
+    return prepare(parse_scenario(text)).scenario
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_an_order_to_stop_names_what_keeps_the_run_from_its_end(
 
 
 def test_misses_of_a_run_in_one_process_are_counted_after_its_first_frame(tmp_path: Path) -> None:
-    scenario = checked_scenario(Path("smoke"), 4)
+    scenario = prepare(Path("smoke"), 4).scenario
     services = {name: replace_field(spec, budget_ms=1e-6) for name, spec in scenario.services.items()}
     run = EmbeddedRun(replace_field(scenario, services=services), tmp_path)
     assert run.run().error == ""

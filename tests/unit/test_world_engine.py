@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.errors import AssetError, PayloadError
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Action, VelocityCommand

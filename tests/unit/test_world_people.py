@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from caviar_services.world.people import FASTEST, JUMPS, PLACED, TURNS, People
+from caviar_services.world.sumo_conventions import FASTEST, JUMPS, PLACED, TURNS, People
 
 STEP_S = 0.1
 places = st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 2)), min_size=2, max_size=40)

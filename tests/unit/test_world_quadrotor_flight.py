@@ -28,10 +28,8 @@ from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, StepResult
 from caviar_services.world.flight import FlightSettings, FlightWorld, FlownObject
 from caviar_services.world.quadrotor.airframe import Airframe
-from caviar_services.world.quadrotor.contacts import box_contact
-from caviar_services.world.quadrotor.control import Controller
-from caviar_services.world.quadrotor.state import Battery
-from caviar_services.world.quadrotor.wind import Wind
+from caviar_services.world.quadrotor.control import Battery, Controller
+from caviar_services.world.quadrotor.surroundings import Wind, box_contact
 from caviar_services.world.trajectory import MovingObject
 
 pytestmark = pytest.mark.slow

@@ -23,10 +23,9 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.people import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
+from caviar_services.world.sumo_conventions import PLACED, step_length_ms
 from caviar_services.world.sumo_process import load_libsumo
-from caviar_services.world.sumo_steps import step_length_ms
 
 pytestmark = [
     pytest.mark.slow,
@@ -41,7 +40,7 @@ FRESH_PROCESS = """
 import hashlib, sys
 from caviar_protocol.codec import encode_payload
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.people import PLACED
+from caviar_services.world.sumo_conventions import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
 
 folder, seed = sys.argv[1], int(sys.argv[2])
@@ -66,7 +65,7 @@ import os, signal, sys
 from pathlib import Path
 from caviar_protocol.codec import encode_payload
 from caviar_services.service import Frame, Preparation, RunInfo
-from caviar_services.world.people import PLACED
+from caviar_services.world.sumo_conventions import PLACED
 from caviar_services.world.sumo import SumoSettings, SumoWorld
 
 folder, scratch, first, last, kill = sys.argv[1], Path(sys.argv[2]), *map(int, sys.argv[3:])

@@ -16,8 +16,7 @@ from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.topics import Action, DriveCommand, RoadStop, Scene, SignalCommand, WaypointCommand
 from caviar_protocol.topics.link import Command
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
-from caviar_services.world.sumo import SumoSettings
-from caviar_services.world.sumo_actuated import ActuatedSumoWorld
+from caviar_services.world.sumo import ActuatedSumoWorld, SumoSettings
 
 pytestmark = [
     pytest.mark.slow,

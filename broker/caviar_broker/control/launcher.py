@@ -185,7 +185,14 @@ class Outbox:
                 return
             # At most `CHUNK` after each poll: POSIX promises room for PIPE_BUF bytes and not for more.
             if self._poll.poll(0):
-                self._write()
+                try:
+                    taken = os.write(self._fd, self._pending[:CHUNK])
+                except OSError:  # the reader is gone: the log remains
+                    self.gone = True
+                    self._pending.clear()
+                    self._behind = None
+                else:
+                    del self._pending[:taken]
             else:
                 return
 
@@ -216,16 +223,6 @@ class Outbox:
 
     def _encode(self, line: Line) -> bytes:
         return self._render(line).encode(errors="backslashreplace") + b"\n"
-
-    def _write(self) -> None:
-        try:
-            taken = os.write(self._fd, self._pending[:CHUNK])
-        except OSError:  # the reader is gone: the log remains
-            self.gone = True
-            self._pending.clear()
-            self._behind = None
-        else:
-            del self._pending[:taken]
 
     def _read_back(self) -> bool:
         """Take the next lines from the log into memory; False where the log does not have them yet."""
@@ -344,22 +341,19 @@ class LauncherPipe:
         # A launcher that never ends a line must not fill the memory.
         self._rest = self._rest[-MAX_ORDER:]
         for line in lines:
-            self._obey(line)
-
-    def _obey(self, line: bytes) -> None:
-        try:
-            order = json.loads(line)
-        except ValueError:
-            order = None
-        match order:
-            case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.member(service):
-                self._server.feed(ev.Lost(service, verdict))
-            case {"restarted": str(service), "text": str(text)}:
-                self._server.note(service, text, "restarted")
-            case {"stop": str(reason)}:
-                self._server.feed(ev.StopRequested(reason))
-            case _:
-                self._server.note("", f"the launcher gave an order that is none: {line[:200]!r}")
+            try:
+                order = json.loads(line)
+            except ValueError:
+                order = None
+            match order:
+                case {"lost": str(service), "verdict": str(verdict)} if self._server.clock.member(service):
+                    self._server.feed(ev.Lost(service, verdict))
+                case {"restarted": str(service), "text": str(text)}:
+                    self._server.note(service, text, "restarted")
+                case {"stop": str(reason)}:
+                    self._server.feed(ev.StopRequested(reason))
+                case _:
+                    self._server.note("", f"the launcher gave an order that is none: {line[:200]!r}")
 
 
 def stop_on_signals(server: BrokerServer) -> Callable[[], bool]:

@@ -8,7 +8,7 @@ From a DONE to the next GRANT:
 1. The shell gives the event to `clock.FrameClock.handle`, which looks the transition up and calls
 2. `episodes.Episodes.handle_done`, which refuses a DONE of another epoch or frame;
 3. `dispatch.Dispatcher.handle_done` ends the task, and `decisions.DecisionTable.decide_answered` decides its
-   products, as `deadlines.Deadlines` does for a service that is late (held, absent, or the end of the run);
+   products, as `decisions.Deadlines` does for a service that is late (held, absent, or the end of the run);
 4. each decision is entered into the ledger and becomes a Journal action.
 5. When all events of a turn are handled, the shell calls `FrameClock.settle`:
 6. `Episodes.pump` and `Dispatcher.advance` find the services whose inputs are all decided, and order a GRANT.

@@ -10,8 +10,7 @@ from collections.abc import Collection, Mapping
 
 from msgspec.structs import replace
 
-from caviar_broker.core.deadlines import Deadlines
-from caviar_broker.core.decisions import DecisionTable
+from caviar_broker.core.decisions import Deadlines, DecisionTable
 from caviar_broker.core.events import Product
 from caviar_broker.core.geometry import GeometryLedger
 from caviar_broker.core.pace import Pacer
@@ -107,7 +106,12 @@ class Dispatcher:
         participant.completed = max(participant.completed, task.frame)
         self.deadlines.measure(task, now)
         if state is _OVERDUE:
-            self._record_late(task, products, now)
+            elapsed = milliseconds(now - task.started_at)
+            self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
+            self.table.record_late(task, products, now)
+            if self._recorders:
+                self._late += products.values()
+            self.table.release(task)
         else:
             task.report = report
             recorded = self.plan.recorded.get((service, self.episode, task.frame), ())
@@ -145,14 +149,6 @@ class Dispatcher:
         if task.state is not _GRANTED:
             self.table.ready.add(participant)  # it was decided before; else its decision brings it back
         return task
-
-    def _record_late(self, task: Task, products: Mapping[str, Product], now: int) -> None:
-        elapsed = milliseconds(now - task.started_at)
-        self._notice("late", task, f"answered after {elapsed}; its frame had gone on")
-        self.table.record_late(task, products, now)
-        if self._recorders:
-            self._late += products.values()
-        self.table.release(task)
 
     def _end_after(self, frame: int) -> None:
         """Cut what comes after ``frame``, with which an agent ends the episode (clause 16).

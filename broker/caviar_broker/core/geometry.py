@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 from caviar_broker.core.run import Member, Run
 from caviar_broker.core.transitions import ServiceState
+from caviar_protocol.assets import wrong_name
 from caviar_protocol.digest import geometry_digest
-from caviar_protocol.geometry import wrong_name
 from caviar_protocol.messages import (
     Asset,
     Done,
@@ -148,7 +148,10 @@ class GeometryLedger:
             self._refuse(member, message.frame, "", why)
             return None
         self._put(member.name, change)
-        self._forget_before(needed)
+        # Forget what was replaced before a frame: no grant needs it any more.
+        for changes in self._changes.values():
+            while len(changes) > 1 and changes[1].frame <= needed:
+                del changes[0]
         self._note_digests()
         run = self._run
         run.enter_journal("geometry", member.name, message.frame, now, geometry=change)
@@ -192,12 +195,6 @@ class GeometryLedger:
         while changes and changes[-1].frame >= change.frame:
             changes.pop()
         changes.append(change)
-
-    def _forget_before(self, frame: int) -> None:
-        """Forget what was replaced before a frame: no grant needs it any more."""
-        for changes in self._changes.values():
-            while len(changes) > 1 and changes[1].frame <= frame:
-                del changes[0]
 
     def _note_digests(self) -> None:
         scenery = self._run.scenery()

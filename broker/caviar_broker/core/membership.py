@@ -379,7 +379,10 @@ class Liveness:
         run.notice("lost", member.name, text, owed[0].frame if owed else -1)
         if not run.takes_part(member):
             return
-        if not self._may_return(member):
+        # Whether the loss of a service is survived for a while: it was ready once, perhaps under a broker
+        # before, or is started by hand and can be again; and it got somewhere.
+        was_ready = member.ready is not None or member.plan.remote or self._run.plan.epoch > 1
+        if not (member.rejoin(self._run.plan.timeouts) > 0 and was_ready and member.losses < MAX_LOSSES):
             run.fail(text, member.name, now)
             return
         limit = member.rejoin(run.plan.timeouts) / 1e9
@@ -387,12 +390,6 @@ class Liveness:
         run.notice("away", member.name, text, owed[0].frame if owed else -1)
         if dispatcher:
             dispatcher.suspend_service(member.name)
-
-    def _may_return(self, member: Member) -> bool:
-        """Whether the loss of a service is survived for a while: it was ready once, perhaps under a
-        broker before, or is started by hand and can be again; and it got somewhere."""
-        was_ready = member.ready is not None or member.plan.remote or self._run.plan.epoch > 1
-        return member.rejoin(self._run.plan.timeouts) > 0 and was_ready and member.losses < MAX_LOSSES
 
     # --- deadlines -----------------------------------------------------------------------------------
 
@@ -417,7 +414,12 @@ class Liveness:
         run = self._run
         if run.state is RunState.STOPPING:
             if run.since + run.plan.timeouts.shutdown <= now:
-                self._give_up_waiting(now)
+                for member in self._run.members.values():
+                    if member.present:
+                        words = member.last_words(now)
+                        text = f"{member} did not say BYE in time (timeouts.shutdown_s); {words}"
+                        self._run.notice("lost", member.name, text)
+                        member.move(ServiceEvent.LOST, now)
             return
         if run.over:
             return
@@ -487,10 +489,3 @@ class Liveness:
             case _:
                 key = "ready_s" if member.state is ServiceState.PREPARING else "reset_s"
                 return member.blame(f"makes no progress (timeouts.{key}) while {member.doing}", now)
-
-    def _give_up_waiting(self, now: int) -> None:
-        for member in self._run.members.values():
-            if member.present:
-                text = f"{member} did not say BYE in time (timeouts.shutdown_s); {member.last_words(now)}"
-                self._run.notice("lost", member.name, text)
-                member.move(ServiceEvent.LOST, now)

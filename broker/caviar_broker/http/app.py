@@ -168,19 +168,7 @@ def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> Fas
     app.add_exception_handler(RunError, _no_broker)
     viewer = [Depends(_bearer), Depends(_may(VIEWER, tokens))]
     operator = [Depends(_bearer), Depends(_may(OPERATOR, tokens))]
-    _questions(app, ask, gateway, viewer)
-    _orders(app, ask, operator)
-    _policies(app, directory, [Depends(_bearer), Depends(_may(TRAINER, tokens))])
-    _probes(app, ask)
 
-    @app.websocket("/ws")
-    async def ws(socket: WebSocket) -> None:
-        await gateway.serve(socket)
-
-    return app
-
-
-def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> None:
     # A function that makes each handler: one made in the loop would answer with the loop's last name.
     def answers(name: str) -> Callable[[], Awaitable[Any]]:
         async def answer() -> Any:
@@ -198,6 +186,28 @@ def _questions(app: FastAPI, ask: Ask, gateway: Gateway, viewer: list[Any]) -> N
         """The same as figures for Prometheus."""
         found = (await ask(do="status"))["status"]
         return PlainTextResponse(metrics(found, gateway.connections), media_type=CONTENT_TYPE)
+
+    _orders(app, ask, operator)
+    _policies(app, directory, [Depends(_bearer), Depends(_may(TRAINER, tokens))])
+
+    @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
+    async def healthz() -> Any:
+        """Whether the broker answers. Needs no token."""
+        # Of `why` and not of `status`, which computes quantiles for every service.
+        await ask(do="why")
+        return {"ok": True}
+
+    @app.get("/readyz", responses=_example("readyz") | _unready("services are missing or prepare"))
+    async def readyz() -> Any:
+        """Whether all services are there and ready. Needs no token."""
+        state = (await ask(do="why"))["why"]["state"]
+        return JSONResponse({"ready": state in READY}, 200 if state in READY else 503)
+
+    @app.websocket("/ws")
+    async def ws(socket: WebSocket) -> None:
+        await gateway.serve(socket)
+
+    return app
 
 
 def _orders(app: FastAPI, ask: Ask, operator: list[Any]) -> None:
@@ -248,21 +258,6 @@ def _policies(app: FastAPI, directory: Path, trainer: list[Any]) -> None:
         if found["state"] == "refused":
             raise HTTPException(409, found["reason"])
         return {"agent": name, "sha256": digest, "state": found["state"], "frame": found["frame"]}
-
-
-def _probes(app: FastAPI, ask: Ask) -> None:
-    @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
-    async def healthz() -> Any:
-        """Whether the broker answers. Needs no token."""
-        # Of `why` and not of `status`, which computes quantiles for every service.
-        await ask(do="why")
-        return {"ok": True}
-
-    @app.get("/readyz", responses=_example("readyz") | _unready("services are missing or prepare"))
-    async def readyz() -> Any:
-        """Whether all services are there and ready. Needs no token."""
-        state = (await ask(do="why"))["why"]["state"]
-        return JSONResponse({"ready": state in READY}, 200 if state in READY else 503)
 
 
 def _may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:

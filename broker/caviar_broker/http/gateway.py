@@ -86,7 +86,14 @@ class Gateway:
         offered = socket.scope.get("subprotocols", [])
         token = token_of(socket.headers, self._tokens, offered)
         if why := self._refusal(socket, token, token_shown(socket.headers, offered)):
-            await self._refuse(socket, why)
+            # Accept, send REFUSE, close: pages and engines cannot read the answer to a request that
+            # fails.
+            peer = socket.client.host if socket.client else "an unknown address"
+            # Throttled: a page that tries again and again must not fill the console of the run.
+            await self._refused(why, f"a WebSocket from {peer} was refused: {why}")
+            await socket.accept(subprotocol(socket.scope.get("subprotocols", [])))
+            await _send(socket, m.Refuse(code="unauthorized", message=why))
+            await _close(socket, 1008, why)
             return
         self.connections += 1
         try:
@@ -107,15 +114,6 @@ class Gateway:
             return ""
         what = "this token is not, or no longer, known" if shown else "there is no token in the request"
         return f"{what}; {self._remedy}"
-
-    async def _refuse(self, socket: WebSocket, why: str) -> None:
-        """Accept, send REFUSE, close: pages and engines cannot read the answer to a request that fails."""
-        peer = socket.client.host if socket.client else "an unknown address"
-        # Throttled: a page that tries again and again must not fill the console of the run.
-        await self._refused(why, f"a WebSocket from {peer} was refused: {why}")
-        await socket.accept(subprotocol(socket.scope.get("subprotocols", [])))
-        await _send(socket, m.Refuse(code="unauthorized", message=why))
-        await _close(socket, 1008, why)
 
     async def _refused(self, kind: str, text: str) -> None:
         """Show a refusal on the run's console, each kind once in a while."""
@@ -192,18 +190,15 @@ class _Bridge:
         for task in done:
             error = task.exception()
             if isinstance(error, _CutOff):
-                await self._cut(error)
+                if self._name:
+                    text = f"the WebSocket of {self._name!r} was cut off: {error.reason}"
+                    await self._tell(self._name, text, NOTE)
+                else:
+                    text = f"a WebSocket that has not said who it is was cut off: {error.reason}"
+                    await self._refused(f"cut off with code {error.code}", text)
+                await _close(self._socket, error.code, error.reason)
             elif error is not None and not isinstance(error, WebSocketDisconnect):
                 raise error
-
-    async def _cut(self, why: _CutOff) -> None:
-        if self._name:
-            text = f"the WebSocket of {self._name!r} was cut off: {why.reason}"
-            await self._tell(self._name, text, NOTE)
-        else:
-            text = f"a WebSocket that has not said who it is was cut off: {why.reason}"
-            await self._refused(f"cut off with code {why.code}", text)
-        await _close(self._socket, why.code, why.reason)
 
     # --- from the peer ------------------------------------------------------------------------------
 
@@ -303,7 +298,16 @@ class _Bridge:
         while True:
             parts = await dealer.recv_multipart(copy=False)
             if self._awaits_welcome or not self._admitted:
-                self._read_answer(parts[0].buffer)
+                # Learn from WELCOME, or the answer to ATTACH, that the peer is accepted, and as what;
+                # what cannot be read here is the peer's to judge.
+                header = parts[0].buffer
+                with contextlib.suppress(ProtocolError):
+                    message = decode_message(header)
+                    if isinstance(message, m.Welcome):
+                        self._welcome, self._awaits_welcome = message, False
+                    if isinstance(message, m.Welcome | m.HeartbeatAck):
+                        self._admitted = True
+                        self._socket.scope.get("state", {}).get(ADMIT, _no_limits)()
             frame = join_parts([part.buffer for part in parts])
             # The frame before may still be on its way: its size counts for the time of this one.
             patience = SLOW_S + self._sent / SLOW_RATE
@@ -313,17 +317,6 @@ class _Bridge:
             except TimeoutError as error:
                 raise _CutOff(1008, f"it has not read for {patience:.3g} s") from error
             self._sent = len(frame)
-
-    def _read_answer(self, header: memoryview) -> None:
-        """Learn from WELCOME, or the answer to ATTACH, that the peer is accepted, and as what; what cannot be
-        read here is the peer's to judge."""
-        with contextlib.suppress(ProtocolError):
-            message = decode_message(header)
-            if isinstance(message, m.Welcome):
-                self._welcome, self._awaits_welcome = message, False
-            if isinstance(message, m.Welcome | m.HeartbeatAck):
-                self._admitted = True
-                self._socket.scope.get("state", {}).get(ADMIT, _no_limits)()
 
     async def _watch_token(self) -> None:
         """A token that is revoked ends what came in with it."""

@@ -178,7 +178,15 @@ class Access:
                 return f"the key given to services that this run starts is not for {name!r}"
             return _role_refusal(name, known, role)
         if key == self.gateway.public:
-            return self._token_refusal(name, role)
+            # Reason why no peer of the gateway may appear as that service; the gateway checks its token.
+            roles = [token.role for token in self._tokens if token.name == name and token.of_service]
+            if not roles:
+                return f"there is no token of a service {name!r} ({self._remedy(name, role or 'ROLE')})"
+            if self._barred.get(f"{GATEWAY} {name}", 0) > time.monotonic_ns():
+                return f"the WebSocket of {name!r} was cut off, and it is barred for {BAR_NS // 10**9} s"
+            if role and role not in roles:
+                return f"the token of {name!r} is for {roles[0]}, not for {role}"
+            return ""
         entry = self._entries.get(key)
         if entry is None:
             return "its key is not authorized (caviar keys authorize)"
@@ -221,17 +229,6 @@ class Access:
     def _look(self) -> tuple[_Stamp, _Stamp]:
         """Compute a value that changes whenever one of the files does."""
         return _stamp(self.directory / AUTHORIZED), _stamp(self.directory / TOKENS)
-
-    def _token_refusal(self, name: str, role: str) -> str:
-        """Reason why no peer of the gateway may appear as that service; the gateway checks its token."""
-        roles = [token.role for token in self._tokens if token.name == name and token.of_service]
-        if not roles:
-            return f"there is no token of a service {name!r} ({self._remedy(name, role or 'ROLE')})"
-        if self._barred.get(f"{GATEWAY} {name}", 0) > time.monotonic_ns():
-            return f"the WebSocket of {name!r} was cut off, and it is barred for {BAR_NS // 10**9} s"
-        if role and role not in roles:
-            return f"the token of {name!r} is for {roles[0]}, not for {role}"
-        return ""
 
     def _remedy(self, name: str, role: str) -> str:
         return f"caviar keys token {name} --role {role} --directory {self.directory}"

@@ -1,4 +1,4 @@
-"""Commands of `caviar` by name: its own, former names, and those that entry points add.
+"""Commands of `caviar` by name: its own, former names, and those that entry points add; added options.
 
 A distribution adds a command with an entry point of the group ``caviar.commands``. Its name is what is typed
 after ``caviar``; its value, ``module:object``, is a function for Typer, or a ``typer.Typer``, which becomes a
@@ -15,11 +15,11 @@ from typing import Any
 
 import typer
 from rich.markup import escape
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from caviar_protocol.errors import DeclarationError, one_line
 from caviar_protocol.host import DISTRIBUTION
-from caviar_protocol.plugins import claims
+from caviar_protocol.plugins import claims, plugins
 
 PANELS = RUN, LOOK, DATASETS, POLICIES, OPERATE, LABORATORIES, PLUG_INS = (
     "Run", "Look at a run", "Datasets", "Policies", "Operate", "Laboratories", "Plug-ins"
@@ -152,3 +152,47 @@ def _refusing(name: str, panel: str, text: str) -> TyperCommand:
     return TyperCommand(
         name, callback=refuse, help=escape(text), rich_help_panel=panel, context_settings=anything
     )
+
+
+class _Alias(TyperOption):
+    """``--NAME VALUE``, for ``--attach NAME=VALUE``.
+
+    Args:
+        attach: The option ``--attach``, of which it is a copy.
+        attachment: ``NAME``.
+    """
+
+    def __init__(self, attach: Any, attachment: str) -> None:
+        vars(self).update(vars(attach))  # Typer's own arguments are not the same in all of its versions
+        self.attachment, self.name, self.opts = attachment, f"attach_{attachment}", [f"--{attachment}"]
+        self.metavar = "VALUE"
+
+    @property
+    def help(self) -> str:  # type: ignore[override]
+        """First line of the attachment's docstring; its module is imported where that is shown."""
+        from caviar_protocol.scenario import summary
+
+        return summary(self.attachment)
+
+
+class AttachingCommand(TyperCommand):
+    """A command with ``--attach``, and an alias of it for each attachment that is installed."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """List the parameters, with the aliases after ``--attach``."""
+        from caviar_protocol.scenario import ATTACHMENTS
+
+        found = super().get_params(ctx)
+        taken = {flag for parameter in found for flag in parameter.opts}
+        at = next(i for i, parameter in enumerate(found) if parameter.name == "attach")
+        names = [name for name in plugins(ATTACHMENTS) if f"--{name}" not in taken]
+        return [*found[: at + 1], *(_Alias(found[at], name) for name in names), *found[at + 1 :]]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; the values of aliases become those of ``--attach``."""
+        rest = super().parse_args(ctx, args)
+        for alias in self.get_params(ctx):
+            if isinstance(alias, _Alias):
+                values = [f"{alias.attachment}={value}" for value in ctx.params.pop(alias.name) or ()]
+                ctx.params["attach"] = [*(ctx.params["attach"] or ()), *values]
+        return rest

@@ -97,26 +97,32 @@ def generate_command(
     """Generate a dataset: episodes, each a recording, and a catalogue of them; goes on where it stopped."""
     from caviar_clients.cli.scenarios import extras_of
     from caviar_clients.datasets.generate import generate
-    from caviar_clients.datasets.plan import plan_dataset, with_cameras, with_own_traffic
-    from caviar_clients.datasets.presets import PRESETS, apply_preset, find_preset
-    from caviar_clients.session.checks import checked_scenario
+    from caviar_clients.datasets.plan import (
+        PRESETS,
+        apply_preset,
+        find_preset,
+        plan_dataset,
+        with_cameras,
+        with_own_traffic,
+    )
+    from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
     settings = keys_set(set_, record)
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
-        loaded = apply_preset(preset, checked_scenario(scene or preset.scenario, settings=settings))
+        loaded = apply_preset(preset, load_scenario(scene or preset.scenario, settings))
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
-        loaded = checked_scenario(scenario, settings=settings)
+        loaded = load_scenario(scenario, settings)
     for extra in dict.fromkeys(more or ()):
         require_known("--with", extra, ("camera",))
         loaded = with_cameras(loaded)
     if traffic == "independent":
         loaded = with_own_traffic(loaded)
-    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(loaded)))
     plan = plan_dataset(loaded, episodes=episodes or loaded.run.episodes, scenes=scenes, seed=seed)
+    require_installed(f"caviar dataset generate {scenario}", ("datasets", *extras_of(plan.scenario)))
     if overwrite:
         _remove(out)
     console = Console()
@@ -160,7 +166,7 @@ def tables_command(
 ) -> None:
     """Write the catalogue of a dataset as files: episodes, scenes, users, products, timings, failures."""
     from caviar_clients.datasets.catalogue import Catalogue
-    from caviar_clients.datasets.export import check_out, export_tables
+    from caviar_clients.datasets.formats import check_out, export_tables
     from caviar_clients.datasets.reader import check_level
     from caviar_clients.datasets.remote import located
 
@@ -231,7 +237,8 @@ def verify_command(
 
     from caviar_clients.cli.shared import require_writable, write_json
     from caviar_clients.datasets.reader import check_level
-    from caviar_clients.datasets.verification.verify import as_rows, verify
+    from caviar_clients.datasets.verification import as_rows
+    from caviar_clients.datasets.verification.verify import verify
 
     check_level(dataset)
     require_writable(json)  # before minutes of reading
@@ -282,7 +289,7 @@ def _remove(out: str) -> None:
 
 @dataclass
 class Pace:
-    """How fast episodes are played, and what time is left.
+    """Rate of episodes, and the time that is left.
 
     Example:
         >>> pace = Pace(episodes=6, began=100.0)

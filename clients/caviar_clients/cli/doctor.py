@@ -25,12 +25,11 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Column, Table
 
-from caviar_broker.core.events import Finished
 from caviar_clients.cli.scenarios import extras_of
 from caviar_clients.cli.shared import print_line
 from caviar_clients.cli.summary import recorded_figures
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.embedded import EmbeddedRun
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, SetupError
 from caviar_protocol.files import PrivateFolder
 from caviar_protocol.host import DISTRIBUTION, PYTHON, install_command
@@ -168,7 +167,10 @@ def check_frames() -> Check:
     remedy = f"{sys.executable} -m pip install --upgrade --upgrade-strategy eager {DISTRIBUTION}"
     try:
         with PrivateFolder("doctor") as folder:
-            outcome, abs_y = _two_frames(folder.path)
+            smoke = prepare(shipped_scenarios()["smoke"], frames=2)
+            outcome = EmbeddedRun(smoke, folder.path).run()
+            figures = recorded_figures(folder.path)
+            abs_y = (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
     except Exception as error:  # anything: a dependency that does not fit raises what it likes
         text = str(error) if isinstance(error, CaviarError) else f"{type(error).__name__}: {error}"
         return Check("frames", False, text, remedy)
@@ -184,13 +186,6 @@ def check_frames() -> Check:
         return Check("frames", True, f"{found}; digests of this machine compare with each other only")
     found = f"two frames of smoke have mean |y| {abs_y:.6g}, expected {FRAME_ABS_Y:.6g}"
     return Check("frames", False, f"{found}; digest {outcome.digest:.12}…", remedy)
-
-
-def _two_frames(folder: Path) -> tuple[Finished, float]:
-    """How two embedded frames of `smoke` end, and their mean |y|."""
-    outcome = EmbeddedRun(checked_scenario(shipped_scenarios()["smoke"], frames=2), folder).run()
-    figures = recorded_figures(folder)
-    return outcome, (figures.link.mean_abs_y if figures and figures.link else None) or 0.0
 
 
 def check_extra(extra: str) -> Check:
@@ -284,7 +279,7 @@ def _check(name: str, ok: bool, found: str, remedy: str) -> Check:
 
 
 def _requirements(extra: str) -> list[Requirement]:
-    """What an extra, or with ``""`` the base install, requires on this platform beside this distribution."""
+    """Requirements of an extra, or with ``""`` of the base install, on this platform."""
     try:
         lines = metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:
@@ -316,7 +311,8 @@ def _check_requirements(name: str, extra: str) -> Check:
     found = ", ".join(versions)
     if unmet and extra and not outdated:
         return Check(name, False, found, install_command(extra), extra)
-    return _check(name, not unmet, found, _pip_install(unmet))
+    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in unmet)
+    return _check(name, not unmet, found, f"{sys.executable} -m pip install {wanted}")
 
 
 def _version(name: str) -> str | None:
@@ -326,13 +322,8 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _pip_install(requirements: list[Requirement]) -> str:
-    wanted = " ".join(f"'{requirement.name}{requirement.specifier}'" for requirement in requirements)
-    return f"{sys.executable} -m pip install {wanted}"
-
-
 def _run(command: list[str], environment: Mapping[str, str]) -> tuple[bool, str]:
-    """Whether a command succeeded, and the first line that it printed, or why it failed."""
+    """Run a command: whether it succeeded, and the first line that it printed, or why it failed."""
     try:
         # Its own process: Dr.Jit with an LLVM that is too old aborts, and takes this one with it.
         done = subprocess.run(  # noqa: S603 - the commands are those above

@@ -1,29 +1,217 @@
-"""Starting a run: the broker and every service as processes of their own, and ending them all."""
+"""Start of a run: the broker and every service as processes of their own; their end, and what Ctrl-C does."""
 
 from __future__ import annotations
 
 import json
 import os
 import selectors
+import signal
 import subprocess
+import sys
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import zmq
 
+from caviar_broker.supervision import describe_exit, describe_stop, is_stopped
 from caviar_clients.cli.keys import BorrowedKey
-from caviar_clients.cli.processes import Child, end, wait
-from caviar_clients.session.checks import module_folders
+from caviar_clients.session.prepared import PreparedScenario, module_folders
 from caviar_protocol.errors import RunError
 from caviar_protocol.files import PrivateFolder, file_system_of, open_to_append
 from caviar_protocol.host import PYTHON
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_services.drjit_setup import THREADS_VARIABLE, share_of_each
-from caviar_services.registry import load
+
+KILLED_S = 2.0
+"""[s] within which a process ends that is killed, unless it waits for a disk."""
+TAIL = 1 << 16
+"""[B] of a log that are looked at for its last line."""
+_CRASH = "Fatal Python error: "
+_AFTER_A_CRASH = ("Extension modules: ", "  File ", "  Binary file ")
+ORDERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a run: of the terminal, of a supervisor, of a terminal that is closed."""
+PYTHON_S = 0.5
+"""[s] that the interpreter has to handle a signal: while a service computes in a library of C, it handles
+none."""
+
+
+@dataclass
+class Child:
+    """The process of one service."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    pidfd: int
+    """Readable once the process is dead."""
+
+    @classmethod
+    def start(cls, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> Child:
+        """Start a process.
+
+        Args:
+            name: Of the service.
+            command: Program and arguments.
+            log: Gets what the process prints, after what a process before it printed.
+            environment: All of its environment.
+        """
+        with open_to_append(log) as file:
+            process = subprocess.Popen(  # noqa: S603  # our own module with checked arguments
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,  # Ctrl-C is the launcher's, which ends the run in order
+                env=environment,
+            )
+        # A process id may be another process's a moment later; the descriptor stays that of this one.
+        return cls(name, process, log, os.pidfd_open(process.pid))
+
+    def last_line(self) -> str:
+        """The last line that the process printed, or what it died of in a library; empty if it printed
+        nothing."""
+        if not self.log.exists():  # the run's directory was deleted
+            return ""
+        with self.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        if not lines:
+            return ""
+        # After a crash faulthandler lists all threads and libraries; what counts stands above them.
+        if lines[-1].startswith(_AFTER_A_CRASH):
+            crashes = (number for number in reversed(range(len(lines))) if lines[number].startswith(_CRASH))
+            if (number := next(crashes, None)) is not None:
+                trace = dropwhile(lambda line: not line.startswith("Current thread "), lines[number:])
+                place = next((line.strip() for line in trace if line.startswith("  File ")), "no Python code")
+                return f"{lines[number]}, {place}"
+        return lines[-1]
+
+
+def end(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> list[int]:
+    """End processes: SIGTERM, and SIGKILL for those that are left later.
+
+    Args:
+        processes: Which; those that have ended already are left out.
+        seconds: Time between the two signals [s].
+
+    Returns:
+        Process ids of those that still live, since they wait for a disk.
+    """
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+    wait(processes, seconds)
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+    # A process in uninterruptible sleep takes no signal, SIGKILL neither: the launcher must not wait for it.
+    wait(processes, KILLED_S)
+    return [process.pid for process in processes if process.poll() is None]
+
+
+def wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Wait until all processes have ended, but for ``seconds`` at most [s]."""
+    until = time.monotonic() + seconds
+    for process in processes:
+        try:
+            process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            continue
+
+
+class Interruption:
+    """Turns signals into an order to end the run, for as long as a ``with`` block lasts.
+
+    Python hands signals to the main thread alone: in another one a block leaves them as they are.
+
+    Args:
+        stop: Orders an orderly end, for a reason. Called from a signal handler; with ``in_process`` from a
+            thread, too.
+        in_process: Whether services run in this process. Python handles no signal while one of them computes
+            in a library of C: a thread then takes the signals, and ends the process with status 130.
+
+    Example:
+        >>> reasons = []
+        >>> with Interruption(reasons.append) as interruption:
+        ...     os.kill(os.getpid(), signal.SIGTERM)
+        >>> interruption.came, reasons
+        (True, ['stopped by SIGTERM'])
+    """
+
+    def __init__(self, stop: Callable[[str], None], *, in_process: bool = False) -> None:
+        self._stop, self._in_process = stop, in_process
+        self._before = dict[signal.Signals, Any]()
+        self.came = False
+        """Whether a signal came."""
+        self._is_ordered = False  # by the handler
+        self._handled_at = 0.0
+        self._thread: threading.Thread | None = None
+        self._is_over = threading.Event()
+
+    def __enter__(self) -> Interruption:
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        self._before = {order: signal.signal(order, self._handle) for order in ORDERS}
+        if self._in_process:
+            self._read, self._write = os.pipe()
+            os.set_blocking(self._write, False)  # as `set_wakeup_fd` has to have it
+            self._fd_before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+            self._thread = threading.Thread(target=self._take, name="caviar-signals", daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        if self._thread is not None:
+            signal.set_wakeup_fd(self._fd_before)
+            os.close(self._write)  # the end of what the thread reads
+            self._thread.join()
+            os.close(self._read)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        self._handled_at = time.monotonic()
+        if self._is_ordered:
+            raise KeyboardInterrupt  # through the launcher's block, which ends all processes
+        self._is_ordered = True
+        self._order(number)
+
+    def _order(self, number: int) -> None:
+        self.came = True
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        self._stop(f"stopped by {name}")
+
+    def _take(self) -> None:
+        """Take the numbers of the signals as they arrive, and act on those that are not handled."""
+        while numbers := os.read(self._read, 64):
+            arrived = time.monotonic()
+            if not set(numbers) & set(ORDERS) or self._is_over.wait(PYTHON_S):
+                continue
+            # One that was handled just before it is read here counts, too: Python merges signals that come
+            # together.
+            if self._handled_at > arrived - PYTHON_S:
+                continue
+            if self.came:
+                _end_at_once()
+            self._order(next(number for number in numbers if number in ORDERS))
+
+
+def _end_at_once() -> None:
+    """End this process from a thread, whatever the others do."""
+    if sys.stderr.isatty():
+        sys.stderr.write("\x1b[?25h")  # the cursor, which the bar hides
+    sys.stderr.write("caviar: ended at once, from within a call that does not return: nothing was closed\n")
+    sys.stderr.flush()
+    os._exit(128 + signal.SIGINT)
+
 
 KILL_AFTER_S = 1.0
 """[s] that a process gets after SIGTERM before SIGKILL, beyond the run's ``shutdown_s``."""
@@ -40,12 +228,6 @@ LOOK_S = 0.05
 """[s] between looks at whether the broker's process is stopped; its death shows at once."""
 
 
-def _describe_exit(status: int) -> str:
-    from caviar_broker.supervision import describe_exit  # late, as in `Launcher._look_after_broker`
-
-    return describe_exit(status)
-
-
 @dataclass
 class Launcher:
     """Runs one scenario as processes of this machine.
@@ -54,7 +236,7 @@ class Launcher:
     what the broker reports, until the run is over. Remote services are started by the user, at ``endpoint``.
 
     Args:
-        scenario: Checked, as `checked_scenario` returns it.
+        prepared: The scenario, as `prepare` returns it.
         path: The scenario's file.
         directory: The run's directory.
         frames, seed, pace: What replaces the scenario's; None: nothing.
@@ -67,7 +249,7 @@ class Launcher:
         settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
     """
 
-    scenario: Scenario
+    prepared: PreparedScenario
     path: Path
     directory: Path
     frames: int | None = None
@@ -80,6 +262,7 @@ class Launcher:
     pace: str | None = None
     attachments: Sequence[str] = ()
     settings: Sequence[str] = ()
+    scenario: Scenario = field(init=False)
     endpoint: str = ""
     """Address at which the broker listens; empty before it does."""
     refused: bool = False
@@ -117,6 +300,7 @@ class Launcher:
     _listen_until: float | None = None
 
     def __post_init__(self) -> None:
+        self.scenario = self.prepared.scenario
         self._key = BorrowedKey(self.keys)
         if not self.bind and self.keys is None and len(self._local) == len(self.scenario.services):
             self.bind = self._private_address()
@@ -195,23 +379,20 @@ class Launcher:
 
     @property
     def _log(self) -> Path:
-        """Where the broker prints."""
+        """File to which the broker prints."""
         return RunDirectory(self.directory).log("broker")
 
     def _broker_arguments(self) -> list[str]:
         if self.resume:
             bind = ["--bind", self.bind] if self.bind else []
             return ["--resume", str(self.directory), *bind, *["--force"] * self.force]
-        arguments = [str(self.path), "--bind", self.bind, "--directory", str(self.directory)]
-        if self.frames is not None:
-            arguments += ["--frames", str(self.frames)]
-        if self.seed is not None:
-            arguments += ["--seed", str(self.seed)]
-        if self.pace is not None:
-            arguments += ["--pace", self.pace]
-        arguments += [f"--attach={text}" for text in self.attachments]
-        arguments += [f"--set={text}" for text in self.settings]
-        return arguments
+        given = {"--frames": self.frames, "--seed": self.seed, "--pace": self.pace}
+        return [
+            *(str(self.path), "--bind", self.bind, "--directory", str(self.directory)),
+            *(f"{option}={value}" for option, value in given.items() if value is not None),
+            *(f"--attach={text}" for text in self.attachments),
+            *(f"--set={text}" for text in self.settings),
+        ]
 
     def _start_broker(self) -> None:
         command = [*PYTHON, "-m", "caviar_broker", *self._broker_arguments()]
@@ -244,7 +425,7 @@ class Launcher:
         spec, path = self._local[name], RunDirectory(self.directory).log(name)
         command = [*PYTHON, "-m", "caviar_services", name]
         command += ["--use", f"{spec.role}:{spec.use}", "--broker", self.endpoint]
-        if wanted := load(spec.role, spec.use).inputs_with(spec.settings):
+        if wanted := self.prepared.services[name].cls.inputs_with(spec.settings):
             command += ["--inputs", *(".".join((i.topic, *i.parts)) for i in wanted)]
         for folder in module_folders(self.scenario):
             command += ["--modules", str(folder)]
@@ -305,9 +486,6 @@ class Launcher:
 
     def _look_after_broker(self) -> None:
         """End a broker that is stopped (SIGSTOP, a debugger); its end is then handled like any other."""
-        # Imported here, with the frame clock, the module is loaded while the broker starts, and not before.
-        from caviar_broker.supervision import describe_stop, is_stopped
-
         broker = self._broker
         if not self._verdict and broker is not None and broker.poll() is None and is_stopped(broker.pid):
             self._verdict = describe_stop(broker.pid)
@@ -316,7 +494,7 @@ class Launcher:
     # --- another broker ----------------------------------------------------------------------------
 
     def _may_resume(self) -> bool:
-        """Whether a broker that died is followed by another: services may rejoin the run, the broker had
+        """Tell whether a broker that died is followed by another: services may rejoin the run, the broker had
         begun, and those before it finished frames."""
         waits = (self.scenario.timeouts.rejoin_s or 0.0) > 0.0
         return (
@@ -337,7 +515,7 @@ class Launcher:
         if broker.poll() is None:
             broker.kill()
         status = broker.wait()  # it has closed its output and got SIGKILL, if it needed that
-        verdict, self._verdict = self._verdict or _describe_exit(status), ""
+        verdict, self._verdict = self._verdict or describe_exit(status), ""
         self._end_services()  # the new broker knows none of their connections
         self._brokers += 1
         self.resume, self.bind, self._rest = True, self.endpoint, b""
@@ -365,7 +543,7 @@ class Launcher:
             raise RunError("the broker closed its output and does not end")
         if not self._over:
             log = self._log.read_text(errors="replace").strip()
-            last = self._verdict or (log.splitlines()[-1] if log else _describe_exit(status))
+            last = self._verdict or (log.splitlines()[-1] if log else describe_exit(status))
             own = last.startswith("caviar broker: ")  # its own error, and no crash
             self.refused = own and not self.endpoint
             raise RunError(last.removeprefix("caviar broker: ") if own else f"the broker died: {last}")
@@ -397,7 +575,7 @@ class Launcher:
         if all(other.process.poll() is not None for other in self._children.values()):
             self._give_up_at = time.monotonic() + self.scenario.timeouts.shutdown_s + BROKER_S
         if not self._over:
-            verdict = _describe_exit(status)
+            verdict = describe_exit(status)
             tail = child.last_line()
             self._order({"lost": child.name, "verdict": f"{verdict}, saying: {tail}" if tail else verdict})
             if child.name in self._awaited:

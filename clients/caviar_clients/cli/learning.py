@@ -102,7 +102,7 @@ def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable
 
 
 def _rollouts(experiment: Experiment, rollout: int = 0) -> str:
-    """Why more steps are trained than the file asks for."""
+    """Reason for more steps than the file asks for."""
     algorithm, members = experiment.algorithm, experiment.environment.members
     what = "n_steps" if hasattr(algorithm, "n_steps") else "train_freq"
     numbers = f" = {rollout // members:,} × {members:,}" if rollout else ""
@@ -113,7 +113,7 @@ def _rollouts(experiment: Experiment, rollout: int = 0) -> str:
 
 
 def _steps_of(experiment: Experiment, root: Path) -> str:
-    """What is left of each seed."""
+    """Rest of each seed, in words."""
     from caviar_clients.learning.campaign import reached
     from caviar_clients.learning.training import read_result
 

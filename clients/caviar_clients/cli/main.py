@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from caviar_clients.cli.attachments import AttachingCommand
-from caviar_clients.cli.commands import LOOK, OPERATE, RUN, Commands
+from caviar_clients.cli.commands import LOOK, OPERATE, RUN, AttachingCommand, Commands
 from caviar_clients.cli.shared import (
     Attach,
     Embedded,
@@ -38,7 +37,7 @@ from caviar_clients.cli.shared import (
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
-from caviar_protocol.host import DISTRIBUTION
+from caviar_protocol.host import DISTRIBUTION, loading
 
 
 class _PlotGroup(TyperGroup):
@@ -118,7 +117,8 @@ def run(
     force: Force = False,
 ) -> None:
     """Run a scenario: the broker and every service as processes of their own, or all in this one."""
-    from caviar_clients.cli.run import resume_run, run_scenario
+    with loading():
+        from caviar_clients.cli.run import resume_run, run_scenario
 
     keys_given = keys_set(set_, record, episodes)
     source = _started_anew(
@@ -317,13 +317,13 @@ def radio_map(
     ] = None,
 ) -> None:
     """Map best server, path gain, received power and SINR over a plane or the ground."""
-    from caviar_clients.cli.radio_map import draw_radio_map, options_of
-    from caviar_clients.cli.radio_map_inputs import Wanted
+    from caviar_clients.cli.radio_map import MapOptions, beam_choice, draw_radio_map
 
-    cells = Wanted(height=height, cell=cell, surface=surface, area=area)
-    options = options_of(
-        metric, cells, beam, frame=frame, carrier=carrier, samples=samples, memory_gib=memory_gib
-    )
+    metrics = tuple(dict.fromkeys(metric or ("gain",)))
+    options = MapOptions(
+        metrics=metrics, height=height, cell=cell, surface=surface, area=area, frame=frame, carrier=carrier,
+        beam=beam_choice(beam), samples=samples, memory_gib=memory_gib,
+    )  # fmt: skip
     for file in draw_radio_map(source, out, options, _errors):
         typer.echo(file)
 
@@ -344,7 +344,7 @@ def video(
     user: Annotated[str | None, typer.Option(help="receiver whose |y| and beam are shown")] = None,
 ) -> None:
     """Make a video of a run: the map with rays and beam, |y| over time, and what a camera saw."""
-    from caviar_clients.cli.video import film_run
+    from caviar_clients.cli.plot import film_run
 
     film = film_run(run, out, fps, frames, camera, width, user, _errors)
     pace = f"{film.fps:g} frames/s, {film.speed:.3g} times real time"

@@ -1,20 +1,29 @@
-"""``caviar plot``: pictures of a recording."""
+"""``caviar plot`` and ``caviar plot video``: pictures of a recording, and a film."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
-from caviar_clients.files import make_folder_of, require_folder
-from caviar_clients.plots.map import MapData, draw_map
+from caviar_clients.cli.shared import progress_bar
+from caviar_clients.files import file_in, make_folder_of, require_folder
+from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
+from caviar_clients.plots.map import MapData, Mark, View, chosen_beam, draw_map, receiver_mark, view_of
+from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.packets import draw_traffic, packet_series
-from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, with_boxes
+from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, rays, scale, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_grid, draw_scan, draw_view
+from caviar_clients.plots.style import common_prefix
 from caviar_clients.plots.user_curves import (
+    UserSeries,
     choose_user,
     draw_dispersion,
     draw_frequency_response,
@@ -24,12 +33,13 @@ from caviar_clients.plots.user_curves import (
     series,
     user_paths,
 )
-from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import RecordingError
+from caviar_protocol.arrays import Float64Array, UInt8Array
+from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.codebooks import codebook_of
 from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.channel.propagation.patterns import element_amplitude
 from caviar_space.mitsuba_xml import find_scenery, read_scenery
@@ -83,12 +93,16 @@ def plot_run(
     files: list[Path] = []
     if "scene" in topics:
         files.append(folder / "map.png")
-        _map(recording, _frame(recording, frame, "channel", chosen), chosen, files[-1])
+        shown = _frame(recording, frame, "channel", chosen)
+        data = map_data(recording, shown, chosen, scenery(recording))
+        if data is None:
+            raise RecordingError(f"frame {shown.number} has no scene; choose another with --frame")
+        draw_map(data, files[-1])
     if chosen is not None:
         files += [folder / "beams-over-time.png", folder / "beams-over-angle.png"]
-        data, agent = series(recording, chosen), agent_names(recording)
-        draw_over_time(data, agent, files[-2])
-        draw_over_angle(data, agent, files[-1])
+        curves, agent = series(recording, chosen), agent_names(recording)
+        draw_over_time(curves, agent, files[-2])
+        draw_over_angle(curves, agent, files[-1])
     packets = packet_series(recording) if chosen is not None else None
     if packets is not None:
         files.append(folder / "traffic.png")
@@ -170,13 +184,6 @@ def map_data(
         user=user,
         title=f"{recording.metadata.name}: {moment(frame)}",
     )
-
-
-def _map(recording: Recording, frame: RecordedFrame, user: tuple[str, str, str] | None, file: Path) -> None:
-    data = map_data(recording, frame, user, scenery(recording))
-    if data is None:
-        raise RecordingError(f"frame {frame.number} has no scene; choose another with --frame")
-    draw_map(data, file)
 
 
 def _scan(frame: RecordedFrame, file: Path) -> None:
@@ -286,15 +293,15 @@ def _frame(
         return recording.frame(0, number)
     candidates = list(recording.frames())
     for wanted in ("scene", topic):
-        with_topic = [frame for frame in candidates if _has(frame, wanted)]
+        with_topic = [
+            frame
+            for frame in candidates
+            if any(entry.topic == wanted and entry.status in ("fresh", "held") for entry in frame.inputs)
+        ]
         candidates = with_topic or candidates
     ranks = [_worth(frame, user) for frame in candidates]
     candidates = [frame for frame, rank in zip(candidates, ranks, strict=True) if rank == max(ranks)]
     return candidates[len(candidates) // 2]  # not the first, in which users have hardly moved
-
-
-def _has(frame: RecordedFrame, topic: str) -> bool:
-    return any(entry.topic == topic and entry.status in ("fresh", "held") for entry in frame.inputs)
 
 
 def _frame_with_points(recording: Recording, frame: RecordedFrame) -> RecordedFrame:
@@ -334,3 +341,198 @@ def moment(frame: RecordedFrame) -> str:
     """Name a frame by its number and simulated time, and by its episode unless that is the first."""
     episode = f"episode {frame.episode}, " if frame.episode else ""
     return f"{episode}frame {frame.number}, t = {frame.t_ns * 1e-9:.2f} s"
+
+
+SLOWEST, FASTEST = 5.0, 30.0
+"""Frames a second where none are asked for: simulated time, within these."""
+_WIDTHS = {".mp4": 1280, ".gif": 960}
+# Pictures whose colours become a GIF's palette.
+_SAMPLES = 6
+
+User = tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class Film:
+    """A video that was written."""
+
+    file: Path
+    frames: int
+    fps: float
+    """Frames shown a second."""
+    speed: float
+    """Simulated time over playing time."""
+    size: tuple[int, int]
+    """Width and height [pixels]."""
+
+
+def film_run(
+    run: Path,
+    out: Path | None = None,
+    fps: float | None = None,
+    frames: str | None = None,
+    camera: str | None = None,
+    width: int | None = None,
+    user: str | None = None,
+    console: Console | None = None,
+) -> Film:
+    """Make a video of a recording: the map, |y| of one user, and what a camera saw.
+
+    Args:
+        run: Run directory or segment.
+        out: File, whose suffix says the format: ``.mp4``, which needs ffmpeg, or ``.gif``. By default
+            ``video.mp4`` in the run directory where there is ffmpeg, ``video.gif`` where not.
+        fps: Frames shown a second; by default as fast as simulated time, but from 5 to 30.
+        frames: ``A:B``, frames A to B − 1 of the first episode, either may be left out; by default all
+            frames of all episodes. Frames without a scene are left out.
+        camera: Camera whose pictures are shown; by default the first, of those that are fixed if there are
+            any.
+        width: Pixels, even; by default 1280, and 960 of a GIF.
+        user: Receiver, or its object, for |y| and the beam; by default the one that was there longest.
+        console: Where progress is shown; by default nowhere.
+
+    Raises:
+        RecordingError: It is not a recording, or frames, camera or user are not in it.
+        SetupError: Matplotlib or ffmpeg is missing, or format, speed and width do not go together.
+        RunError: The file cannot be written; there is none then, not even half of one.
+    """
+    recording = Recording(run)
+    file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")
+    suffix = file.suffix.lower()
+    rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
+    chosen = choose_user(recording, user or "") if "link" in recording.topics else None
+    plan, indices = _survey(recording, _indices(recording, frames), chosen, camera)
+    make_folder_of(file)
+    # Frames pass one by one, twice: limits and scales of the first pass hold in all pictures of the second.
+    moving = MovingMap(plan, pixels)
+
+    def pictures(steps: Iterable[int]) -> Iterator[UInt8Array]:
+        # Cameras may see every n-th frame: between two pictures the earlier one stands.
+        last = None
+        for step in steps:
+            frame = RecordedFrame(recording, indices[step])
+            data = map_data(recording, frame, chosen, None)
+            if plan.camera is not None:
+                last = _seen(frame).get(plan.camera, last)
+            if data is not None:
+                yield moving.draw(data, step, last)
+
+    count = len(indices)
+    spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
+    samples = list(pictures(spread)) if suffix == ".gif" else []
+    samples = samples or list(pictures(spread[:1]))
+    columns = (MofNCompleteColumn(), TimeRemainingColumn())
+    with progress_bar(console or Console(quiet=True), *columns) as bar:
+        drawn = iter(bar.track(pictures(range(count)), total=count, description="drawing"))
+        WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
+    speed = rate * recording.metadata.sampling_period_ns * 1e-9
+    return Film(file, count, rate, speed, moving.size)
+
+
+def _format(
+    file: Path, suffix: str, fps: float | None, width: int | None, period_ns: int
+) -> tuple[float, int]:
+    """Frames a second and width [pixels]."""
+    if suffix not in WRITERS:
+        what = f"ends in {suffix!r}, which is no format of a video" if suffix else "has no suffix"
+        if file.is_dir():
+            raise SetupError(f"{file} {file_in(file, 'video.mp4')} or .gif")
+        raise SetupError(f"{file} {what}; write .mp4 or .gif")
+    if suffix == ".mp4":
+        needed_ffmpeg(file)
+    # A GIF that is faster is slowed down by viewers (`GIF_FPS`).
+    rate = min(max(1e9 / period_ns, SLOWEST), FASTEST) if fps is None else fps
+    if not 0 < rate <= (GIF_FPS if suffix == ".gif" else 240):
+        raise SetupError(f"--fps is {rate:g}; write more than 0 and at most 50 for a GIF, 240 for an MP4")
+    pixels = _WIDTHS[suffix] if width is None else width
+    if not 320 <= pixels <= 3840 or pixels % 2:
+        raise SetupError(f"--width is {pixels}; write an even number from 320 to 3840")
+    return rate, pixels
+
+
+def _indices(recording: Recording, frames: str | None) -> list[int]:
+    """Places in the recording of the frames that are asked for."""
+    if frames is None:
+        return list(range(len(recording)))
+    numbers = [entry.frame for i in range(len(recording)) if (entry := recording.entry(i)).episode == 0]
+    has = (
+        f"{recording.path} has frames {min(numbers)} to {max(numbers)} of its first episode"
+        if numbers
+        else (f"{recording.path} has no frame of a first episode; leave out --frames")
+    )
+    match = re.fullmatch(r"(\d*):(\d*)", frames)
+    if match is None:
+        raise RecordingError(f"--frames is {frames!r}; write A:B for frames A to B - 1; {has}")
+    first, stop = int(match[1] or 0), int(match[2]) if match[2] else max(numbers, default=0) + 1
+    found = [i for i, number in enumerate(numbers) if first <= number < stop]
+    if not found:
+        raise RecordingError(f"--frames is {frames!r}, in which there is no frame; {has}")
+    return found
+
+
+def _survey(
+    recording: Recording, indices: Sequence[int], user: User | None, camera: str | None
+) -> tuple[Plan, list[int]]:
+    """Plan of the film from a first look at its frames, and the places of those that have a scene."""
+    ground, kept = scenery(recording), []
+    views: list[View] = []
+    gains: list[tuple[float, float]] = []
+    aspects: dict[str, float] = {}
+    kinds: set[bool] = set()
+    marks: set[Mark] = set()
+    names: set[str] = set()
+    has_ticks = has_beam = False
+    for index in indices:
+        frame = RecordedFrame(recording, index)
+        for sensor, picture in _seen(frame).items():
+            aspects.setdefault(sensor, picture.shape[0] / picture.shape[1])
+        data = map_data(recording, frame, user, None)
+        if data is None:
+            continue
+        kept.append(index)
+        beam, found = chosen_beam(data), rays(data.scene, data.channel)
+        views.append(view_of(data, beam))
+        if len(found.all_gains):
+            gains.append(scale(found.all_gains))
+        # What any frame has is in the key of the film, which is drawn once.
+        has_ticks |= bool(len(found.tick_gains))
+        has_beam |= beam is not None
+        carriers = {device.parent for device in data.scene.devices}
+        marks |= {receiver_mark(data.link, device.name) for device in antennas(data.scene, "rx")}
+        kinds |= {name in carriers for name in data.scene.names}
+        names |= set(data.scene.names)
+    if not kept:
+        raise RecordingError(f"{recording.path} holds no scene in these frames, so there is no map to draw")
+    shown = choose_camera(aspects, camera, f"these frames of {recording.path} hold")
+    limits = np.array(views)
+    low, high = limits[..., 0].min(axis=0).tolist(), limits[..., 1].max(axis=0).tolist()
+    plan = Plan(
+        view=((low[0], high[0]), (low[1], high[1])),
+        gains_db=scale(np.array(gains).ravel()) if gains else None,
+        has_ticks=has_ticks,
+        has_beam=has_beam,
+        kinds=frozenset(kinds),
+        receivers=frozenset(marks),
+        prefix=common_prefix(sorted(names)),
+        user="" if user is None else user[1].split("/")[0],
+        footprints=ground,
+        series=None if user is None else _cut(series(recording, user), kept),
+        agent=agent_names(recording),
+        camera=shown,
+        aspect=aspects.get(shown or "", 0.75),
+    )
+    return plan, kept
+
+
+def _seen(frame: RecordedFrame) -> dict[str, UInt8Array]:
+    """Pictures by camera."""
+    payloads = frame.payloads("camera", Camera).values()
+    return {image.sensor: image.rgb for payload in payloads for image in payload.images}
+
+
+def _cut(data: UserSeries, indices: list[int]) -> UserSeries:
+    arrays = {
+        name: getattr(data, name)[indices]
+        for name in ("time", "present", "has_path", "los", "abs_y", "best", "baseline", "theta")
+    }
+    return UserSeries(data.tx, data.rx, data.carrier, **arrays)

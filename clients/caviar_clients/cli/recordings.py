@@ -86,8 +86,8 @@ def inspect_command(run: Path, digest: bool = False, as_json: bool = False) -> i
     Raises:
         RecordingError: There is no recording.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RecordingWarning)  # its lines are printed as damage
+    # The lines of its warnings are printed as damage.
+    with warnings.catch_warnings(action="ignore", category=RecordingWarning):
         recording = Recording(run)
     if digest:
         return _print_digest(recording)
@@ -227,7 +227,7 @@ def replay_run(
     from caviar_clients.cli.run import run_scenario
     from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
     from caviar_clients.replay.recorded import RecordedRun
-    from caviar_clients.session.checks import check_implementations, names_class
+    from caviar_clients.session.prepared import names_class, prepare
     from caviar_services.registry import find_modules_in
 
     found = RecordedRun(Recording(run))
@@ -235,7 +235,7 @@ def replay_run(
         find_modules_in(Path.cwd())
     request = request_of(found.scenario.services, replace, settings, keep, recorded, again)
     plan = plan_replay(found, request, frames)
-    check_implementations(plan.scenario)
+    prepare(plan.scenario)
     _print_plan(plan, found, console)
     with PrivateFolder("replay") as folder:
         scenario, figures = folder.path / f"{plan.scenario.run.name}.toml", folder.path / "summary.json"
@@ -308,7 +308,11 @@ def rescue_run(run: Path, console: Console) -> int:
     journal, of_journal = _examine_journal(run)
     record, of_record = _examine_record(run, recording, journal)
     parts = [of_recording, of_record, of_journal]
-    _tell_runs_apart(parts)
+    named = [part for part in parts if part.run]
+    if len({part.run for part in named}) > 1:  # each part says of which run it is
+        for part in named:
+            part.state = "foreign"
+            part.lines.insert(0, f"of run {part.run!r}")
     console.print(_table(parts))
     states = {part.state for part in parts}
     if not states & {"damaged", "lost", "foreign"}:
@@ -322,7 +326,18 @@ def rescue_run(run: Path, console: Console) -> int:
         return 2
     target = _free_name(run)
     try:
-        _save(run, target, recording, record, journal)
+        target.mkdir()
+        if recording is not None:
+            _save_recording(recording, target)
+        if record is not None:
+            record.save(target)
+        if journal is not None:
+            # Up to the last whole entry; what a broker began to write when it died is no entry.
+            with journal.path.open("rb") as source:
+                RunDirectory(target).journal.write_bytes(source.read(journal.end))
+        for folder in (files.assets, files.checkpoints):
+            if folder.is_dir():
+                shutil.copytree(folder, target / folder.name)
     except OSError as error:
         raise failure(Path(error.filename or target), error) from error
     if not any(target.iterdir()):
@@ -333,83 +348,62 @@ def rescue_run(run: Path, console: Console) -> int:
     return 2 if "lost" in states else 1
 
 
-def _tell_runs_apart(parts: list[Part]) -> None:
-    """Note at each part of which run it is, where they are not all of one."""
-    named = [part for part in parts if part.run]
-    if len({part.run for part in named}) > 1:
-        for part in named:
-            part.state = "foreign"
-            part.lines.insert(0, f"of run {part.run!r}")
-
-
 def _examine_recording(run: Path) -> tuple[Recording | None, Part]:
-    part = Part(name="recording", state="whole", lines=[])
     if not any(run.glob("recording*")):
-        part.state, part.lines = "none", ["there is none"]
-        return None, part
+        return None, Part(name="recording", state="none", lines=["there is none"])
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RecordingWarning)
+        with warnings.catch_warnings(action="ignore", category=RecordingWarning):
             # Segments after one that is missing, too: other readers stop there.
             recording = Recording(run, past_gaps=True)
         damage = list(recording.run_digest().damage)
     except RecordingError as error:
-        part.state, part.lines = "lost", [str(error)]
-        return None, part
+        return None, Part(name="recording", state="lost", lines=[str(error)])
     readable = sum(1 for _ in _readable_frames(recording)) if damage else len(recording)
     last = recording.entry(len(recording) - 1) if len(recording) else None
     up_to = f", up to {frame_name((last.episode, last.frame))}" if last else ""
     ends = "" if recording.complete or damage else "; it breaks off there, as a killed recorder leaves it"
-    part.run = recording.metadata.run
-    part.lines = [f"{readable} frames can be read{up_to}{ends}", *damage]
-    if damage:
-        part.state = "damaged"
-    return recording, part
+    lines = [f"{readable} frames can be read{up_to}{ends}", *damage]
+    state: State = "damaged" if damage else "whole"
+    return recording, Part(name="recording", state=state, lines=lines, run=recording.metadata.run)
 
 
 def _examine_journal(run: Path) -> tuple[JournalReader | None, Part]:
-    part = Part(name="journal", state="whole", lines=[])
-    if not RunDirectory(run).journal.exists():
-        part.state, part.lines = "none", ["there is none"]
-        return None, part
+    file, of = RunDirectory(run).journal, ""
+    if not file.exists():
+        return None, Part(name="journal", state="none", lines=["there is none"])
     try:
-        part.run = run_of_journal(RunDirectory(run).journal)
-        reader = JournalReader(RunDirectory(run).journal)
-        entries = sum(1 for _ in reader)
+        of = run_of_journal(file)
+        reader = JournalReader(file)
+        lines = [f"{sum(1 for _ in reader)} entries can be read"]
     except RecordingError as error:
-        part.state, part.lines = "lost", [str(error)]
-        return None, part
-    part.lines = [f"{entries} entries can be read"]
+        return None, Part(name="journal", state="lost", lines=[str(error)], run=of)
     if reader.problem:
-        part.state = "damaged"
-        part.lines.append(f"{reader.problem}: {reader.lost} B are lost")
-    return reader, part
+        lines.append(f"{reader.problem}: {reader.lost} B are lost")
+    return reader, Part(name="journal", state="damaged" if reader.problem else "whole", lines=lines, run=of)
 
 
 def _examine_record(
     run: Path, recording: Recording | None, journal: JournalReader | None
 ) -> tuple[RunRecord | None, Part]:
-    part = Part(name=RunDirectory(run).record.name, state="whole", lines=[])
     files = RunDirectory(run)
+    name = files.record.name
     # Read anew: a reader goes through its journal once.
     entries = JournalReader(journal.path) if journal is not None else ()
     embedded = any(entry.epoch == NO_BROKER for entry in islice(entries, 1))
     if not files.record.exists() and (embedded or not files.journal.exists()):
-        part.state = "none"
-        part.lines = ["there is none, as of every run in one process" if embedded else "there is none"]
-        return None, part
+        text = "there is none, as of every run in one process" if embedded else "there is none"
+        return None, Part(name=name, state="none", lines=[text])
     try:
         record = read_record(run)
     except RecordingError as error:
+        lines = [str(error).removeprefix(f"cannot resume {run}: ")]
         rebuilt = _rebuilt(recording, journal)
-        part.state = "damaged" if rebuilt is not None else "lost"
-        part.lines = [str(error).removeprefix(f"cannot resume {run}: ")]
-        if rebuilt is not None:
-            part.lines.append("made anew from the recording's metadata and the journal")
-        return rebuilt, part
-    part.run = record.run
-    part.lines = [f"run {record.run}, epoch {record.epoch}"]
-    return record, part
+        if rebuilt is None:
+            return None, Part(name=name, state="lost", lines=lines)
+        lines.append("made anew from the recording's metadata and the journal")
+        return rebuilt, Part(name=name, state="damaged", lines=lines)
+    lines = [f"run {record.run}, epoch {record.epoch}"]
+    return record, Part(name=name, state="whole", lines=lines, run=record.run)
 
 
 def _rebuilt(recording: Recording | None, journal: JournalReader | None) -> RunRecord | None:
@@ -437,27 +431,6 @@ def _readable_frames(recording: Recording) -> Iterator[int]:
         stored = (p for p in products if p.provenance.status in (Status.FRESH, Status.LATE))
         if all(product.digest == product.provenance.digest for product in stored):
             yield index
-
-
-def _save(
-    run: Path,
-    target: Path,
-    recording: Recording | None,
-    record: RunRecord | None,
-    journal: JournalReader | None,
-) -> None:
-    target.mkdir()
-    if recording is not None:
-        _save_recording(recording, target)
-    if record is not None:
-        record.save(target)
-    if journal is not None:
-        # Up to the last whole entry; what a broker began to write when it died is no entry.
-        with journal.path.open("rb") as source:
-            RunDirectory(target).journal.write_bytes(source.read(journal.end))
-    for folder in (RunDirectory(run).assets, RunDirectory(run).checkpoints):
-        if folder.is_dir():
-            shutil.copytree(folder, target / folder.name)
 
 
 def _save_recording(recording: Recording, target: Path) -> None:

@@ -57,10 +57,10 @@ def serve_broker(
     # `caviar run` and `caviar status` load this module, and no broker: a server takes a third of a second.
     from caviar_broker.launch import DEFAULT_BIND, parser, serve
     from caviar_broker.security.access import check_bind
-    from caviar_clients.session.checks import checked_scenario
-    from caviar_clients.session.plausibility import implausible_values
+    from caviar_clients.session.prepared import prepare
 
-    scenario = checked_scenario(path, frames, seed, pace)
+    prepared = prepare(path, frames, seed, pace)
+    scenario = prepared.scenario
     check_bind(bind or DEFAULT_BIND, keys=keys is not None)
     current = RunInProgress(out, scenario.run.name) if "--restarted" in options else None
     left = current.directory() if current else None
@@ -68,7 +68,7 @@ def serve_broker(
         typer.echo(f"run {left}: its broker died, another one resumes it")
         return current.serve(left, lambda: resume_broker(left, options))
     directory = new_run_directory(out, scenario.run.name)
-    for warning in implausible_values(scenario):
+    for warning in prepared.warnings:
         typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"run {directory}; start its services; from elsewhere, with --broker and its address:")
     for command in service_commands(scenario.services, bind, keys):

@@ -13,22 +13,18 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import msgspec
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.text import Text
 
-from caviar_broker.run_record import read_record
-from caviar_broker.security.access import check_bind
-from caviar_clients.cli.launch import Launcher
-from caviar_clients.cli.processes import Interruption
+from caviar_clients.cli.launch import Interruption, Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable
 from caviar_clients.files import printable, write_file
-from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.plausibility import implausible_values
+from caviar_clients.session.prepared import PreparedScenario, implemented, prepare
 from caviar_protocol.errors import RecordingError, RunError, SetupError
+from caviar_protocol.host import loading
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, find_scenario
 from caviar_protocol.scenario.rules import refuse_remote
@@ -50,11 +46,11 @@ class EmbeddedLauncher:
     """A run in this process, with the interface of `caviar_clients.cli.launch.Launcher`.
 
     Args:
-        scenario: Checked, as `checked_scenario` returns it.
+        scenario: As `prepare` returns it.
         directory: The run's directory.
     """
 
-    def __init__(self, scenario: Scenario, directory: Path) -> None:
+    def __init__(self, scenario: PreparedScenario, directory: Path) -> None:
         from caviar_clients.session.embedded import EmbeddedRun
 
         self._directory = directory
@@ -95,12 +91,7 @@ class EmbeddedLauncher:
             "error": outcome.error,
             "culprit": outcome.culprit,
             "digest": outcome.digest,
-            "frames": statistics.frames,
-            "frames_per_second": statistics.frames_per_second(),
-            "warm_up_frames": statistics.warm_up_frames,
-            "deadlines": msgspec.structs.asdict(statistics.deadlines()),
-            "pace": msgspec.structs.asdict(statistics.pace()),
-            "services": {n: msgspec.structs.asdict(s) for n, s in statistics.services().items()},
+            **statistics.figures(),
         }
 
     def stop(self, reason: str) -> None:
@@ -182,7 +173,7 @@ def with_recording_checked(
 
 
 class RunOutcome(NamedTuple):
-    """How a run ended."""
+    """End of a run."""
 
     directory: Path
     status: int
@@ -225,10 +216,14 @@ def run_scenario(
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = checked_scenario(path, frames, seed, pace, attachments, settings)
+    with loading():  # the classes of services
+        prepared = prepare(path, frames, seed, pace, attachments, settings)
+    scenario = prepared.scenario
     if bind:
+        from caviar_broker.security.access import check_bind
+
         check_bind(bind, keys=keys is not None)
-    require_extras(scenario)
+    require_extras(prepared)
     if embedded:
         refuse_remote(scenario)
     if http and embedded:
@@ -242,16 +237,15 @@ def run_scenario(
     require_writable(json_file)
     directory = new_run_directory(out, scenario.run.name)
     print_line(console, f"run {directory}")
-    warnings = implausible_values(scenario)
-    for warning in warnings:
+    for warning in prepared.warnings:
         print_line(console, f"warning: {warning}", "yellow")
     # The child processes get the scenario as it was found: they read the file themselves.
     launcher: Launcher | EmbeddedLauncher
     if embedded:
-        launcher = EmbeddedLauncher(scenario, directory)
+        launcher = EmbeddedLauncher(prepared, directory)
     else:
         launcher = Launcher(
-            scenario,
+            prepared,
             find_scenario(path).resolve(),
             directory,
             frames,
@@ -263,7 +257,7 @@ def run_scenario(
             attachments=attachments,
             settings=settings,
         )
-    return _follow(launcher, scenario, directory, console, json_file, keys, warnings, new=True)
+    return _follow(launcher, scenario, directory, console, json_file, keys, prepared.warnings, new=True)
 
 
 def resume_run(
@@ -287,13 +281,22 @@ def resume_run(
         RecordingError: The directory has no record of a run, or one that cannot be read.
         RunError: A file cannot be written, or the broker cannot start.
     """
-    scenario = read_record(directory).scenario
+    from caviar_broker.run_record import read_record
+
+    prepared = implemented(read_record(directory).scenario)
     require_writable(json_file)
     print_line(console, f"run {directory}")
     launcher = Launcher(
-        scenario, directory, directory.resolve(), bind=bind, keys=keys, http=http, resume=True, force=force
+        prepared,
+        directory,
+        directory.resolve(),
+        bind=bind,
+        keys=keys,
+        http=http,
+        resume=True,
+        force=force,
     )
-    return _follow(launcher, scenario, directory, console, json_file, keys)
+    return _follow(launcher, prepared.scenario, directory, console, json_file, keys)
 
 
 def _follow(
@@ -320,7 +323,8 @@ def _follow(
     outcome: Mapping[str, Any] = {}
     interrupted = Interruption(launcher.stop, in_process=isinstance(launcher, EmbeddedLauncher))
     try:
-        with launcher, interrupted, _bar(console) as bar:
+        columns = ("{task.fields[rate]}", TimeRemainingColumn(), "{task.fields[misses]}")
+        with launcher, interrupted, progress_bar(console, MofNCompleteColumn(), *columns) as bar:
             watcher = _Watcher(bar, console, scenario, keys)
             for event in launcher.events():
                 watcher.show(event)
@@ -409,7 +413,8 @@ class _Watcher:
         for name, spec in self._scenario.services.items():
             if spec.remote:
                 connect_s = self._scenario.timeouts.connect_s
-                self._tell(waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys), "bold")
+                text = waiting_text(name, spec, endpoint, connect_s) + key_text(name, self._keys)
+                print_line(self._console, printable(text), "bold")
 
     def _frame(self, frames: int, misses: int) -> None:
         now = time.monotonic()
@@ -440,7 +445,7 @@ class _Watcher:
             frame = f" in frame {event['frame']}" if event["frame"] >= 0 else ""
             who = f"{event['service']}{frame}: " if event["service"] or frame else ""
             text = f"{event['kind']}: {who}{event['text']}"
-            self._tell(text + self._remedy(event), "yellow")
+            print_line(self._console, printable(text + self._remedy(event)), "yellow")
 
     def _remedy(self, event: Mapping[str, Any]) -> str:
         """The command that brings a remote service back; empty for other events."""
@@ -449,14 +454,6 @@ class _Watcher:
             return ""
         command = start_command(event["service"], spec, self._endpoint)
         return f"; unless it comes back by itself, start it again as before (or, the example,  {command})"
-
-    def _tell(self, text: str, style: str) -> None:
-        print_line(self._console, printable(text), style)
-
-
-def _bar(console: Console) -> Progress:
-    columns = ("{task.fields[rate]}", TimeRemainingColumn(), "{task.fields[misses]}")
-    return progress_bar(console, MofNCompleteColumn(), *columns)
 
 
 def _show(console: Console, summary: Mapping[str, Any]) -> None:

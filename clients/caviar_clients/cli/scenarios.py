@@ -11,12 +11,12 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from caviar_clients.cli.shared import description, print_line, require_installed
+from caviar_clients.session.prepared import PreparedScenario, PreparedService, implemented
 from caviar_protocol.errors import RunError
 from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.plugins import plugins
-from caviar_protocol.scenario import Scenario, ServiceSpec, load_scenario, shipped_scenarios
+from caviar_protocol.scenario import Scenario, load_scenario, shipped_scenarios
 from caviar_services.registry import load
-from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
 
 TEMPLATE = "new/scenario.toml"
 """The scenario that `caviar new` writes, in the package of scenarios."""
@@ -25,50 +25,47 @@ _TEMPLATE_NAME = 'name = "my-scenario"'
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
-def extras_of(scenario: Scenario) -> tuple[str, ...]:
+def extras_of(scenario: Scenario | PreparedScenario) -> tuple[str, ...]:
     """Name the extras of the distribution that the services of a scenario need, in alphabetical order.
 
     Remote services need theirs where they run.
     """
-    return tuple(sorted(set().union(*(_extras(spec) for spec in scenario.services.values()))))
+    return tuple(sorted(set().union(*map(_extras, implemented(scenario).services.values()))))
 
 
-def _extras(spec: ServiceSpec) -> set[str]:
-    if spec.remote:
-        return set()
-    found = {load(spec.role, spec.use).extra}
+def _extras(service: PreparedService) -> set[str]:
+    spec, found = service.spec, {service.cls.extra}
     # Scenes of Sionna are part of a package that both `world` and `channel` bring.
     scenery = spec.settings.get("scenery", "")
     if isinstance(scenery, str) and scenery.startswith("sionna:"):
         found.add("channel" if has_extra("channel") and not has_extra("world") else "world")
     if spec.settings.get("rate_model") == "nr":  # of the link `cell`
         found.add("system")
-    engines = {flown.get("engine") for flown in spec.settings.get("flown", ())}  # of quadrotors
-    found.update(plant_named(engine).extra for engine in engines & plugins(PLANTS).keys())
+    if flown := spec.settings.get("flown", ()):  # perhaps quadrotors
+        from caviar_services.world.quadrotor.airframe import PLANTS, plant_named
+
+        engines = {each.get("engine") for each in flown}
+        found.update(plant_named(engine).extra for engine in engines & plugins(PLANTS).keys())
     ladder, reference = spec.settings.get("ladder", ()), spec.settings.get("reference")
     for rung in (*ladder, *([reference] if reference else [])):  # models that an adaptive channel has
         found.add(load(spec.role, rung.get("use", "sionna-rt")).extra)
     return found - {""}
 
 
-def require_extras(scenario: Scenario) -> None:
+def require_extras(scenario: Scenario | PreparedScenario) -> None:
     """Refuse a scenario for which an extra is not installed.
 
     Raises:
         SetupError: An extra is missing; the text has one command that installs all that are.
     """
-    require_installed(f"scenario {scenario.run.name!r}", extras_of(scenario))
+    prepared = implemented(scenario)
+    require_installed(f"scenario {prepared.scenario.run.name!r}", extras_of(prepared))
 
 
 def list_scenarios(console: Console) -> None:
     """Print the scenarios that ship, each with a line and the extras that it needs."""
-    table = Table(
-        Column("name", no_wrap=True),
-        Column("what it is", overflow="fold"),
-        Column("needs", overflow="fold"),
-        box=None,
-        pad_edge=False,
-    )
+    columns = (Column(name, overflow="fold") for name in ("what it is", "needs"))
+    table = Table(Column("name", no_wrap=True), *columns, box=None, pad_edge=False)
     lacking: set[str] = set()
     for name, path in shipped_scenarios().items():
         extras = extras_of(load_scenario(path))

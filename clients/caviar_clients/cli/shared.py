@@ -1,4 +1,4 @@
-"""What commands share: arguments and options, refusals, lines and bars on the screen, files of results."""
+"""Shared parts of commands: arguments and options, refusals, lines and bars on the screen, result files."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from caviar_protocol.arrays import BoolArray, Float64Array, quantity
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Report, Status
 from caviar_protocol.policies import REFUSED
-from caviar_protocol.recording import RecordedFrame, Recording
+from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.codebooks import DFT
 from caviar_protocol.topics import Channel, Link
@@ -88,7 +88,7 @@ class OutageSummary(msgspec.Struct, kw_only=True):
 
 
 class SourceSummary(msgspec.Struct, kw_only=True):
-    """What became of one source's products of one topic."""
+    """Fate of one source's products of one topic."""
 
     topic: str
     source: str
@@ -100,7 +100,7 @@ class SourceSummary(msgspec.Struct, kw_only=True):
 
 
 class PacketSummary(msgspec.Struct, kw_only=True):
-    """What became of packets, over all frames and users."""
+    """Fate of packets, over all frames and users."""
 
     arrived: Annotated[int, quantity("bit", "came for users")]
     sent: Annotated[int, quantity("bit", "came through")]
@@ -438,26 +438,6 @@ def _db(ratio: float | None) -> float | None:
     return 10 * math.log10(ratio) if ratio and not math.isnan(ratio) else None
 
 
-def _measure(
-    frame: RecordedFrame,
-    sources: dict[tuple[str, str], SourceSummary],
-    totals: _LinkTotals,
-    orthonormal: bool,
-) -> None:
-    links: list[Link] = []
-    channels: list[Channel] = []
-    for product in frame.products:
-        entry = product.provenance
-        if entry.status in (Status.FRESH, Status.LATE):
-            sources[entry.topic, entry.source].bytes += product.size
-        if entry.status is Status.FRESH and entry.topic == "link":
-            links.append(cast(Link, product.payload))
-        elif entry.status is Status.FRESH and entry.topic == "channel" and orthonormal:
-            channels.append(cast(Channel, product.payload))
-    for link in links:
-        totals.add(link, channels)
-
-
 def _has_dft_alone(scenario: dict[str, Any]) -> bool:
     devices = scenario.get("devices")
     arrays = [device.get("array") for device in devices or () if isinstance(device, dict)]
@@ -494,10 +474,22 @@ def summarise(recording: Recording) -> RunSummary:
             source = sources.setdefault(key, SourceSummary(topic=entry.topic, source=entry.source))
             setattr(source, entry.status.value, getattr(source, entry.status.value) + 1)
         # A frame whose payloads are damaged still has its entries, and counts with them.
+        links: list[Link] = []
+        channels: list[Channel] = []
         try:
-            _measure(frame, sources, totals, orthonormal)
+            for product in frame.products:
+                entry = product.provenance
+                if entry.status in (Status.FRESH, Status.LATE):
+                    sources[entry.topic, entry.source].bytes += product.size
+                if entry.status is Status.FRESH and entry.topic == "link":
+                    links.append(cast(Link, product.payload))
+                elif entry.status is Status.FRESH and entry.topic == "channel" and orthonormal:
+                    channels.append(cast(Channel, product.payload))
         except RecordingError as error:
             damage.append(str(error))
+            continue
+        for link in links:
+            totals.add(link, channels)
     return RunSummary(
         run=metadata.run,
         scenario=metadata.name,
@@ -544,6 +536,9 @@ def recorded_figures(directory: Path) -> RunSummary | None:
         return None
 
 
+_OF_OUTCOME = ("frames_per_second", "warm_up_frames", "services", "deadlines", "pace", "digest")
+
+
 def summary_of(
     outcome: Mapping[str, Any],
     recorded: RunSummary | None,
@@ -574,12 +569,7 @@ def summary_of(
         "error": outcome["error"],
         "frames": outcome["frames"],
         "frames_recorded": recorded.frames if recorded else None,
-        "frames_per_second": outcome["frames_per_second"],
-        "warm_up_frames": outcome["warm_up_frames"],
-        "services": outcome["services"],
-        "deadlines": outcome["deadlines"],
-        "pace": outcome["pace"],
-        "digest": outcome["digest"],
+        **{key: outcome[key] for key in _OF_OUTCOME},
         **{
             name: msgspec.to_builtins(getattr(figures, name, None))
             for name in LinkSummary.__struct_fields__

@@ -7,24 +7,37 @@ and stand apart for that reason. Its schema is in docs/reference/datasets.md.
 
 from __future__ import annotations
 
-import hashlib
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Any
+from urllib.parse import quote
 
 import msgspec
 
-from caviar_clients.datasets.database import REBUILT, database_errors
-from caviar_clients.datasets.rows import Episode, EpisodeRows, ProductRow, SceneRow, UserRow
+from caviar_clients.datasets.rows import Episode, EpisodeRows, ProductRow, SceneRow, UserRow, column_types
+from caviar_clients.datasets.settings import FORMAT, check_settings
 from caviar_protocol.errors import RecordingError
 
-FORMAT = 1
-"""Version of the layout of a dataset: of its catalogue, its files and its settings."""
+REBUILT = "move it away, and the same caviar dataset generate command makes it anew from the recordings"
+"""What to do with a catalogue that cannot be read."""
 
+_REMEDIES = {
+    sqlite3.SQLITE_FULL: "free space there: the same command then goes on",
+    sqlite3.SQLITE_NOTADB: REBUILT,
+    sqlite3.SQLITE_CORRUPT: REBUILT,
+    sqlite3.SQLITE_READONLY: "allow writing it and its folder, or give a copy where that is allowed",
+    # SQLite opens FILE-wal too, where a killed command left changes, and makes FILE-shm beside it.
+    sqlite3.SQLITE_CANTOPEN: "allow reading it and what is named like it, and writing in its folder, or give "
+    "a copy",
+    sqlite3.SQLITE_PERM: "allow reading and writing it, or give a copy",
+    sqlite3.SQLITE_AUTH: "allow reading and writing it, or give a copy",
+    sqlite3.SQLITE_IOERR: "check the disk (dmesg names its errors), then run the same command again",
+}
+_LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_PROTOCOL)
 _TYPES_DIFFER = "has columns of other types, or another key"
 LOCKED_S = 5.0
 """[s] for which the lock of another process is waited for."""
@@ -50,29 +63,6 @@ CREATE TABLE failures (
     episode INTEGER NOT NULL, failed TEXT NOT NULL, error TEXT NOT NULL, host TEXT
 ) STRICT;
 """
-
-
-class _Run(msgspec.Struct):
-    frames: Annotated[int, msgspec.Meta(ge=1)]
-    sampling_period_ns: Annotated[int, msgspec.Meta(ge=0)]
-    instants_s: list[float] = []
-
-
-class _Scenario(msgspec.Struct):
-    run: _Run
-    services: dict[str, dict[str, Any]]
-    devices: list[dict[str, Any]] = []
-    carriers: list[dict[str, Any]] = []
-
-
-class _Settings(msgspec.Struct):
-    """What readers of a dataset rely on in its settings, whatever else these have."""
-
-    format: int
-    scenario: _Scenario
-    files: dict[str, Any]
-    versions: dict[str, Any]
-    device: str
 
 
 class Catalogue:
@@ -106,7 +96,7 @@ class Catalogue:
         with self._errors():
             mode = "rwc" if writable else "ro"
             self._connection = sqlite3.connect(
-                f"file:{_quoted(path)}?mode={mode}", uri=True, timeout=LOCKED_S
+                f"file:{quote(os.fsencode(path))}?mode={mode}", uri=True, timeout=LOCKED_S
             )
         try:
             self._open()
@@ -188,7 +178,7 @@ class Catalogue:
                     else "install a newer version of CAVIAR"
                 )
                 raise self._no_catalogue(f"it has format {made_as}, and this version reads {FORMAT}", remedy)
-            msgspec.convert(settings, _Settings)
+            check_settings(settings)
         except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
             raise self._no_catalogue(f"the settings in table dataset are damaged: {error}") from error
         return settings
@@ -321,13 +311,40 @@ class Catalogue:
         marks = ", ".join("?" * len(fields(TABLES[table][0])))
         self._connection.executemany(f"INSERT INTO {table} VALUES ({marks})", rows)  # noqa: S608
 
-    def _errors(self) -> AbstractContextManager[None]:
-        return database_errors(self.path, self._name)
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise errors of SQLite as `RecordingError`, with the remedy."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            # The low byte is the kind, the others say more of it; errors of the module itself have none.
+            kind = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            remedy = _REMEDIES.get(kind, "")
+            if kind in _LOCKED:
+                holders = ", ".join(_holders_of(self.path)) or "another process"
+                remedy = f"{holders} writes it: wait until that ends, then run the same command again"
+            raise RecordingError(f"{self._name}: {error}{'; ' if remedy else ''}{remedy}") from error
 
 
-def _quoted(path: Path) -> str:
-    """A path in the form of a URI, in which these three have meanings."""
-    return str(path).replace("%", "%25").replace("?", "%3f").replace("#", "%23")
+def _holders_of(path: Path) -> list[str]:
+    """Name the other processes of this machine that hold a lock on a database, its ``-wal`` or ``-shm``.
+
+    Returns:
+        ``process 4711 (sqlite3)``, …; empty where none is found, or the system does not tell.
+    """
+    files = (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm")))
+    inodes = {str(file.stat().st_ino) for file in files if file.exists()}
+    found = dict[str, None]()
+    with suppress(OSError, ValueError, IndexError):  # no such system, or a line of another form
+        for line in Path("/proc/locks").read_text().splitlines():
+            # «1: POSIX ADVISORY WRITE 4711 08:01:123456 0 EOF»; one that waits has «->» before its class.
+            words = line.split()
+            if "->" in words or words[5].rpartition(":")[2] not in inodes or int(words[4]) == os.getpid():
+                continue
+            command = Path(f"/proc/{words[4]}/comm")
+            of = f" ({command.read_text().strip()})" if command.exists() else ""
+            found[f"process {words[4]}{of}"] = None
+    return list(found)
 
 
 def columns_of(table: str) -> dict[str, str]:
@@ -361,7 +378,7 @@ def _described(connection: sqlite3.Connection, table: str) -> list[tuple[Any, ..
 
 
 def _difference(found: Sequence[tuple[Any, ...]], expected: Sequence[tuple[Any, ...]]) -> str:
-    """What is wrong with a table, by the descriptions of its columns; empty where nothing is."""
+    """Fault of a table, by the descriptions of its columns; empty where there is none."""
     if not found:
         return "is missing"
     names, right = [column[0] for column in found], [column[0] for column in expected]
@@ -383,20 +400,5 @@ def _schema() -> str:
 
 
 def _columns(cls: type[Any]) -> Iterator[str]:
-    for name, hint in get_type_hints(cls).items():
-        optional = isinstance(hint, UnionType)
-        kind = get_args(hint)[0] if optional else hint
+    for name, (kind, optional) in column_types(cls).items():
         yield f"{name} {_SQL_TYPES[kind]}{'' if optional else ' NOT NULL'}"
-
-
-def fingerprint(settings: Mapping[str, Any]) -> str:
-    """Digest of the settings of a dataset; the number of its episodes is none of them.
-
-    Args:
-        settings: Of `plan.DatasetPlan.settings`.
-
-    Example:
-        >>> fingerprint({"device": "llvm"}) == fingerprint({"device": "cuda"})
-        False
-    """
-    return hashlib.sha256(msgspec.json.encode(settings, order="sorted")).hexdigest()

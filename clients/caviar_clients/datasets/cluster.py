@@ -7,7 +7,6 @@ may be played twice without harm: so a worker that dies, hangs or loses its sche
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import time
 from collections import deque
@@ -16,16 +15,20 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from caviar_clients.datasets.cluster_watch import NO_WORKER_S, NOTE_S, TOPIC, ClusterWatch, Stall
-from caviar_clients.datasets.dask_settings import CONNECT_S, set_up_dask
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask, play_episode
-from caviar_clients.datasets.exits import KNOWN_S, exit_of, noting_nanny
-from caviar_protocol.errors import CaviarError, RunError, SetupError
-from caviar_protocol.files import PrivateFolder
-from caviar_protocol.host import install_command, safe_path
+from caviar_clients.datasets.local_cluster import (
+    CONNECT_S,
+    KNOWN_S,
+    exit_of,
+    noting_nanny,
+    set_up_dask,
+    start_workers,
+)
+from caviar_protocol.errors import CaviarError, RunError
 
 # Part of the extra `datasets`: imported where it is used.
 if TYPE_CHECKING:
-    from distributed import Client, Future, LocalCluster
+    from distributed import Client, Future
 
 ATTEMPTS = 5
 """Times that an episode is begun, where the processes that play it die."""
@@ -131,7 +134,7 @@ class Episodes:
         return found
 
     def _tried(self, pending: dict[Future, str]) -> Iterator[Any]:
-        """What came of trials, as they end, by the address of their workers."""
+        """Yield results of trials, as they end."""
         what = "scenes have been tried beforehand, at every worker,"
         while pending:
             for future in self._ended(pending):
@@ -241,7 +244,7 @@ class Episodes:
         return {address: about["last_seen"] for address, about in found["workers"].items()}
 
     def _ended(self, tasks: Mapping[Future, object]) -> list[Future]:
-        """Those of some tasks that have ended, after a second at most."""
+        """Tasks of these that have ended, after a second at most."""
         from distributed import wait
         from distributed.client import FuturesCancelledError
 
@@ -258,7 +261,7 @@ class Episodes:
         return ended
 
     def _result(self, future: Future, task: EpisodeTask, playing: _Playing) -> EpisodeResult | None:
-        """What came of a task; None: it is begun once more."""
+        """Result of a task; None: it is begun once more."""
         if future.status == "finished":
             try:
                 found: EpisodeResult = future.result(timeout=ANSWER_S)
@@ -272,7 +275,7 @@ class Episodes:
         return self._again(task, playing, f"that died ({self._exit_of(error)})")
 
     def _exit_of(self, error: Any) -> str:
-        """How the process of a `KilledWorker` of Dask ended."""
+        """Say how the process of a `KilledWorker` of Dask ended."""
         return exit_of(error.last_worker.address, wait_s=0.0 if self._scheduler else KNOWN_S)
 
     def _again(self, task: EpisodeTask, playing: _Playing, why: str) -> EpisodeResult | None:
@@ -296,8 +299,7 @@ class Episodes:
         return self._client
 
     def _connect(self) -> None:
-        import dask
-        from distributed import Client, LocalCluster, Security
+        from distributed import Client, Security
 
         if self._scheduler:
             if self._scheduler.startswith("tls:") and Security().tls_client_cert is None:
@@ -323,30 +325,7 @@ class Episodes:
             self._watch_workers()
             self.workers = len(self._last_seen())
             return
-        # A scheduler runs the code of any client, and any user of the machine reaches its port.
-        try:
-            security = Security.temporary()
-        except ImportError as error:
-            raise SetupError(f"{error}, for TLS between processes: {install_command('datasets')}") from error
-        self._stack.enter_context(safe_path())
-        folder = self._stack.enter_context(PrivateFolder("dask")).path
-        self._stack.enter_context(dask.config.set({"temporary-directory": str(folder)}))
-        # In two steps, since Ctrl-C may end the second one, which leaves a cluster that is half made.
-        cluster = LocalCluster.__new__(LocalCluster)
-        self._stack.callback(_abandon, cluster)
-        cluster.__init__(
-            security=security,
-            n_workers=self.workers,
-            threads_per_worker=1,
-            worker_class=noting_nanny(),
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            scheduler_kwargs={"dashboard": False},
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-        )
-        self._stack.enter_context(cluster)
-        self._client = self._stack.enter_context(Client(cluster, set_as_default=False))
+        self._client = start_workers(self.workers, self._stack)
         self._watch_workers()
 
     def _watch_workers(self) -> None:
@@ -441,14 +420,6 @@ class _Playing:
         self._begun.clear()
         self._twins.clear()
         return list(found.values())
-
-
-def _abandon(cluster: LocalCluster) -> None:
-    """Close a cluster, half made, whole or closed, so that Dask does not at the end of the process."""
-    cluster.shutdown_on_close = False
-    with suppress(Exception):  # workers that have not started yet are in the way of its own order
-        if cluster.status.name not in ("closing", "closed"):
-            cluster.close(timeout=5)
 
 
 async def _exit() -> None:

@@ -1,4 +1,4 @@
-"""What a generation waits for: workers that are gone or give no sign of life, and steps that do not end.
+"""Watch of a generation: workers that are gone or give no sign of life, and steps that do not end.
 
 `StepWatch` tells it in the process that plays an episode, `ClusterWatch` in the command. Times are arguments:
 the command reads the clock.
@@ -93,7 +93,7 @@ class Stall:
 
     @property
     def error(self) -> str:
-        """Why what waits for it is given up."""
+        """Error of an episode that is given up for it."""
         return (
             f"given up after {self.stands_s:.0f} s in one step, {STALLED_S:.0f} s are the limit: {self.text}"
             "; mend the service, or ask less of it"
@@ -189,7 +189,8 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
             address: old if (old := self._seen.get(address)) and old[0] == stamp else (stamp, now)
             for address, stamp in seen.items()
         }
-        strange = [*self._without_workers(now), *self._silent(now), *_standing(stalls)]
+        standing = [f"episode {number}: {stall.text}" for number, stall in sorted(stalls.items())[:SHOWN]]
+        strange = [*self._without_workers(now), *self._silent(now), *standing]
         waited_s = now - self._progressed
         is_due = now - max(self._progressed, self._noted) >= NOTE_S
         if is_due and (strange or waited_s >= 2.0 * mean_s):
@@ -226,11 +227,8 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         if not silent:
             return []
         named = ", ".join(f"{address} for {silent_s:.0f} s" for address, silent_s in silent[:SHOWN])
-        return [f"{len(silent)} of {len(self._seen)} workers give no sign of life: {named}{_more(silent)}"]
-
-
-def _standing(stalls: Mapping[int, Stall]) -> list[str]:
-    return [f"episode {number}: {stall.text}" for number, stall in sorted(stalls.items())[:SHOWN]]
+        more = f" (and {len(silent) - SHOWN} more)" if len(silent) > SHOWN else ""
+        return [f"{len(silent)} of {len(self._seen)} workers give no sign of life: {named}{more}"]
 
 
 def _at_workers(episodes: Collection[int]) -> str:
@@ -240,7 +238,3 @@ def _at_workers(episodes: Collection[int]) -> str:
     if len(episodes) == 1:
         return f"episode {first} is at the workers"
     return f"{len(episodes)} episodes are at the workers, episode {first} the first"
-
-
-def _more(found: Collection[object]) -> str:
-    return f" (and {len(found) - SHOWN} more)" if len(found) > SHOWN else ""

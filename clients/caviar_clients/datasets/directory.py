@@ -33,7 +33,7 @@ class DatasetDirectory:
 
     @property
     def catalogue(self) -> Path:
-        """What the dataset holds and what is to be done: a SQLite database (`catalogue`)."""
+        """Catalogue of what there is and what is to be done: a SQLite database (`catalogue`)."""
         return self.path / "catalogue.sqlite"
 
     @property

@@ -24,7 +24,6 @@ from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_th
 from caviar_clients.datasets.remote import RemoteDataset, is_address
 from caviar_clients.datasets.rows import EpisodeRows, rows_of
 from caviar_clients.files import printable
-from caviar_clients.session.checks import check_implementations
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import CaviarError
@@ -43,7 +42,7 @@ SETTINGS = "settings"
 
 @dataclass(frozen=True)
 class EpisodeTask:
-    """What a process needs to know to play an episode."""
+    """Task of a process that plays an episode."""
 
     scenario: Scenario
     """With the settings of a dataset (`plan.dataset_scenario`)."""
@@ -55,15 +54,15 @@ class EpisodeTask:
     kept: str = ""
     """Where the recording of a trial is moved to; empty: it is removed."""
     cached: Mapping[str, bytes] = field(default_factory=dict)
-    """Files that the cache of the process's user needs, by their names in it (`traffic.saved_states`)."""
+    """Files that the cache of the process's user needs, by their names in it (`generate.SharedTraffic`)."""
     settings: str = ""
-    """Digest of the settings of the dataset (`catalogue.fingerprint`): kept beside the recording, so that a
+    """Digest of the settings of the dataset (`settings.fingerprint`): kept beside the recording, so that a
     catalogue can be made from recordings; empty: not known."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What came of an episode."""
+    """Result of an episode."""
 
     episode: int
     error: str = ""
@@ -147,10 +146,9 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(file, content, durable=False, concurrent=True)
-    scenario = check_implementations(task.scenario)
     watch = StepWatch(task.episode)
     run = EmbeddedRun(
-        scenario,
+        task.scenario,  # which is checked where the dataset is planned
         folder,
         on_frame=watch.frame_finished,
         on_wait=watch.waits,
@@ -166,7 +164,7 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
 
 
 def _on_disk(folder: Path) -> int:
-    """What a recording takes of the disk, with its folder and a block for what is measured [B]."""
+    """Space that a recording takes of the disk, with its folder and a block for what is measured [B]."""
     about = [path.stat() for path in (folder, *folder.iterdir())]
     return sum(stat.st_blocks * 512 for stat in about) + about[0].st_blksize
 

@@ -1,4 +1,4 @@
-"""What a dataset takes in time and on the disk, from three scenes that every worker plays beforehand."""
+"""Estimate of time and space of a dataset, from three scenes that every worker plays beforehand."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is left of a dataset takes.
+    """Time and space that what is left of a dataset takes.
 
     Example:
         >>> trial = Trial(5.0, scenes=(1, 3), wall_s=(1.0, 2.0), bytes=(100_000, 300_000))
@@ -77,7 +77,7 @@ def estimate(trials: Sequence[Trial], episodes: int, scenes: int) -> Estimate:
 
 
 def _extrapolated(scenes: Sequence[int], values: Sequence[float], wanted: int) -> float:
-    """What an episode of so many scenes takes: a part for the episode, and one for each scene."""
+    """Extrapolate to an episode of so many scenes: a part for the episode, and one for each scene."""
     low, high = min(scenes), max(scenes)
     at_low = fmean(value for count, value in zip(scenes, values, strict=True) if count == low)
     if low == high:

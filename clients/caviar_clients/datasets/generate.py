@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
-from caviar_clients.datasets.catalogue import Catalogue, fingerprint
+from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.cluster import Episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeResult, EpisodeTask
@@ -18,9 +18,16 @@ from caviar_clients.datasets.estimate import Estimate, check_disk, check_least, 
 from caviar_clients.datasets.ledger import Ledger, MissingEpisodes
 from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset, is_address
+from caviar_clients.datasets.settings import fingerprint
 from caviar_clients.datasets.texts import counted
-from caviar_clients.datasets.traffic import SharedTraffic
+from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.scenario import Scenario
+from caviar_protocol.scenario.conversion import convert_settings
+from caviar_services.registry import load
+from caviar_services.service import RunInfo
+from caviar_services.world.sumo import SumoWorld
+from caviar_services.world.sumo_process import TrafficStates
 
 MOST_EPISODES = 10**18 - 1
 """That a catalogue can number."""
@@ -33,13 +40,13 @@ class Observer(Protocol):
         """A line for the user."""
 
     def traffic(self, now_s: float, end_s: float) -> None:
-        """How far the pass through the traffic has come [s]."""
+        """Take the progress of the pass through the traffic [s]."""
 
     def tried(self, done: int, of: int) -> None:
-        """How many workers have played their scenes for the estimate."""
+        """Take the number of workers that have played their scenes for the estimate."""
 
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
-        """What the episodes that are left take, and what is free on the disk [B]; None: of an address."""
+        """Take the estimate of what is left, and the free space of the disk [B]; None: of an address."""
 
     def returned(self) -> None:
         """A scheduler that was lost is there again: what is measured of time begins anew."""
@@ -50,7 +57,7 @@ class Observer(Protocol):
 
 @dataclass
 class Outcome:
-    """How a generation ended."""
+    """Outcome of a generation."""
 
     episodes: int = 0
     """That were played by it."""
@@ -222,3 +229,55 @@ def _estimate(
     found = estimate(good, len(left), plan.scenes)
     free = check_disk(ledger.directory.path, found.bytes) if ledger.remote is None else None
     observer.estimated(found, free, len(left), episodes.workers)
+
+
+# --- traffic ------------------------------------------------------------------------------------------------
+
+
+class SharedTraffic:
+    """The traffic that all episodes of a scenario share; none where each has its own.
+
+    Its states are saved once, before the first episode, and travel with the episodes.
+
+    Args:
+        scenario: Of the episodes.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._states = list(_shared(scenario))
+
+    def save(self, episodes: int, progress: Callable[[float, float], None] = lambda *_: None) -> None:
+        """Save the states that episodes begin from, where one is not there.
+
+        Args:
+            episodes: Their number.
+            progress: Called now and then with SUMO's time [s], and with that at which the pass ends.
+
+        Raises:
+            RunError: They cannot be saved.
+        """
+        for states in self._states:
+            if states.missing(episodes):
+                states.make(episodes, progress)
+
+    def states_of(self, episode: int) -> dict[str, bytes]:
+        """Read the saved states from which an episode begins.
+
+        Args:
+            episode: Its number.
+
+        Returns:
+            Their content, by the name of the file in the cache; empty where each episode has its own traffic.
+        """
+        files = (states.file(episode) for states in self._states)
+        return {file.relative_to(default_folder()).as_posix(): file.read_bytes() for file in files}
+
+
+def _shared(scenario: Scenario) -> Iterator[TrafficStates]:
+    for name, spec in scenario.services.items():
+        if spec.role != "world" or spec.remote or not issubclass(cls := load(spec.role, spec.use), SumoWorld):
+            continue
+        settings = convert_settings(cls.Settings, spec.settings)
+        run = RunInfo(name=name, sampling_period_ns=scenario.run.sampling_period_ns)
+        if (states := cls(settings, run).traffic_states(scenario.run.seed)) is not None:
+            yield states

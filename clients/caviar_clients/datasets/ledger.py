@@ -1,4 +1,4 @@
-"""What is there of a dataset: its catalogue against its recordings, before more is played.
+"""Ledger of a dataset: its catalogue against its recordings, before more is played.
 
 The catalogue may be lost, or know of less than there is after a kill: recordings tell what they are, and are
 listed anew. One that is damaged is refused by name, and nothing is removed but by the user.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,13 +16,13 @@ from typing import Any
 
 import msgspec
 
-from caviar_clients.datasets.catalogue import Catalogue, fingerprint
-from caviar_clients.datasets.differences import refusal
+from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
 from caviar_clients.datasets.episode import MEASURED, SETTINGS
 from caviar_clients.datasets.plan import DatasetPlan
 from caviar_clients.datasets.remote import RemoteDataset
-from caviar_clients.datasets.rows import rows_of
+from caviar_clients.datasets.rows import rows_of, whole_recording
+from caviar_clients.datasets.settings import fingerprint, refusal
 from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.recording import Recording
@@ -35,7 +34,7 @@ SHOWN = 3
 
 
 class _Measured(msgspec.Struct):
-    """What stands beside a recording (`episode.MEASURED`), as far as the catalogue has columns for it."""
+    """File beside a recording (`episode.MEASURED`), as far as the catalogue has columns for it."""
 
     settings: str = ""
     started: str | None = None
@@ -79,7 +78,7 @@ class MissingEpisodes(Sequence[int]):
 
 @dataclass(frozen=True)
 class Ledger:
-    """What is there of a dataset, and where.
+    """Recordings and catalogue of a dataset, and their place.
 
     Args:
         plan: What shall be there.
@@ -99,7 +98,7 @@ class Ledger:
 
     @property
     def began(self) -> bool:
-        """Whether anything of the dataset is there, so that its catalogue is worth keeping."""
+        """True where anything of the dataset is there, so that its catalogue is worth keeping."""
         return any((self.catalogue.settings, self.catalogue.episodes(), self.catalogue.failures()))
 
     @property
@@ -194,10 +193,7 @@ class Ledger:
             self.remote.fetch_episode(number, self.directory)
         folder = self.directory.episode(number)
         try:
-            with warnings.catch_warnings(action="ignore"):  # of damage, which is told below
-                recording = Recording(folder)
-            if recording.damage or not recording.complete:
-                raise RecordingError(recording.damage[0] if recording.damage else f"{folder} breaks off")
+            recording = whole_recording(lambda: Recording(folder))
             rows = rows_of(recording)
             if rows.episode[0] != number:
                 raise RunError(
@@ -243,7 +239,7 @@ def _with_defaults(made_from: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _measured(folder: Path) -> _Measured:
-    """What stands beside a recording; empty where it cannot be read, since nothing follows from it."""
+    """Read the file beside a recording; empty where it cannot be read, since nothing follows from it."""
     try:
         return msgspec.json.decode((folder / MEASURED).read_bytes(), type=_Measured)
     except (OSError, msgspec.MsgspecError):

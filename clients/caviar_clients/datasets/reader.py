@@ -92,7 +92,7 @@ class Dataset:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """How it was made: ``scenario``, ``versions``, ``device``, digests of ``files``."""
+        """Settings that it was made with: ``scenario``, ``versions``, ``device``, digests of ``files``."""
         return self._catalogue.settings
 
     @property
@@ -185,7 +185,7 @@ class Dataset:
             raise RecordingError(f"there is no table {name!r}; {suggestion(name, TABLES)}")
         cls, _ = TABLES[name]
         names, rows = self._catalogue.table(name)
-        columns = Columns.of(cls, names, rows)
+        columns = Columns.of_rows(cls, names, rows)
         wanted = np.isin(columns["episode"], self.episodes)
         return columns if wanted.all() else columns.where(wanted)
 

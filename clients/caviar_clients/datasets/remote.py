@@ -20,8 +20,9 @@ from pathlib import Path
 
 import msgspec
 
-from caviar_clients.datasets.catalogue import Catalogue, fingerprint
+from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, rename_unless_there
+from caviar_clients.datasets.settings import fingerprint
 from caviar_protocol.assets import default_folder
 from caviar_protocol.errors import RecordingError, RunError, SetupError
 from caviar_protocol.host import install_command
@@ -40,7 +41,7 @@ _ALMOST = re.compile(
 
 
 def is_address(location: str | Path) -> bool:
-    """Whether a location of a dataset is an address, not a folder.
+    """Check whether a location of a dataset is an address, not a folder.
 
     Raises:
         RunError: It is empty, or an address that lacks a colon or a slash; has the intended form.

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
+from caviar_protocol.multipath import delay_spread
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.recording.integrity import declared_digest
 from caviar_protocol.space.scene import antennas, device_pose
@@ -128,7 +131,7 @@ SCENE_COLUMNS = {
 
 @dataclass(frozen=True)
 class ProductRow:
-    """What a service made for one instant."""
+    """Product of a service for one instant."""
 
     episode: int
     scene: int
@@ -148,6 +151,38 @@ class EpisodeRows:
     scenes: tuple[tuple[Any, ...], ...]
     users: tuple[tuple[Any, ...], ...]
     products: tuple[tuple[Any, ...], ...]
+
+
+def column_types(row: type[Any]) -> dict[str, tuple[type[Any], bool]]:
+    """Find the type of each column of a table, and whether it may lack a value.
+
+    Args:
+        row: Class whose fields are the columns.
+
+    Example:
+        >>> column_types(UserRow)["x_m"]
+        (<class 'float'>, True)
+    """
+    hints = get_type_hints(row).items()
+    return {n: (get_args(h)[0], True) if isinstance(h, UnionType) else (h, False) for n, h in hints}
+
+
+def whole_recording(opened: Callable[[], Recording], *, with_digests: bool = False) -> Recording:
+    """Open a recording that is neither damaged nor broken off.
+
+    Args:
+        opened: Opens it.
+        with_digests: Whether every byte is compared with its digest.
+
+    Raises:
+        RecordingError: It is damaged or breaks off; says where.
+    """
+    with warnings.catch_warnings(action="ignore"):  # of damage, which is the error
+        recording = opened()
+    damage = [*recording.damage, *(recording.run_digest().damage if with_digests else ())]
+    if damage or not recording.complete:
+        raise RecordingError(damage[0] if damage else f"{recording.path} breaks off")
+    return recording
 
 
 def rows_of(recording: Recording) -> EpisodeRows:
@@ -272,9 +307,7 @@ def _profile(a: Any, tau: Any) -> tuple[float | None, float | None, float | None
     total = float(power.sum())
     if not total:
         return None, None, None
-    mean = float((power * tau).sum()) / total
-    spread = math.sqrt(float((power * (tau - mean) ** 2).sum()) / total)
-    return 10.0 * math.log10(total), float(tau.min()), spread
+    return 10.0 * math.log10(total), float(tau.min()), float(delay_spread(a, tau))
 
 
 def _best_pair(

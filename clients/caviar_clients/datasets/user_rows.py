@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib.util
 import random
 from collections.abc import Iterator, Mapping, Sequence
-from types import UnionType
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_clients.datasets.rows import USER_COLUMNS
+from caviar_clients.datasets.rows import USER_COLUMNS, column_types
 from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, SetupError, suggestion
 from caviar_protocol.host import install_command
@@ -48,7 +47,7 @@ class Columns(Mapping[str, NDArray[Any]]):
         self._columns = dict(columns)
 
     @classmethod
-    def of(cls, row: type[Any], names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Columns:
+    def of_rows(cls, row: type[Any], names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Columns:
         """Make columns of the rows of a database.
 
         Args:
@@ -56,12 +55,11 @@ class Columns(Mapping[str, NDArray[Any]]):
             names: Of the columns, in the order of the values.
             rows: Values.
         """
-        hints = get_type_hints(row)
+        types = column_types(row)
         values = list(zip(*rows, strict=True)) if rows else [()] * len(names)
         found = {}
         for name, column in zip(names, values, strict=True):
-            optional = isinstance(hints[name], UnionType)
-            kind = get_args(hints[name])[0] if optional else hints[name]
+            kind, optional = types[name]
             given = [_NONE[kind] if value is None else value for value in column] if optional else column
             found[name] = np.array(given, dtype=_DTYPES[kind])
         return cls(found)

@@ -6,8 +6,8 @@
   (`caviar_clients.learning.recorded`);
 * ``caviar/UavPath-v1``: a flight to a goal, or to addresses in any order, in reach of the radio, with a
   reward of comparable parts (`uav_path`);
-* ``caviar/RadioStrike-v0``: a user and a beam in each slot, as in the ITU challenge of 2021
-  (`radio_strike`), also many of them computed together (`radio_strike.vector_env.RadioStrikeVectorEnv`).
+* ``caviar/RadioStrike-v0``: a user and a beam in each slot, as in the ITU challenge of 2021, single and many
+  together (`caviar_labs.radio_strike`, which plays without a run).
 
 `pair.UavPairEnv` is one of PettingZoo: one agent flies, another one chooses the beams.
 
@@ -30,6 +30,6 @@ gymnasium.register(
 gymnasium.register("caviar/UavPath-v1", "caviar_clients.envs.uav_path:UavPathEnv")
 gymnasium.register(
     "caviar/RadioStrike-v0",
-    "caviar_clients.envs.radio_strike.env:RadioStrikeEnv",
-    vector_entry_point="caviar_clients.envs.radio_strike.vector_env:RadioStrikeVectorEnv",
+    "caviar_labs.radio_strike.env:RadioStrikeEnv",
+    vector_entry_point="caviar_labs.radio_strike.vector_env:RadioStrikeVectorEnv",
 )

@@ -15,13 +15,11 @@ import gymnasium
 
 from caviar_clients.envs.arguments import checked_path
 from caviar_clients.envs.base import BeamSelectionEnv, Observation, SessionEnv
-from caviar_clients.envs.flight import MOTION
-from caviar_clients.envs.uav_path import UavPathEnv
-from caviar_clients.session.base import Session
-from caviar_clients.session.checks import checked_scenario
-from caviar_clients.session.connected import open_session
+from caviar_clients.envs.uav_path import MOTION, UavPathEnv
+from caviar_clients.session.prepared import PreparedScenario, prepare
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError, suggestion
 from caviar_protocol.host import install_command
+from caviar_protocol.messages import Input
 from caviar_protocol.scenario import Scenario
 
 try:
@@ -81,12 +79,13 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
         directory: str | Path | None = None,
         render_mode: str | None = None,
     ) -> None:
-        pilot, beams = _roles(checked_scenario(checked_path("scenario", scenario)), pilot, beams)
+        prepared = prepare(checked_path("scenario", scenario))
+        pilot, beams = _roles(prepared.scenario, pilot, beams)
         _check_options("selection", selection, BeamSelectionEnv)
         _check_options("flight", flight, UavPathEnv)
         at = {"broker": broker, "directory": directory, "render_mode": render_mode}
-        self._selection = BeamSelectionEnv(scenario, agent=beams, **(selection or {}))
-        self._pilot = _Pilot(scenario, self._selection, agent=pilot, **{**(flight or {}), **at})
+        self._selection = BeamSelectionEnv(prepared, agent=beams, **(selection or {}))
+        self._pilot = _Pilot(prepared, self._selection, agent=pilot, **{**(flight or {}), **at})
         self.possible_agents = [pilot, beams]
         self.agents: list[str] = []
         self.render_mode = render_mode
@@ -172,23 +171,14 @@ class UavPairEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]  # i
 class _Pilot(UavPathEnv):
     """The pilot's environment, whose session takes the other agent's place too."""
 
-    def __init__(self, scenario: str | Path, selection: BeamSelectionEnv, **options: Any) -> None:
+    def __init__(self, scenario: PreparedScenario, selection: BeamSelectionEnv, **options: Any) -> None:
         super().__init__(scenario, **options)
-        self._selection = selection
+        self._selection, self._beside = selection, (selection.agent,)
 
-    def _open(self) -> Session:
-        inputs = {entry.topic: entry for entry in (*self._selection.inputs(), *self.inputs())}
-        return open_session(
-            self.scenario,
-            self.agent,
-            tuple(inputs.values()),
-            self._broker,
-            self._directory,
-            self._credentials,
-            with_scenery=True,
-            beside=(self._selection.agent,),
-            connect_timeout_s=self._connect_timeout_s,
-        )
+    def inputs(self) -> tuple[Input, ...]:
+        """Give what both agents consume."""
+        by_topic = {entry.topic: entry for entry in (*self._selection.inputs(), *super().inputs())}
+        return tuple(by_topic.values())
 
 
 def _check_options(name: str, given: object, environment: type[SessionEnv[Any]]) -> None:

@@ -14,15 +14,133 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_names
-from caviar_clients.envs.base import Moment, Observation
-from caviar_clients.envs.deliveries import MOST_ADDRESSES, Box, Deliveries, greatest_power, rotary_wing_power
-from caviar_clients.envs.flight import FlightEnv, point
-from caviar_clients.session.checks import TRIES, Airspace
+from caviar_clients.envs.base import Moment, Observation, SessionEnv
+from caviar_clients.envs.deliveries import (
+    MOST_ADDRESSES,
+    TRIES,
+    Airspace,
+    Box,
+    Deliveries,
+    greatest_power,
+    rotary_wing_power,
+)
+from caviar_clients.session.prepared import PreparedScenario
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.errors import PayloadError, RunError, ScenarioError
+from caviar_protocol.scenario.schema import owned_by
 from caviar_protocol.seeding import generator
+from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.coordinates import Vector
-from caviar_protocol.topics import Action, Link, WaypointCommand
+from caviar_protocol.space.scene import directions
+from caviar_protocol.topics import Action, BeamChoice, Link, VelocityCommand, WaypointCommand
+from caviar_protocol.topics.link import Command
+
+MOTION = "motion:"
+ROUNDING = 1e-6
+"""Beyond ±1 an action is taken so far: float32 rounds."""
+
+
+class FlightEnv(SessionEnv[NDArray[np.float32]]):
+    """Trajectory control in the loop (contract, clause 3; world ``flight``).
+
+    The action is a velocity over the object's greatest speed, in world axes, Shape ``[3]``, each within
+    ±1; one longer than 1, as the corners of that box are, is shortened to 1. The world bounds acceleration
+    too, and keeps the object clear of buildings. Beams of receivers that the agent owns beside the motion
+    point along the straight line.
+
+    Args:
+        scenario: Scenario file, or the name of a scenario that ships.
+        vehicle: Name of the flown object; None: the only one.
+        options: The other arguments of `SessionEnv`.
+
+    Raises:
+        ScenarioError: The scenario has no such object, or the agent does not own its motion.
+    """
+
+    def __init__(self, scenario: str | Path | PreparedScenario, vehicle: str | None, **options: Any) -> None:
+        super().__init__(scenario, **options)
+        self.vehicle, self._flown = self._flown_object(vehicle)
+        self._max_speed = float(self._flown["max_speed_m_s"])
+        self._steered = self._receivers_of_agent()
+        self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+    def _flown_object(self, vehicle: str | None) -> tuple[str, dict[str, Any]]:
+        """Name of the object in the run, and its settings."""
+        # Of several worlds each has a prefix for the names of its objects.
+        worlds = [spec.settings for spec in self.scenario.services.values() if spec.role == "world"]
+        found = {
+            str(settings.get("prefix") or "") + thing["name"]: thing
+            for settings in worlds
+            for thing in settings.get("flown", ())
+        }
+        names = ", ".join(found) or "none; use a world 'flight' with [[services.<world>.settings.flown]]"
+        if vehicle is None and len(found) == 1:
+            vehicle = next(iter(found))
+        if vehicle is None or vehicle not in found:
+            raise ScenarioError(f"vehicle={vehicle!r} is no flown object of the scenario; there are: {names}")
+        return vehicle, found[vehicle]
+
+    def _receivers_of_agent(self) -> tuple[str, ...]:
+        """Patterns of the receivers whose beams the agent owns."""
+        # Without `users` an agent owns every actuator of the run (contract, clause 17).
+        users = self.scenario.services[self.agent].users or ("*",)
+        if users != ("*",) and not owned_by(
+            (u for u in users if u.startswith(MOTION)), MOTION + self.vehicle
+        ):
+            raise ScenarioError(
+                f"agent {self.agent!r} owns {', '.join(users)}; add 'motion:{self.vehicle}' to its users"
+            )
+        return tuple(text.removeprefix("beam:") for text in users if not text.startswith(MOTION))
+
+    def _commands(self, action: NDArray[np.float32], moment: Moment) -> Sequence[Command]:
+        share = point(action)
+        if share is None or max(map(abs, share)) > 1.0 + ROUNDING:
+            text = " ".join(repr(action).split())
+            raise PayloadError(
+                f"the action is {text}; write three numbers within -1 and 1: the velocity east, north and up "
+                f"over {self._max_speed:g} m/s"
+            )
+        x, y, z = share
+        # The corners of the box of actions are √3 long; the object flies at its greatest speed there.
+        speed = self._max_speed / max(1.0, math.hypot(x, y, z))
+        flight = VelocityCommand(object=self.vehicle, velocity=(x * speed, y * speed, z * speed))
+        return [*self._beams(moment), flight]
+
+    def _beams(self, moment: Moment) -> list[BeamChoice]:
+        """Beams along the straight line, of the receivers that the agent owns."""
+        pairs = [pair for _, pair in moment.users if owned_by(self._steered, pair.rx.name)]
+        at_tx, at_rx = directions(moment.scene, pairs)
+        choices = []
+        for pair, towards_rx, towards_tx in zip(pairs, at_tx, at_rx, strict=True):
+            tx_beam, rx_beam = straight_beams(pair.tx.array, towards_rx, pair.rx.array, towards_tx)
+            choices.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
+        return sorted(choices, key=lambda choice: (choice.rx, choice.tx))
+
+    def _position(self, moment: Moment) -> NDArray[np.float64]:
+        """Position of the object [m], Shape ``[3]``."""
+        position: NDArray[np.float64] = moment.scene.position[moment.scene.names.index(self.vehicle)]
+        return position
+
+
+def point(numbers: Any) -> Vector | None:
+    """Read a point, or another vector of three numbers.
+
+    Returns:
+        Three finite numbers; None where it is something else.
+
+    Example:
+        >>> point([1, 2, 3.5]), point("here")
+        ((1.0, 2.0, 3.5), None)
+    """
+    try:
+        found = np.asarray(numbers, np.float64)
+    except (TypeError, ValueError):
+        return None
+    if found.shape != (3,) or not np.isfinite(found).all():
+        return None
+    x, y, z = found.tolist()
+    return x, y, z
+
 
 OWN_PARTS = ("position", "velocity", "goal", "rate", "outage")
 """What is always observed."""
@@ -37,7 +155,7 @@ _MARGIN = 0.01
 
 
 class Weights(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What each part of the reward counts, from 0 on."""
+    """Weights of the parts of the reward, from 0 on."""
 
     progress: float = 1.0
     radio: float = 1.0
@@ -144,7 +262,7 @@ class UavPathEnv(FlightEnv):
 
     def __init__(
         self,
-        scenario: str | Path = "uav-path",
+        scenario: str | Path | PreparedScenario = "uav-path",
         vehicle: str | None = None,
         reach_m: float = 5.0,
         box_m: tuple[Sequence[float], Sequence[float]] | None = None,
@@ -168,11 +286,17 @@ class UavPathEnv(FlightEnv):
         self._weights = _weights(weights or {})
         self._reach = _positive("reach_m", reach_m)
         self._efficiency = _positive("efficiency_bit_s_hz", efficiency_bit_s_hz)
-        self._outage_snr = _decibels("outage_snr_db", outage_snr_db)
+        if not (_is_number(outage_snr_db) and abs(outage_snr_db) <= GREATEST_DB):
+            limits = f"write a number from -{GREATEST_DB:g} to {GREATEST_DB:g} [dB]"
+            raise ScenarioError(f"outage_snr_db={outage_snr_db!r}; {limits}")
+        self._outage_snr = float(10 ** (outage_snr_db / 10))
         self._low, self._high = self._bounds()
         self._drawn_in = (self._low, self._high) if box_m is None else self._box(box_m)
         self._step_way = self._max_speed * self.scenario.run.sampling_period_ns / 1e9
-        self._count = _count(deliveries)
+        if type(deliveries) is not int or not 0 <= deliveries <= MOST_ADDRESSES:
+            limits = f"write a whole number from 0 to {MOST_ADDRESSES}"
+            raise ScenarioError(f"deliveries={deliveries!r}; {limits}")
+        self._count = deliveries
         self._no_fly = _boxes(no_fly_m)
         self._greatest_power = greatest_power(self._max_speed)
         self._distance = self._distances(distance_m)
@@ -203,13 +327,8 @@ class UavPathEnv(FlightEnv):
         return low, high
 
     def _box(self, box_m: tuple[Sequence[float], Sequence[float]]) -> tuple[Vector, Vector]:
-        corners = [point(corner) for corner in box_m] if isinstance(box_m, Sequence) else []
-        low, high = corners if len(corners) == 2 else (None, None)
-        if (
-            low is None
-            or high is None
-            or not all(a <= x <= y <= b for a, x, y, b in zip(self._low, low, high, self._high, strict=True))
-        ):
+        low, high = _corners(box_m) or (self._high, self._low)
+        if not all(a <= x <= y <= b for a, x, y, b in zip(self._low, low, high, self._high, strict=True)):
             raise ScenarioError(
                 f"box_m={box_m!r} is no box within {list(self._low)} and {list(self._high)}; write its "
                 "lowest and its highest corner, x, y, z [m] each"
@@ -377,16 +496,19 @@ class UavPathEnv(FlightEnv):
         own = {
             "position": 2 * (position - low) / size - 1,
             "velocity": moment.scene.velocity[index] / self._max_speed,
-            "goal": self._way(self._first_address(position), position) / size,
+            "goal": (np.asarray(self._first_address(position)) - position) / size,
         }
         deliveries = self._episode_deliveries
         if self._count:
             ways = [
-                np.zeros(3) if done else self._way(address, position) / size
+                np.zeros(3) if done else (np.asarray(address) - position) / size
                 for address, done in zip(deliveries.addresses, deliveries.delivered, strict=True)
             ]
             own["addresses"], own["delivered"] = np.array(ways), np.array(deliveries.delivered, np.float64)
-        found: Observation = {name: _clipped(values) for name, values in own.items()}
+        # Within ±1: rounding puts what is at a bound beyond it.
+        found: Observation = {
+            name: np.clip(values, -1.0, 1.0).astype(np.float32) for name, values in own.items()
+        }
         found["rate"], found["outage"] = (np.array([value], np.float32) for value in (efficiency, outage))
         return {**found, **super()._observation(moment)}
 
@@ -395,10 +517,6 @@ class UavPathEnv(FlightEnv):
         x, y, z = position.tolist()
         first = self._episode_deliveries.next_address((x, y, z))
         return self._episode_deliveries.addresses[-1] if first is None else first
-
-    def _way(self, address: Vector, position: Float64Array) -> Float64Array:
-        way: Float64Array = np.asarray(address) - position
-        return way
 
     def _info(self, moment: Moment) -> dict[str, Any]:
         known = super()._info(moment)
@@ -413,13 +531,8 @@ class UavPathEnv(FlightEnv):
         return known
 
 
-def _clipped(values: Float64Array) -> NDArray[np.float32]:
-    """Within ±1: rounding puts what is at a bound beyond it."""
-    return np.clip(values, -1.0, 1.0).astype(np.float32)
-
-
 def _is_number(value: object) -> bool:
-    """Whether it is a finite number. NaN compares false with everything: a range alone would let it pass."""
+    """Tell whether it is a finite number: NaN compares false with everything, and would pass a range."""
     return isinstance(value, numbers.Real) and math.isfinite(value)
 
 
@@ -429,30 +542,22 @@ def _positive(name: str, value: float) -> float:
     return float(value)
 
 
-def _count(deliveries: int) -> int:
-    if type(deliveries) is not int or not 0 <= deliveries <= MOST_ADDRESSES:
-        raise ScenarioError(f"deliveries={deliveries!r}; write a whole number from 0 to {MOST_ADDRESSES}")
-    return deliveries
+def _corners(given: object) -> tuple[Vector, Vector] | None:
+    """Read two points; None where it is something else."""
+    low, high = map(point, given) if isinstance(given, Sequence) and len(given) == 2 else (None, None)
+    return None if low is None or high is None else (low, high)
 
 
 def _boxes(no_fly_m: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[Box, ...]:
     found = []
     for given in no_fly_m:
-        corners = [point(corner) for corner in given] if isinstance(given, Sequence) else []
-        low, high = corners if len(corners) == 2 else (None, None)
-        if low is None or high is None or not all(a < b for a, b in zip(low, high, strict=True)):
+        corners = _corners(given)
+        if corners is None or not all(a < b for a, b in zip(*corners, strict=True)):
             raise ScenarioError(
                 f"no_fly_m has {given!r}; write the lowest and the highest corner of a box, x, y, z [m] each"
             )
-        found.append(Box(low, high))
+        found.append(Box(*corners))
     return tuple(found)
-
-
-def _decibels(name: str, value: float) -> float:
-    """A ratio that is given in dB, as a number."""
-    if not (_is_number(value) and abs(value) <= GREATEST_DB):
-        raise ScenarioError(f"{name}={value!r}; write a number from -{GREATEST_DB:g} to {GREATEST_DB:g} [dB]")
-    return float(10 ** (value / 10))
 
 
 def _weights(given: Mapping[str, float]) -> Weights:

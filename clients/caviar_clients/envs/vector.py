@@ -12,8 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from caviar_clients.envs.arguments import checked_members, checked_seeds, whole_numbers
-from caviar_clients.envs.base import BeamSelectionEnv, Observation
-from caviar_clients.envs.rewards import RewardKind, link_info
+from caviar_clients.envs.base import BeamSelectionEnv, Observation, RewardKind, link_info
 from caviar_clients.session.batch import REMEDY, BatchLink, BatchSession, MemberSeed, check_batch
 from caviar_protocol import observations
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, Payload
@@ -92,7 +91,7 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
         single = self.single = BeamSelectionEnv(
             scenario, agent=agent, users=users, observe=observe, reward=reward
         )
-        check_batch(single.scenario, single.agent)
+        check_batch(single.prepared, single.agent)
         if single.observer.inputs:
             topics = ", ".join(sorted({entry.topic for entry in single.observer.inputs}))
             raise ScenarioError(
@@ -135,8 +134,7 @@ class BeamSelectionVectorEnv(VectorEnv[Observation, Actions, NDArray[Any]]):
         if options:
             raise ScenarioError(f"no options of reset are called {sorted(options)}; there are none")
         if self._session is None:
-            scenario, agent = self.single.scenario, self.single.agent
-            self._session = BatchSession(scenario, agent, self.num_envs)
+            self._session = BatchSession(self.single.prepared, self.single.agent, self.num_envs)
             self.closed = False
         self._members = members
         return self._begin(self._session)

@@ -23,9 +23,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from caviar_clients.files import writing
-from caviar_clients.learning.checkpoints import newest_checkpoint
+from caviar_clients.learning.checkpoints import locked, newest_checkpoint
 from caviar_clients.learning.experiment import Experiment
-from caviar_clients.learning.lock import locked
 from caviar_clients.learning.training import (
     CHECKPOINTS,
     Progress,
@@ -43,8 +42,6 @@ RECORD = "experiment.json"
 _LOCK = "lock"
 _GOODBYE_S = 5.0
 
-Report = Callable[[Progress], None]
-
 
 class _Record(msgspec.Struct, frozen=True):
     digest: str
@@ -55,7 +52,7 @@ def train_experiment(
     experiment: Experiment,
     root: Path,
     jobs: int = 1,
-    report: Report = lambda progress: None,
+    report: Callable[[Progress], None] = lambda progress: None,
 ) -> list[SeedResult]:
     """Train all seeds of an experiment, or go on with those that are left.
 
@@ -300,7 +297,7 @@ def _start(training: _Training) -> tuple[Connection, Any]:
     return pipe, process
 
 
-def _take(pipe: Connection, report: Report) -> bool:
+def _take(pipe: Connection, report: Callable[[Progress], None]) -> bool:
     """Take what a process says; False: it has ended."""
     try:
         said = pipe.recv()

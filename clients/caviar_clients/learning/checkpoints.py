@@ -1,4 +1,5 @@
-"""Checkpoints of a training: model, optimizer and replay buffer, each a folder that is there whole or not.
+"""Checkpoints of a training: model, optimizer and replay buffer, each a folder that is there whole or not;
+and its lock, which one process holds until it ends, however it ends.
 
 Numbers and arrays alone, which are read without running what a file says; a model saved by Stable-Baselines3
 has pickled objects.
@@ -9,10 +10,15 @@ before is removed. A process that dies in the middle leaves a folder ``….parti
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
+import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import msgspec
 import numpy as np
@@ -106,7 +112,7 @@ def load_checkpoint(path: Path, model: Any) -> Any:
 
 
 def _numbers(model: Any) -> dict[str, Any]:
-    """What a model counts, beside weights and arrays."""
+    """Numbers that a model counts, beside weights and arrays."""
     found = {name: value for name, value in vars(model).items() if type(value) in (int, float, bool)}
     episodes = [{name: float(value) for name, value in one.items()} for one in model.ep_info_buffer or ()]
     return {**found, "ep_info_buffer": episodes}
@@ -136,3 +142,54 @@ def _fill(buffer: Any, content: Any) -> None:
     for name, array in _arrays(buffer).items():
         saved = content[name]
         array[: len(saved)] = saved
+
+
+@contextmanager
+def locked(file: Path, what: str, patience_s: float = 0.0) -> Iterator[None]:
+    """Keep other processes from training the same; the lock ends with the process, however it ends.
+
+    Args:
+        file: Of the lock; it is made, with the folders to it.
+        what: Is trained, as the error's subject.
+        patience_s: How long the process before may take to its end.
+
+    Raises:
+        RunError: Another process trains it, or the disk refuses.
+    """
+    while True:
+        with writing(file):
+            stream = file.open("a+")
+        with stream:
+            _lock(stream, what, patience_s)
+            if not _is_still_at(file, stream):  # the process before has removed the folder that it had made
+                continue
+            stream.truncate(0)
+            stream.write(str(os.getpid()))
+            stream.flush()
+            yield
+            return
+
+
+def _is_still_at(file: Path, stream: IO[str]) -> bool:
+    try:
+        return os.path.samestat(file.stat(), os.fstat(stream.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def _lock(stream: IO[str], what: str, patience_s: float) -> None:
+    until = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            # A child whose parent was killed ends at its next report.
+            if time.monotonic() > until:
+                stream.seek(0)
+                holder = stream.read() or "that has just begun"
+                raise RunError(
+                    f"{what} is being trained by process {holder}; wait for it, or end it"
+                ) from None
+            time.sleep(0.05)
+        else:
+            return

@@ -35,7 +35,7 @@ class Player(Protocol):
 
     @property
     def inputs(self) -> Iterable[Input]:
-        """What it consumes."""
+        """Topics that it consumes."""
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Begin an episode."""
@@ -133,8 +133,8 @@ class PolicyPlayer:
 
 
 @dataclass(frozen=True)
-class Played:
-    """What became of an agent's choices in an episode, by user and frame; users without a path are left out.
+class EpisodeScore:
+    """Score of an agent's choices in an episode, by user and frame; users without a path are left out.
     Shape ``[N]`` each."""
 
     abs_y: Float64Array
@@ -151,8 +151,8 @@ class Played:
     station: tuple[str, ...]
     """Transmitter and carrier of each, as ``lamp on mm``."""
 
-    def of(self, kind: str) -> BoolArray:
-        """Which of them are of a kind: ``all``, ``LOS``, ``NLOS``, or of a station."""
+    def mask(self, kind: str) -> BoolArray:
+        """Mask of those of a kind: ``all``, ``LOS``, ``NLOS``, or of a station."""
         if kind == "all":
             return np.ones(len(self.los), np.bool_)
         if kind in self.station:
@@ -178,7 +178,7 @@ class Contest:
     """Agents that play the same episodes.
 
     Args:
-        scenario: Checked, as `caviar_clients.session.checks.checked_scenario` returns it. The agents take the
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` checks it. The agents take the
             place of one of its own.
         players: By name.
         users: Receivers that count, as names with ``*`` and ``?``.
@@ -189,8 +189,8 @@ class Contest:
         ScenarioError: The scenario has no such agent, or no link, or several.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> scenario = checked_scenario("geometric", frames=20)
+        >>> from caviar_clients.session.prepared import prepare
+        >>> scenario = prepare("geometric", frames=20).scenario
         >>> agents = {name: made_player(scenario, name) for name in ("random", "oracle")}
         >>> with Contest(scenario, agents) as contest:
         ...     found = contest.play(seed=1)
@@ -233,7 +233,7 @@ class Contest:
         """End the run."""
         self._session.close()
 
-    def play(self, seed: int | None) -> dict[str, Played]:
+    def play(self, seed: int | None) -> dict[str, EpisodeScore]:
         """Play an episode.
 
         Args:
@@ -253,7 +253,7 @@ class Contest:
             for seat in self._seats.values():
                 self._decide(seat, frame, served)
             frame = self._session.step({"action": nothing})
-        return {name: _played(seat) for name, seat in self._seats.items()}
+        return {name: _scored(seat) for name, seat in self._seats.items()}
 
     def _decide(self, seat: _Seat, frame: Frame, served: set[tuple[str, str]]) -> None:
         """Have an agent choose, and its link score that."""
@@ -292,14 +292,14 @@ class Contest:
         seat.pilots.append(made.counts.get(PILOTS, 0))
 
 
-def _played(seat: _Seat) -> Played:
-    found = np.concatenate(seat.rows)
-    return Played(
-        abs_y=found[:, 0],
-        straight=found[:, 1],
-        best=found[:, 2],
-        los=found[:, 3] > 0,
-        net_efficiency=found[:, 4],
+def _scored(seat: _Seat) -> EpisodeScore:
+    abs_y, straight, best, los, net_efficiency = np.concatenate(seat.rows).T
+    return EpisodeScore(
+        abs_y=abs_y,
+        straight=straight,
+        best=best,
+        los=los > 0,
+        net_efficiency=net_efficiency,
         pilots=float(np.mean(seat.pilots)),
         station=tuple(seat.stations),
     )

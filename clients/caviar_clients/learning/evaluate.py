@@ -14,8 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.learning.contest import Contest, Played, Player, PolicyPlayer, episodes_of, made_player
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.learning.contest import (
+    Contest,
+    EpisodeScore,
+    Player,
+    PolicyPlayer,
+    episodes_of,
+    made_player,
+)
+from caviar_clients.session.prepared import prepare
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_services.agent.policy import PolicyModel
@@ -88,7 +95,7 @@ def student_95(degrees: int) -> float:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured, by method: those of `METHODS`, and the agents that were compared with."""
+    """Measured figures by method: those of `METHODS`, and the agents that were compared with."""
 
     policy: str
     scenario: str
@@ -156,7 +163,7 @@ def evaluate(
                 f"{name!r} is compared with as it is, without {', '.join(settings)}; name another agent"
             )
     model = PolicyModel(file, called)
-    known = checked_scenario(Path(scenario))
+    known = prepare(Path(scenario)).scenario
     served = (users,) if isinstance(users, str) else tuple(users)
     players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, called)}
     for name, use in _AGENTS.items():
@@ -164,7 +171,7 @@ def evaluate(
     for name, settings in (against or {}).items():
         if name not in players:
             players[name] = made_player(known, name, settings, served, agent)
-    episodes_played: dict[str, list[Played]] = {method: [] for method in players}
+    episodes_played: dict[str, list[EpisodeScore]] = {method: [] for method in players}
     efficiency: dict[str, list[float]] = {method: [] for method in players}
     pilots: dict[str, list[float]] = {method: [] for method in players}
     transmitters = model.card.transmitters if model.card else ("*",)
@@ -178,14 +185,14 @@ def evaluate(
     stations = sorted({name for played in episodes_played["policy"] for name in played.station})
     kinds = (*KINDS, *(stations if len(stations) > 1 else ()))
     by_episode = {
-        m: {k: tuple(_mean(p.abs_y[p.of(k)]) for p in played) for k in kinds}
+        m: {k: tuple(_mean(p.abs_y[p.mask(k)]) for p in played) for k in kinds}
         for m, played in episodes_played.items()
     }
     return Evaluation(
         policy=file.name,
         scenario=known.run.name,
         found={m: {k: mean_of(means) for k, means in of.items()} for m, of in by_episode.items()},
-        frames={k: sum(int(p.of(k).sum()) for p in episodes_played["policy"]) for k in kinds},
+        frames={k: sum(int(p.mask(k).sum()) for p in episodes_played["policy"]) for k in kinds},
         power={
             m: _mean(np.concatenate([p.abs_y.reshape(-1) ** 2 for p in played]))
             for m, played in episodes_played.items()

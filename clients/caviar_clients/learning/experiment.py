@@ -29,9 +29,8 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -96,7 +95,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Arguments of the environment; a text ``file:PATH`` is a path relative to the folder of the file."""
 
     def spec(self) -> gymnasium.envs.registration.EnvSpec:
-        """What is registered for the environment, of whose id ``gymnasium.spec`` takes no module.
+        """Registered entry of the environment, of whose id ``gymnasium.spec`` takes no module.
 
         Raises:
             ImportError: Its module cannot be imported; the text says why.
@@ -109,7 +108,7 @@ class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class _Algorithm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
-    """What algorithms share. A hyper-parameter that is left out is the library's default."""
+    """Keys that algorithms share. A hyper-parameter that is left out is the library's default."""
 
     own: ClassVar[tuple[str, ...]] = ("library", "final_learning_rate", "policy_network")
 
@@ -150,7 +149,7 @@ class Dqn(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True, tag
 
 
 class _OnPolicy(_Algorithm, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What PPO and A2C share."""
+    """Keys that PPO and A2C share."""
 
     n_steps: Count | None = None
     gae_lambda: Share | None = None
@@ -214,7 +213,7 @@ class Encoding(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is trained, how, and with which seeds."""
+    """An experiment: what is trained, how, and with which seeds."""
 
     not_in_file: ClassVar[tuple[str, ...]] = ("source", "written")
 
@@ -255,7 +254,7 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return hashlib.sha256(encoded + b"\n" + content).hexdigest()
 
     def place_of_option(self, message: str) -> Place:
-        """Where the option of the environment stands that an error is about.
+        """Place of the option of the environment that an error is about.
 
         Args:
             message: Of the error. It is about an option with whose name it begins, or whose value it quotes.
@@ -267,7 +266,7 @@ class Experiment(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return place.at(found[0]) if len(found) == 1 else place
 
     def place(self, *names: str) -> Place:
-        """Where a key stands in the file."""
+        """Place of a key in the file."""
         place = Place("", self.source)
         for name in names:
             place = place.at(name)
@@ -385,21 +384,21 @@ def _check_steps(experiment: Experiment) -> None:
             )
 
 
+# By key of an encoding: what each of its numbers fulfils, and what to write. The network computes with 32
+# bits, of which the least positive number is about 1e-38.
+_ENCODINGS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "scale": (lambda value: 1e-30 <= value <= 1e30, "write numbers > 0, from 1e-30 to 1e30"),
+    "offset": (lambda value: abs(value) <= 1e30, "write finite numbers"),
+    "waves": (lambda value: 0 <= value <= 1024, "write whole numbers from 0 to 1024"),
+}
+
+
 def _check_encodings(experiment: Experiment) -> None:
     for name, encoding in experiment.features.items():
-        scales = encoding.scale if isinstance(encoding.scale, tuple) else (encoding.scale,)
-        # The network computes with 32 bits, of which the least positive number is about 1e-38.
-        if not all(1e-30 <= scale <= 1e30 for scale in scales):
-            place = experiment.place("features", name, "scale")
-            raise place.error(f"is {encoding.scale}, write numbers > 0, from 1e-30 to 1e30")
-        offsets = encoding.offset if isinstance(encoding.offset, tuple) else (encoding.offset,)
-        if not all(math.isfinite(offset) and abs(offset) <= 1e30 for offset in offsets):
-            place = experiment.place("features", name, "offset")
-            raise place.error(f"is {encoding.offset}, write finite numbers")
-        waves = encoding.waves if isinstance(encoding.waves, tuple) else (encoding.waves,)
-        if not all(0 <= count <= 1024 for count in waves):
-            place = experiment.place("features", name, "waves")
-            raise place.error(f"is {encoding.waves}, write whole numbers from 0 to 1024")
+        for key, (is_right, remedy) in _ENCODINGS.items():
+            given = getattr(encoding, key)
+            if not all(map(is_right, given if isinstance(given, tuple) else (given,))):
+                raise experiment.place("features", name, key).error(f"is {given}, {remedy}")
 
 
 def _import(module: str) -> None:
@@ -423,7 +422,7 @@ def _import(module: str) -> None:
 
 
 def _is_of(spec: gymnasium.envs.registration.EnvSpec, module: str) -> bool:
-    """Whether an environment is defined in a module, or in one below it."""
+    """Check whether an environment is defined in a module, or in one below it."""
     made = spec.entry_point
     name = made.partition(":")[0] if isinstance(made, str) else getattr(made, "__module__", None)
     if not name:  # a function made from text belongs to none

@@ -20,10 +20,10 @@ from caviar_clients.envs.arguments import (
     checked_seeds,
     whole_numbers,
 )
-from caviar_clients.envs.rewards import KINDS, OF_PACKETS, Reward, RewardKind, link_info
+from caviar_clients.envs.base import KINDS, OF_PACKETS, Reward, RewardKind, link_info
 from caviar_clients.learning.tracks import NoProducts, Tracks, read_tracks
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.cell.rates import shannon
+from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.errors import PayloadError, RunError, ScenarioError
 from caviar_protocol.observations import Moment
 from caviar_services.link.base import BatchLink
@@ -212,7 +212,7 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
     # --- links -----------------------------------------------------------------------------------
 
     def _scored(self, rows: Int64Array, beams: Int64Array) -> BatchLink:
-        """What the beams achieve in these frames, as they were recorded."""
+        """Figures of the beams in these frames, as they were recorded."""
         tracks, pair = self.tracks, self.tracks.pair
         abs_y = tracks.swept[rows, beams]
         snr = tracks.power_over_noise[rows] * abs_y**2
@@ -272,7 +272,7 @@ class RecordedBeamsVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[A
 
 
 class _Order:
-    """Which user comes when: each once before one comes again."""
+    """Order of the users: each once before one comes again."""
 
     def __init__(self, count: int, seed: int | None) -> None:
         self._random, self._count, self._left = np.random.default_rng(seed), count, list[int]()

@@ -24,7 +24,7 @@ from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import Channel, Scene
 from caviar_services.link.base import User, channels_of
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import LinkBudget
 
@@ -147,7 +147,7 @@ def read_tracks(
 
 @dataclass
 class _Rows:
-    """What a track is made of, frame by frame."""
+    """Rows of a track, frame by frame."""
 
     track: Track
     last: int
@@ -222,7 +222,7 @@ class _Reader:
                 yield u, user
 
     def _observing(self, user: User, path: Path) -> Observer:
-        """What reads the parts of one user; made at the first one, whose arrays the others have."""
+        """Observer of one user; made at the first one, whose arrays the others have."""
         if self._observer is None or self._pair is None:
             self._pair = user
             known = _OnePlace((_device(user.tx, "tx"), _device(user.rx, "rx")))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,12 +23,15 @@ import numpy as np
 
 from caviar_clients.files import writing
 from caviar_clients.learning import features
-from caviar_clients.learning.checkpoints import load_checkpoint, newest_checkpoint, save_checkpoint
-from caviar_clients.learning.events import EventFile
+from caviar_clients.learning.checkpoints import (
+    load_checkpoint,
+    locked,
+    newest_checkpoint,
+    save_checkpoint,
+)
 from caviar_clients.learning.experiment import Dqn, Experiment
 from caviar_clients.learning.export import BeamEnv, export_policy
 from caviar_clients.learning.features import check_encodings
-from caviar_clients.learning.lock import locked
 from caviar_clients.learning.vec_env import stable_baselines3_env
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError, SetupError
 from caviar_protocol.files import replace_file
@@ -50,7 +54,7 @@ PATIENCE_S = 3.0
 
 
 class SeedResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What the training of one seed led to: its file `RESULT`."""
+    """Result of the training of one seed: its file `RESULT`."""
 
     seed: int
     steps: int
@@ -66,7 +70,7 @@ class SeedResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
-    """How far the training of a seed is."""
+    """Progress of the training of a seed."""
 
     seed: int
     steps: int
@@ -151,7 +155,7 @@ def make_envs(experiment: Experiment) -> Any:
 
 
 def _other_users(experiment: Experiment, given: int, size: int) -> str:
-    """What to write where the encoding of a part is of fewer users than the environment has."""
+    """Say what to write where the encoding of a part is of fewer users than the environment has."""
     remedy = "write one for all, or one for each"
     made = gymnasium.make(experiment.environment.id, **experiment.environment.options).unwrapped
     count = len(made.users) if isinstance(made, BeamEnv) else 1
@@ -220,8 +224,8 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
         if newest is not None:
             load_checkpoint(newest, model)
         report(_progress(model, seed, total))
-        with EventFile(mine / CURVES, purge_step=model.num_timesteps or None) as events:
-            model.set_logger(_logger(events))
+        with _curves(mine / CURVES, purge_step=model.num_timesteps or None) as logger:
+            model.set_logger(logger)
             callback = _reporting(lambda: report(_progress(model, seed, total)))
             while model.num_timesteps < total:
                 with _explained(model, seed):
@@ -424,9 +428,31 @@ def _mean_reward(model: Any) -> float | None:
     return float(np.mean([float(episode["r"]) for episode in ended])) if ended else None
 
 
-def _logger(events: EventFile) -> Any:
-    """A logger of Stable-Baselines3 that writes event files."""
+@contextmanager
+def _curves(folder: Path, purge_step: int | None) -> Iterator[Any]:
+    """Make a logger of Stable-Baselines3 that writes a file of events, which TensorBoard shows as curves.
+
+    Args:
+        folder: Where the file is made.
+        purge_step: TensorBoard drops numbers of older files from this step on: a training that goes on from
+            a checkpoint takes the steps after it once more. None: it keeps all.
+
+    Raises:
+        RunError: The file cannot be written, also later, as on a disk that is full.
+    """
     from stable_baselines3.common.logger import KVWriter, Logger
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
+    from tensorboardX.proto.summary_pb2 import Summary
+
+    with writing(folder / "events"):  # two files of one second and machine differ by the process
+        events = EventsWriter(str(folder / "events"), f".{os.getpid()}.0")
+
+    def put(**fields: Any) -> None:
+        # `SummaryWriter` would write in a thread of its own, and lose what that thread fails with.
+        with writing(folder / "events"):
+            events.write_event(Event(wall_time=time.time(), **fields))
+            events.flush()  # so that curves are seen while the training goes on
 
     class Curves(KVWriter):  # type: ignore[misc]  # Stable-Baselines3 is not looked at
         """Writes the numbers of a training."""
@@ -434,19 +460,24 @@ def _logger(events: EventFile) -> Any:
         def write(
             self, key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], step: int = 0
         ) -> None:
-            kept = {
-                key: float(value)
+            kept = [
+                Summary.Value(tag=key, simple_value=float(value))
                 for key, value in key_values.items()
                 if isinstance(value, int | float | np.number)
                 and "tensorboard" not in (key_excluded[key] or ())
-            }
+            ]
             if kept:
-                events.write(step, kept)
+                put(step=step, summary=Summary(value=kept))
 
         def close(self) -> None:
             """The training that made the file closes it."""
 
-    return Logger(folder=None, output_formats=[Curves()])
+    if purge_step is not None:
+        put(step=purge_step, session_log=SessionLog(status=SessionLog.START))
+    try:
+        yield Logger(folder=None, output_formats=[Curves()])
+    finally:
+        events.close()
 
 
 _BEAMS = {"abs_y": "beams/abs_y", "baseline_abs_y": "beams/los_beam", "best_abs_y": "beams/optimum"}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -36,7 +36,7 @@ class Reel:
         keys: Colours that a palette has whatever else there is, Shape ``[K, 3]``.
     """
 
-    pictures: Iterator[UInt8Array]
+    pictures: Iterable[UInt8Array]
     count: int
     fps: float
     samples: Sequence[UInt8Array]
@@ -170,7 +170,7 @@ def write_mp4(reel: Reel, file: Path) -> None:
             raise RunError(f"ffmpeg could not write {file}: {said or f'status {process.returncode}'}")
 
 
-def _feed(process: subprocess.Popen[bytes], pictures: Iterator[UInt8Array]) -> None:
+def _feed(process: subprocess.Popen[bytes], pictures: Iterable[UInt8Array]) -> None:
     """Write all pictures to ffmpeg; if that ends early, its status says so afterwards."""
     pipe = process.stdin
     if pipe is None:

@@ -314,7 +314,7 @@ def served_object(data: MapData) -> str:
 
 @dataclass(frozen=True)
 class Mark:
-    """How a device stands in a map.
+    """Mark of a device in a map.
 
     Args:
         label: Entry of the legend.
@@ -393,7 +393,7 @@ _HATCH, _HATCH_COLOR = "////", "#c4c4c4"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadioMapView:
-    """What is drawn around the cells of a radio map.
+    """Surroundings of the cells of a radio map.
 
     Args:
         area: Lowest x and y, highest x and y of the cells [m].

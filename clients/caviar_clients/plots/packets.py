@@ -31,7 +31,7 @@ POINTS = 100
 
 @dataclass(frozen=True, eq=False)
 class PacketSeries:
-    """What became of the packets of R receivers in F frames; summed over transmitters and carriers."""
+    """Packets of R receivers in F frames; summed over transmitters and carriers."""
 
     rx: tuple[str, ...]
     time: Float64Array

@@ -1,4 +1,4 @@
-"""What a map draws of the world: the paths of a channel, objects and scenery from above."""
+"""Shapes that a map draws: the paths of a channel, objects and scenery from above."""
 
 from __future__ import annotations
 

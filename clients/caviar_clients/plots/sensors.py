@@ -1,4 +1,4 @@
-"""What one camera saw at one instant: picture, depth, objects, surface normals, materials.
+"""Pictures of one sensor at one instant: a camera's picture, depth, objects, normals, materials; LIDAR scans.
 
 A LIDAR scan: from above, and as the sensor sees it.
 """
@@ -113,9 +113,7 @@ def _draw_above(drawn: Any, axes: Any, scan: LidarScan, moving: BoolArray, scene
         "", xy=(x + 0.12 * extent * heading[0], y + 0.12 * extent * heading[1]), xytext=(x, y),
         arrowprops={"arrowstyle": "->", "color": BLACK, "linewidth": 1.6}, zorder=6,
     )  # fmt: skip
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, east [m]")
-    axes.set_ylabel("y, north [m]")
+    axes.set(aspect="equal", xlabel="x, east [m]", ylabel="y, north [m]")
     axes.grid()
 
 
@@ -136,8 +134,7 @@ def _draw_ranges(drawn: Any, axes: Any, scan: LidarScan, device: LidarDevice) ->
         extent=(180 + half, -180 + half, *elevation),
     )  # fmt: skip
     drawn.colorbar(shown, ax=axes, label="Range [m]", pad=0.01)
-    axes.set_xticks(range(-180, 181, 45))
-    axes.set_xlabel("Azimuth from the sensor's x axis, counter-clockwise [°]")
+    axes.set(xticks=range(-180, 181, 45), xlabel="Azimuth from the sensor's x axis, counter-clockwise [°]")
     axes.set_ylabel("Elevation [°]")
 
 
@@ -228,10 +225,12 @@ def draw_view(view: CameraView, title: str, folder: Path, stem: str = "camera") 
     panels = list(_panels(view))
     files = [folder / f"{stem}.png"]
     _draw_all(panels, title, files[0])
+    from matplotlib.image import imsave  # where that drew, it is installed
+
     for kind, name, draw, aspect in panels:
         files.append(folder / f"{stem}-{kind}.png")
         if kind == "rgb" and view.rgb is not None:
-            _save_pixels(view.rgb, files[-1])
+            imsave(files[-1], np.ascontiguousarray(view.rgb))
             continue
         with figure(files[-1], 9.5, 7.0 * aspect + 0.6) as drawn:
             axes = drawn.subplots()
@@ -315,8 +314,7 @@ def _aspect(image: Any) -> float:
 
 
 def _show(axes: Any, image: Any, **how: Any) -> Any:
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_visible(False)
     axes.set_facecolor(SKY_GREY)
@@ -397,9 +395,3 @@ def _legend(axes: Any, entries: list[tuple[str, tuple[float, ...]]]) -> None:
 
     handles = [Patch(facecolor=colour, edgecolor=LIGHT_GREY, label=name) for name, colour in entries]
     axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0, frameon=False)
-
-
-def _save_pixels(rgb: UInt8Array, file: Path) -> None:
-    from matplotlib.image import imsave
-
-    imsave(file, np.ascontiguousarray(rgb))

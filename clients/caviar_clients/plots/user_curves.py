@@ -79,7 +79,7 @@ def link_source(recording: Recording) -> str:
 
 
 def has_users(recording: Recording) -> bool:
-    """Whether any frame of the link has a user."""
+    """Check whether any frame of the link has a user."""
     return any(link.rx for link in _links(recording))
 
 
@@ -170,8 +170,7 @@ def draw_over_time(data: UserSeries, agent: str, file: Path) -> None:
         top.set_title(f"Beam selection for {data.rx}, served by {data.tx} ({data.carrier})")
         theta = _apart(data, np.degrees(_wrapped(data.theta)))
         bottom.plot(*_without_jumps(*theta), color=GREY, linewidth=1.6)
-        bottom.set_ylabel("AoA θ [°]")
-        bottom.set_xlabel("Time [s]")
+        bottom.set(ylabel="AoA θ [°]", xlabel="Time [s]")
         bottom.margins(x=0)
         legend_below(drawn, middle)
 
@@ -204,8 +203,7 @@ def draw_over_angle(data: UserSeries, agent: str, file: Path) -> None:
         if (data.has_path & ~data.los).any():
             axes.scatter([], [], s=30, facecolors="none", edgecolors=GREY, label="hollow: NLOS")
         axes.grid()
-        axes.set_xlabel("AoA θ [°]")
-        axes.set_ylabel("|y| relative to the optimum [dB]")
+        axes.set(xlabel="AoA θ [°]", ylabel="|y| relative to the optimum [dB]")
         axes.set_ylim(top=max(0.5, -0.03 * axes.get_ylim()[0]))
         axes.set_title(f"|y| over the angle of arrival: {data.rx}, served by {data.tx} ({data.carrier})")
         legend_below(drawn, axes)
@@ -429,8 +427,7 @@ def draw_frequency_response(data: UserPaths, shown: tuple[int, int], moment: str
         profile, response = drawn.add_subplot(grid[0, 0]), drawn.add_subplot(grid[0, 1])
         _draw_profile(profile, data, frame)
         response.plot(offsets, gain_db[frame], color=BLUE, linewidth=1.6)
-        response.set_xlabel("Frequency from the carrier [MHz]")
-        response.set_ylabel("|H(f)|² [dB]")
+        response.set(xlabel="Frequency from the carrier [MHz]", ylabel="|H(f)|² [dB]")
         response.margins(x=0)
         response.grid()
         drawn.suptitle(f"{data.rx}, served by {data.tx} ({data.carrier.name}): {moment}")
@@ -443,8 +440,7 @@ def _draw_profile(axes: Any, data: UserPaths, frame: int) -> None:
     delay = data.tau[frame][there] * 1e9
     with np.errstate(divide="ignore"):
         gain_db = 20 * np.log10(np.abs(data.a[frame][there]))
-    axes.set_xlabel("Delay [ns]")
-    axes.set_ylabel("Gain of a path [dB]")
+    axes.set(xlabel="Delay [ns]", ylabel="Gain of a path [dB]")
     axes.grid()
     if not len(delay) or not np.isfinite(gain_db).any():
         axes.text(0.5, 0.5, "no path", transform=axes.transAxes, ha="center", color=GREY)
@@ -478,8 +474,7 @@ def _draw_map(axes: Any, data: UserPaths, offsets: Float64Array, gain_db: Float6
         extend = "min" if floor > least else "neither"
         axes.figure.colorbar(mesh, ax=axes, label="|H(f)|² [dB]", extend=extend)
     axes.axvline(data.time[frame], color=VERMILION, linewidth=1.0, linestyle="--")
-    axes.set_xlabel("Time [s]")
-    axes.set_ylabel("Frequency from\nthe carrier [MHz]")
+    axes.set(xlabel="Time [s]", ylabel="Frequency from\nthe carrier [MHz]")
 
 
 def _gains_db(data: UserPaths, carrier: Carrier) -> Float64Array:

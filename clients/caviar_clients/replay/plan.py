@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from caviar_clients.replay.recorded import RecordedRun
-from caviar_clients.session.checks import declared_hello, served_from_recording, settings_type
+from caviar_clients.session.prepared import declared_hello, served_from_recording, settings_type
 from caviar_protocol.errors import RunError, suggestion
 from caviar_protocol.messages import Hello, Input
 from caviar_protocol.scenario import ReplaySpec, Scenario, ServiceSpec
@@ -190,7 +190,7 @@ Part: TypeAlias = Literal["recorded", "replaced", "again", "left out"]
 
 @dataclass(frozen=True)
 class Role:
-    """What becomes of one service."""
+    """Part of one service in a replay."""
 
     name: str
     part: Part
@@ -267,7 +267,7 @@ def plan_replay(run: RecordedRun, request: Request, frames: int | None = None) -
 
 
 def _role(name: str, spec: ServiceSpec, run: RecordedRun, request: Request) -> Role:
-    """What becomes of a service. The order is that of precedence: options before what follows from them."""
+    """Choose the part of a service, in the order of precedence: options before what follows from them."""
     if name in request.replace:
         return Role(name, "replaced", request.replace[name], f"in place of {spec.use}")
     if name in request.settings:

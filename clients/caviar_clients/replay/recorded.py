@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from caviar_clients.session.checks import declared_hello, demanded
+from caviar_clients.session.prepared import declared_hello, demanded
 from caviar_protocol.digest import RunDigest
 from caviar_protocol.errors import DeclarationError, RecordingError
 from caviar_protocol.files import open_regular
@@ -81,7 +81,7 @@ class RecordedRun:
 
     @cached_property
     def parts_are_known(self) -> bool:
-        """Whether every consumer's declaration is here, so that a part not demanded is not recorded."""
+        """True where every consumer's declaration is here, so that a part not demanded is not recorded."""
         return not any(spec.remote for spec in self.scenario.services.values())
 
     @cached_property

@@ -34,10 +34,10 @@ class Session(ABC):
             decides for all of them at once: frames are those of the first one.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
         >>> from caviar_clients.session.connected import open_session
+        >>> from caviar_clients.session.prepared import prepare
         >>> from caviar_protocol.topics import Action
-        >>> scenario, inputs = checked_scenario("smoke", frames=3), (Input(topic="scene"),)
+        >>> scenario, inputs = prepare("smoke", frames=3), (Input(topic="scene"),)
         >>> with open_session(scenario, "agent", inputs) as session:
         ...     frame = session.reset(seed=7)
         ...     while not frame.final:
@@ -76,8 +76,10 @@ class Session(ABC):
         if self._frame is None:
             self._begin(chosen)
             self._frame = self._granted()
-            if _begins(self._frame, seed):
-                return self._frame
+            begun = self._frame
+            its_seed = seed is None or (begun.seed, begun.seed_episode) == (seed, 0)
+            if begun.number == 0 and not begun.final and its_seed:
+                return begun
             # An agent that had the place before left the run in the middle of an episode.
         if self._frame.final:
             self._answer_alike(StepResult(seed=chosen))
@@ -147,12 +149,6 @@ class Session(ABC):
         self.close()
 
 
-def _begins(frame: Frame, seed: int | None) -> bool:
-    """Whether a frame is the first one of an episode, of this seed where one is chosen."""
-    chosen = seed is None or (frame.seed, frame.seed_episode) == (seed, 0)
-    return frame.number == 0 and not frame.final and chosen
-
-
 PATIENCE_S = 600.0
 """[s] that a run waits for a decision before it blames the agent: between two of them a program may learn, or
 its user look at what it learned."""
@@ -196,7 +192,7 @@ class OutsideAgent(Service[OutsideSettings]):
 
 
 def failure_of(error: SystemExit | KeyboardInterrupt) -> RuntimeError:
-    """What a service failed by, whose code would end the program of the run without a word.
+    """Make the failure of a service whose code would end the program of the run without a word.
 
     Args:
         error: That the service raised.

@@ -10,40 +10,42 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from caviar_clients.session.embedded import EmbeddedSession
+from caviar_clients.session.prepared import PreparedScenario, implemented
 from caviar_protocol.arrays import Int64Array
 from caviar_protocol.errors import RunError
-from caviar_protocol.messages import Input
+from caviar_protocol.messages import Input, Role
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.rules import scenario_error
 from caviar_protocol.topics import Action
-from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.batch import MemberSeed as MemberSeed
-from caviar_services.channel.batch import SceneAt
+from caviar_services.channel.base import ChannelModel, SceneAt
+from caviar_services.channel.base import MemberSeed as MemberSeed
 from caviar_services.link.base import BatchLink as BatchLink
 from caviar_services.link.base import LinkBatch, LinkModel
-from caviar_services.registry import load
 
 REMEDY = (
     'make such environments one by one, by gymnasium.make_vec(…, vectorization_mode="sync"), a '
     'SyncVectorEnv, or "async", an AsyncVectorEnv'
 )
-_TAKES_PART = ("world", "channel", "link")
+_COMPUTED: tuple[Role, ...] = ("channel", "link")
 
 
-def check_batch(scenario: Scenario, agent: str) -> None:
+def check_batch(scenario: Scenario | PreparedScenario, agent: str) -> None:
     """Check that many episodes of a scenario can be computed at once.
 
     Args:
-        scenario: Checked, as `caviar_clients.session.checks.checked_scenario` returns it.
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` returns it.
         agent: Whose place is taken.
 
     Raises:
         ScenarioError: They cannot; the text names the service, where it stands, and the remedy.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> check_batch(checked_scenario("geometric"), "agent")
+        >>> from caviar_clients.session.prepared import prepare
+        >>> check_batch(prepare("geometric"), "agent")
     """
+
+    prepared = implemented(scenario)
+    scenario = prepared.scenario
 
     def refuse(name: str, why: str) -> NoReturn:
         text = f"many episodes cannot be computed at once: {why}; {REMEDY}"
@@ -53,13 +55,13 @@ def check_batch(scenario: Scenario, agent: str) -> None:
         called = f"{spec.role} {name!r}"
         if spec.role == "agent" and name != agent:
             refuse(name, f"{called} decides beside {agent!r}")
-        if spec.role not in _TAKES_PART:
+        if spec.role not in ("world", *_COMPUTED):
             continue  # recorders are left out, and of sensors nothing is observed
         if spec.remote:
             refuse(name, f"{called} is another program")
-        if not load(spec.role, spec.use).computes_batches(spec.settings):
+        if not prepared.services[name].cls.computes_batches(spec.settings):
             refuse(name, f"{called} is {spec.use!r}, which computes one episode at a time as it is set")
-    for role in ("channel", "link"):
+    for role in _COMPUTED:
         names = [name for name, spec in scenario.services.items() if spec.role == role]
         if len(names) != 1:
             text = f"a batch needs one {role}, and the scenario has {', '.join(names) or 'none'}; {REMEDY}"
@@ -72,7 +74,7 @@ class BatchSession:
     Call `begin`, then `step` for each frame from 0 on, then `begin` again; `close` at the end.
 
     Args:
-        scenario: Checked, as `caviar_clients.session.checks.checked_scenario` returns it.
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` returns it.
         agent: Whose place is taken.
         members: M.
 
@@ -81,25 +83,23 @@ class BatchSession:
 
     Example:
         >>> import numpy as np
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> session = BatchSession(checked_scenario("geometric"), "agent", members=2)
+        >>> from caviar_clients.session.prepared import prepare
+        >>> session = BatchSession(prepare("geometric"), "agent", members=2)
         >>> session.begin([MemberSeed(5, 0), MemberSeed(6, 0)])
         >>> session.step(0, np.array([[3], [3]])).abs_y.shape
         (2, 1)
         >>> session.close()
     """
 
-    def __init__(self, scenario: Scenario, agent: str, members: int) -> None:
-        check_batch(scenario, agent)
-        self.frames = scenario.run.frames
+    def __init__(self, scenario: Scenario | PreparedScenario, agent: str, members: int) -> None:
+        prepared = implemented(scenario)
+        check_batch(prepared, agent)
+        self.frames = prepared.scenario.run.frames
         """Frames of an episode."""
         self._members = members
-        self._channel, self._link = (
-            next(name for name, spec in scenario.services.items() if spec.role == role)
-            for role in ("channel", "link")
-        )
+        self._channel, self._link = (prepared.of_role(role)[0].name for role in _COMPUTED)
         inputs = (Input(topic="scene"), Input(topic="link", lag=1, required=False))
-        self._session = EmbeddedSession(scenario, agent, inputs)
+        self._session = EmbeddedSession(prepared, agent, inputs)
         # Of the frames that the run has come to. It is played once: scenes are the same in every episode.
         self._scenes: list[SceneAt] = []
         self._instants_ns: list[int] = []

@@ -11,6 +11,7 @@ from queue import Empty, SimpleQueue
 
 from caviar_clients.session.base import Frame, Session, declared
 from caviar_clients.session.embedded import EmbeddedSession
+from caviar_clients.session.prepared import PreparedScenario
 from caviar_protocol.errors import CaviarError, RunError, ScenarioError
 from caviar_protocol.fields import MAX_IN_FLIGHT
 from caviar_protocol.keys import Credentials
@@ -88,7 +89,8 @@ class ConnectedSession(Session):
         """Leave the run; after the last frame of its last episode the run ends in order."""
         if self._frame is not None and self._frame.final and self._thread.is_alive():
             self._answer_alike(StepResult())
-            self._drained()
+            with suppress(Empty):  # until the run is over, or the next episode begins
+                self._grants.get(timeout=LEAVE_S)
         self._frame = None
         self.leave()
         for other in self._others.values():
@@ -142,11 +144,6 @@ class ConnectedSession(Session):
             if isinstance(grant, CaviarError):
                 raise grant
             return grant
-
-    def _drained(self) -> None:
-        """Wait until the run is over or the next episode begins."""
-        with suppress(Empty):
-            self._grants.get(timeout=LEAVE_S)
 
     # --- in the runner's thread --------------------------------------------------------------------
 
@@ -250,7 +247,7 @@ def agent_of(scenario: Scenario, agent: str | None) -> str:
 
 
 def open_session(
-    scenario: Scenario,
+    scenario: Scenario | PreparedScenario,
     agent: str,
     inputs: tuple[Input, ...],
     broker: str | None = None,
@@ -263,7 +260,7 @@ def open_session(
     """Open a session of one agent of a scenario, or of several.
 
     Args:
-        scenario: Checked, as `checked_scenario` returns it.
+        scenario: Checked, as `prepare` returns it.
         agent: Name of the agent whose place is taken, as `agent_of` finds it.
         inputs: What the agent consumes.
         broker: ZeroMQ address of a broker that serves the scenario; None: the run is in this process.
@@ -282,8 +279,9 @@ def open_session(
         >>> open_session(load_scenario("smoke"), "agent", (Input(topic="scene"),)).close()
     """
     places = (agent, *((beside,) if isinstance(beside, str) else beside))
+    plain = scenario if isinstance(scenario, Scenario) else scenario.scenario
     for place in places:
-        agent_of(scenario, place)
+        agent_of(plain, place)
     if isinstance(beside, str) or len(set(places)) != len(places):
         raise ScenarioError(f"agent={agent!r}, beside={beside!r}; write a tuple of names, each of them once")
     if broker is None:
@@ -291,5 +289,5 @@ def open_session(
     if directory is not None:
         raise ScenarioError("a connected run records where its broker says; leave directory=… out")
     return ConnectedSession(
-        broker, agent, inputs, connect_timeout_s, credentials, with_scenery, beside, scenario
+        broker, agent, inputs, connect_timeout_s, credentials, with_scenery, beside, plain
     )

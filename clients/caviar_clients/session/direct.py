@@ -33,7 +33,7 @@ _OWN = "caviar_services."
 
 
 def plays_directly(plan: RunPlan) -> bool:
-    """Whether the frames of a run in one process need no clock.
+    """Tell whether the frames of a run in one process need no clock.
 
     Args:
         plan: The run. Nothing of it may be recorded.
@@ -225,7 +225,7 @@ class DirectFrames:
         )
 
     def _older(self, item: FrameInput) -> FrameInput:
-        """What a product of the frame before is for a consumer of this one."""
+        """A product of the frame before, as a consumer of this one gets it."""
         if not item.present:
             return item
         was = item.provenance
@@ -241,7 +241,7 @@ class DirectFrames:
         return item.under(entry)
 
     def _computed(self, part: _Part, frame: Frame) -> StepResult | None:
-        """What a service makes of a frame; None: it failed, or answers from outside."""
+        """Result of a service for a frame; None: it failed, or answers from outside."""
         self.at_work = part.name, frame
         try:
             result = part.session.compute(frame)

@@ -19,34 +19,39 @@ from typing import Any, TypeVar
 
 from msgspec.structs import replace as replace_field
 
-from caviar_broker.assets import pattern_files
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
-from caviar_broker.core.plan import briefings, plan_run, with_ownership
+from caviar_broker.core.plan import with_ownership
 from caviar_broker.journal import JournalFile
 from caviar_broker.journal_format import NO_BROKER
-from caviar_broker.policies import given_policies
-from caviar_broker.run_record import with_replay
+from caviar_broker.run_record import planned_run
 from caviar_broker.statistics import Statistics
 from caviar_clients.files import make_folder_of
 from caviar_clients.session.base import Frame, Session, declared, failure_of
 from caviar_clients.session.direct import DirectFrames, plays_directly
+from caviar_clients.session.prepared import PreparedScenario, implemented
 from caviar_clients.session.watchdog import Watchdog, Work
 from caviar_protocol import messages as m
-from caviar_protocol.assets import AssetStore
+from caviar_protocol.assets import AssetStore, MeshCheck
 from caviar_protocol.errors import RunError
-from caviar_protocol.geometry import MeshCheck
 from caviar_protocol.messages import Input
 from caviar_protocol.recording.reader import Imposed
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import Scenario, ServiceSpec
+from caviar_protocol.scenario import Scenario
 from caviar_protocol.validation import ContentCheck
 from caviar_services.conversion import Answer, sorted_products
-from caviar_services.registry import load, with_inputs
+from caviar_services.registry import with_inputs
 from caviar_services.service import Service, StepResult
 from caviar_services.session import ServiceSession
 
 S = TypeVar("S", bound=ServiceSession)
+
+_RECEIVED: Mapping[type[m.Message], Callable[[str, Any], ev.Event]] = {
+    m.GeometryDone: ev.GeometryDoneReceived,
+    m.ResetDone: ev.ResetDoneReceived,
+    m.Ready: ev.ReadyReceived,
+    m.Fault: ev.FaultReceived,
+}
 
 # Without a handler of the program, its warnings go to standard error.
 _log = logging.getLogger("caviar.session")
@@ -114,7 +119,7 @@ class EmbeddedRun:
     """One run of a scenario in this process.
 
     Args:
-        scenario: Checked, as `caviar_protocol.scenario.load_scenario` returns it.
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` returns it.
         directory: Where the recorder and the journal write. None: nothing is written, recorders are left
             out, and products go from service to service as they are, so that the outcome has no digest and
             `statistics` stay empty.
@@ -130,15 +135,15 @@ class EmbeddedRun:
         with_journal: Whether the decisions of the clock are written beside the recording.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> outcome = EmbeddedRun(checked_scenario("smoke", frames=3), directory=None).run()
+        >>> from caviar_clients.session.prepared import prepare
+        >>> outcome = EmbeddedRun(prepare("smoke", frames=3), directory=None).run()
         >>> outcome.error
         ''
     """
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: Scenario | PreparedScenario,
         directory: Path | None,
         on_notice: Callable[[ev.Notice], None] = lambda notice: None,
         on_frame: Callable[[ev.FrameFinished], None] = lambda frame: None,
@@ -149,18 +154,20 @@ class EmbeddedRun:
         episode: int | None = None,
         with_journal: bool = True,
     ) -> None:
+        prepared, seats = implemented(scenario), seats or {}
+        scenario = prepared.scenario
         if directory is None:
-            scenario = _without_recorders(scenario)
-        for name in seats or {}:
+            kept = {name: spec for name, spec in scenario.services.items() if spec.role != "recorder"}
+            run = replace_field(scenario.run, record=())
+            scenario = replace_field(scenario, services=kept, run=run)
+        for name in seats:
             # Settings of the implementation whose place is taken are not for the service outside.
             seated = replace_field(scenario.services[name], settings={})
             scenario = replace_field(scenario, services={**scenario.services, name: seated})
         scenario = with_ownership(scenario)
         folder = (directory or Path()).resolve()
-        plan = plan_run(scenario, folder.name, briefings(scenario, folder))
-        plan = with_replay(plan, scenario.replay)
-        imposed = plan.imposed if imposed is None else imposed
         store = AssetStore()
+        plan = planned_run(scenario, folder.name, folder, store, keeps=directory is not None)
         self._meshes = MeshCheck(store, plan.max_faces)
         if episode is not None:
             plan = replace(plan, first_episode=episode, episodes=episode + 1)
@@ -172,9 +179,7 @@ class EmbeddedRun:
             # No service can be lost and come back: where this process dies, all of them do.
             checkpoint_frames=0,
             ephemeral=directory is None,
-            imposed=imposed,
-            patterns=pattern_files(scenario, store),
-            policies=given_policies(scenario, store, directory),
+            imposed=plan.imposed if imposed is None else imposed,
         )
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self._services = {service.name: service for service in plan.services}
@@ -198,31 +203,36 @@ class EmbeddedRun:
         self._without_clock = directory is None and bool(seats) and plays_directly(plan)
         self._reset: m.Reset | None = None  # the last one
         self._check = check = ContentCheck()
-        seats = seats or {}
 
         def session(kind: type[S], name: str, cls: type[Service[Any]]) -> S:
             use, send = scenario.services[name].use, partial(self._take, name)
-            progress = partial(self._progressed, name)
+
+            def progress(phase: str, grace_s: float = 0.0) -> None:
+                self._watchdog.progress(name, phase)
+
             return kind(name, use, cls, send, store, progress=progress, check=check, encodes=self._encodes)
 
-        def loaded(spec: ServiceSpec) -> type[Service[Any]]:
-            cls = load(spec.role, spec.use)
-            return with_inputs(cls, cls.inputs_with(spec.settings))
+        def implementation(name: str) -> type[Service[Any]]:
+            cls = prepared.services[name].cls
+            return with_inputs(cls, cls.inputs_with(scenario.services[name].settings))
 
         self.seats = {name: session(OutsideSession, name, cls) for name, cls in seats.items()}
         """Services that decide outside of the run."""
         self._sessions: dict[str, ServiceSession] = {
-            name: self.seats.get(name) or session(ServiceSession, name, loaded(spec))
-            for name, spec in scenario.services.items()
+            name: self.seats.get(name) or session(ServiceSession, name, implementation(name))
+            for name in scenario.services
         }
-        self._at_work: Work | None = None  # what a service handles just now
+        self.at_work: Work | None = None
+        """What a service handles just now, for the watchdog; None between services."""
         self._direct: DirectFrames | None = None
         classes = {name: session.cls for name, session in self._sessions.items()}
         # Which meshes there are in a frame is the clock's to say.
         settings = {name: spec.settings for name, spec in scenario.services.items()}
         if any(c.role == "world" and c.changes_geometry_with(settings[n]) for n, c in classes.items()):
             self._without_clock = False
-        self._watchdog = Watchdog(plan, classes, self._present_work, on_wait, wait_again_s)
+        self._watchdog = Watchdog(
+            plan, classes, lambda: (self._direct or self).at_work, on_wait, wait_again_s
+        )
 
     def run(self) -> ev.Finished:
         """Run to the end.
@@ -296,7 +306,7 @@ class EmbeddedRun:
             self._reset = order.message
         # What a service sends comes back through `_take` before this call returns.
         began = time.monotonic_ns()
-        self._at_work = order.service, order.message
+        self.at_work = order.service, order.message
         try:
             session.handle(order.message, parts)
         except (SystemExit, KeyboardInterrupt) as error:
@@ -305,7 +315,7 @@ class EmbeddedRun:
             if isinstance(order.message, m.Grant):
                 phase, episode, frame = "step", order.message.episode, order.message.frame
             session.report(failure, phase, episode, frame)
-        self._at_work = None
+        self.at_work = None
         if self._encodes and type(order.message) is m.Grant:
             elapsed, plan = time.monotonic_ns() - began, self._services[order.service]
             grant = order.message
@@ -314,16 +324,9 @@ class EmbeddedRun:
             self.statistics.latency(order.service, elapsed, missed)
 
     def _close(self, session: ServiceSession) -> None:
-        self._direct, self._at_work = None, (session.name, None)
+        self._direct, self.at_work = None, (session.name, None)
         session.close()
-        self._at_work = None
-
-    def _present_work(self) -> Work | None:
-        direct = self._direct
-        return self._at_work if direct is None else direct.at_work
-
-    def _progressed(self, name: str, phase: str, grace_s: float = 0.0) -> None:
-        self._watchdog.progress(name, phase)
+        self.at_work = None
 
     def _play_directly(self) -> Generator[None, None, None]:
         """Play on without the clock, which granted the first frame of the first episode."""
@@ -346,26 +349,18 @@ class EmbeddedRun:
         match message:
             case m.Done():
                 payloads = tuple(zip(parts[::2], parts[1::2], strict=True)) if self._encodes else tuple(parts)
-                event = ev.DoneReceived(name, message, payloads, self._refused(message))
-            case m.GeometryDone():
-                event = ev.GeometryDoneReceived(name, message)
-            case m.ResetDone():
-                event = ev.ResetDoneReceived(name, message)
+                new = message.geometry  # of a world that announces meshes
+                refused = None if new is None else self._meshes.refusals(new.assets)
+                event = ev.DoneReceived(name, message, payloads, refused)
+            case m.GeometryDone() | m.ResetDone() | m.Ready() | m.Fault():
+                event = _RECEIVED[type(message)](name, message)
             case m.AssetOffer():
                 event = ev.AssetsOffered(name, message.assets)
-            case m.Ready():
-                event = ev.ReadyReceived(name, message)
-            case m.Fault():
-                event = ev.FaultReceived(name, message)
             case m.Bye():
                 event = ev.ByeReceived(name, message.reason)
             case _:
                 raise RunError(f"{name!r} sent {message}, which a run in one process has no use for")
         self._events.append(event)
-
-    def _refused(self, message: m.Done) -> dict[str, str] | None:
-        """Why meshes that a world announces are none, by name; None where it announces none."""
-        return None if message.geometry is None else self._meshes.refusals(message.geometry.assets)
 
     def _skip_time(self) -> None:
         """No service has work left: move the clock to its next deadline."""
@@ -414,12 +409,6 @@ class EmbeddedRun:
                 pass
 
 
-def _without_recorders(scenario: Scenario) -> Scenario:
-    services = {name: spec for name, spec in scenario.services.items() if spec.role != "recorder"}
-    run = replace_field(scenario.run, record=())
-    return replace_field(scenario, services=services, run=run)
-
-
 ENDLESS = 2**53
 """Episodes of a run that goes on until it is closed."""
 KEPT_NOTICES = 100
@@ -430,7 +419,7 @@ class EmbeddedSession(Session):
     """A run in this process that plays as many episodes as are asked for.
 
     Args:
-        scenario: Checked, as `caviar_protocol.scenario.load_scenario` returns it.
+        scenario: Checked, as `caviar_clients.session.prepared.prepare` returns it.
         agent: Name of the agent whose place is taken.
         inputs: What it consumes.
         directory: Where recorder and journal write; None: nothing is written, which is a lot faster.
@@ -443,7 +432,7 @@ class EmbeddedSession(Session):
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: Scenario | PreparedScenario,
         agent: str,
         inputs: tuple[Input, ...],
         directory: Path | None = None,
@@ -455,13 +444,15 @@ class EmbeddedSession(Session):
         """Notices of the run, the newest last."""
         if directory is not None:
             make_folder_of(RunDirectory(directory).journal)
-        endless = replace_field(scenario, run=replace_field(scenario.run, episodes=ENDLESS))
+        prepared = implemented(scenario)
+        plain = prepared.scenario
+        plain = replace_field(plain, run=replace_field(plain.run, episodes=ENDLESS))
         self._seed = -1
         scenery_here = self._take_scenery if with_scenery else None
         cls = declared(inputs, lambda: self._seed, _decided_outside, scenery_here)
         others = declared(inputs, lambda: self._seed, _decided_outside)
         seats = {agent: cls, **dict.fromkeys(beside, others)}
-        self._run = EmbeddedRun(endless, directory, self._notice, seats=seats)
+        self._run = EmbeddedRun(replace(prepared, scenario=plain), directory, self._notice, seats=seats)
         self._seat = self._run.seats[agent]
         self._seats_beside = {name: self._run.seats[name] for name in beside}
         self._steps = self._run.steps()

@@ -6,26 +6,23 @@ import math
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, ScenarioError, SetupError
-from caviar_protocol.messages import Role
 from caviar_protocol.multipath import TAPS_BEFORE
 from caviar_protocol.scenario import Scenario
-from caviar_protocol.scenario.conversion import Place, convert_settings
-from caviar_protocol.scenario.rules import scenario_error, settings_place
+from caviar_protocol.scenario.rules import scenario_error
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics.scene import Panel
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, models
-from caviar_services.channel.propagation.clearance import Surfaces
-from caviar_services.registry import load
-from caviar_services.service import Service
 from caviar_services.world.base import World
 from caviar_space.mitsuba_xml import read_scenery
 from caviar_space.scenery import scenery_assets, scenery_file, scenery_triangles
+
+if TYPE_CHECKING:
+    from caviar_clients.session.prepared import PreparedScenario
 
 FREQUENCY_HZ = (100e6, 1e12)
 """The lower end of mobile radio; the upper end of Recommendation ITU-R P.676."""
@@ -44,28 +41,26 @@ LOOKED_AT = 200
 """Positions of one object at most, spread evenly over its way."""
 
 
-def implausible_values(scenario: Scenario) -> list[str]:
+def implausible_values(prepared: PreparedScenario) -> list[str]:
     """Warn of implausible values; the run takes place all the same.
-
-    Args:
-        scenario: Checked, as `checked_scenario` returns it.
 
     Returns:
         A line for each value, with file, line, key and what may have been meant.
 
     Example:
-        >>> from caviar_clients.session.checks import checked_scenario
-        >>> implausible_values(checked_scenario("smoke"))
+        >>> from caviar_clients.session.prepared import prepare
+        >>> implausible_values(prepare("smoke"))
         []
     """
+    scenario = prepared.scenario
     found = [
         *_carriers(scenario),
         *_numerologies(scenario),
         *_powers(scenario),
         *_arrays(scenario),
-        *_ladders(scenario),
-        *_object_keys(scenario),
-        *_positions(scenario),
+        *_ladders(prepared),
+        *_object_keys(prepared),
+        *_positions(prepared),
     ]
     return [str(scenario_error(scenario, key, text)) for key, text in found]
 
@@ -177,18 +172,15 @@ def _arrays(scenario: Scenario) -> _Warnings:
                 )
 
 
-def _configured(scenario: Scenario, role: Role) -> Iterator[tuple[Place, type[Service[Any]], Any]]:
-    """Implementations of a role that run here: the place of the settings, the class, and the settings."""
-    for name, spec in scenario.services.items():
-        if spec.role == role and not spec.remote:
-            place, cls = settings_place(scenario, name), load(role, spec.use)
-            yield place, cls, convert_settings(cls.Settings, spec.settings, place)
-
-
-def _ladders(scenario: Scenario) -> _Warnings:
+def _ladders(prepared: PreparedScenario) -> _Warnings:
     """References of adaptive channels that know less than the rungs that they judge."""
-    for place, _, settings in _configured(scenario, "channel"):
-        if not isinstance(settings, AdaptiveSettings) or settings.reference is None:
+    for channel in prepared.of_role("channel"):
+        settings, place = channel.settings, channel.place
+        if getattr(settings, "reference", None) is None:
+            continue
+        from caviar_services.channel.adaptive.controller import AdaptiveSettings, models
+
+        if not isinstance(settings, AdaptiveSettings):
             continue
         *rungs, (_, reference) = models(settings, place)  # the reference stands last
         depth = getattr(reference, "max_depth", 0)
@@ -207,34 +199,35 @@ def _ladders(scenario: Scenario) -> _Warnings:
             )
 
 
-def _object_keys(scenario: Scenario) -> _Warnings:
+def _object_keys(prepared: PreparedScenario) -> _Warnings:
     """Keys of materials and foliage that no object and no piece of scenery of the run can have."""
-    known = _objects_and_pieces(scenario)
+    known = _objects_and_pieces(prepared)
     if known is None:
         return
     names, classes = known
-    for place, _, settings in _configured(scenario, "channel"):
+    for channel in prepared.of_role("channel"):
         for setting in ("object_materials", "foliage"):
-            for key in getattr(settings, setting, ()):
+            for key in getattr(channel.settings, setting, ()):
                 fits = key in classes or any(name == key or fnmatchcase(name, key) for name in names)
                 if not fits:
                     near = get_close_matches(key, [*names, *classes], n=1)
                     hint = f"; did you mean {near[0]!r}?" if near else ""
-                    at = place.at(setting).at(key).key
+                    at = channel.place.at(setting).at(key).key
                     yield at, f"is no object, class of objects or piece of scenery of the run{hint}"
 
 
-def _objects_and_pieces(scenario: Scenario) -> tuple[set[str], set[str]] | None:
+def _objects_and_pieces(prepared: PreparedScenario) -> tuple[set[str], set[str]] | None:
     """Names of all objects and pieces of scenery, and all classes; None where they are not known yet."""
-    if any(spec.role == "world" and spec.remote for spec in scenario.services.values()):
+    if any(spec.role == "world" and spec.remote for spec in prepared.scenario.services.values()):
         return None
     names, classes = set[str](), set[str]()
     try:
-        for _, world, settings in _configured(scenario, "world"):
-            objects = world.known_objects(settings) if issubclass(world, World) else None
+        for world in prepared.of_role("world"):
+            objects = world.cls.known_objects(world.settings) if issubclass(world.cls, World) else None
             if objects is None:
                 return None
-            pieces = read_scenery(scenery_file(settings.scenery)).shapes if settings.scenery else ()
+            scenery = world.settings.scenery
+            pieces = read_scenery(scenery_file(scenery)).shapes if scenery else ()
             names.update(objects, (piece.name for piece in pieces))
             classes.update(objects.values())
     except (AssetError, ScenarioError, SetupError):
@@ -255,68 +248,47 @@ def _powers(scenario: Scenario) -> _Warnings:
             )
 
 
-class _Placed(NamedTuple):
-    """Something that stands at a place of its own in the world."""
-
-    key: str
-    name: str
-    position: Vector
-
-
-def _positions(scenario: Scenario) -> _Warnings:
-    placed = [*_placed_devices(scenario), *_placed_objects(scenario)]
-    ground = _Ground.of(scenario) if placed else None
+def _positions(prepared: PreparedScenario) -> _Warnings:
+    placed = [*_placed(prepared)]
+    ground = _scenery_of(prepared.scenario) if placed else None
     if ground is None:
         return
     known: set[str] = set()
-    for thing in placed:
-        wrong = ground.implausible(np.array(thing.position)) if thing.name not in known else ""
+    for key, name, position in placed:
+        wrong = ground.implausible(np.array(position)) if name not in known else ""
         if wrong:
-            known.add(thing.name)
-            at = ", ".join(f"{number:g}" for number in thing.position)
-            yield thing.key, f"{thing.name!r} stands at ({at}) m, {wrong}"
+            known.add(name)
+            at = ", ".join(f"{number:g}" for number in position)
+            yield key, f"{name!r} stands at ({at}) m, {wrong}"
 
 
-def _placed_devices(scenario: Scenario) -> Iterator[_Placed]:
-    for index, device in enumerate(scenario.devices):
+def _placed(prepared: PreparedScenario) -> Iterator[tuple[str, str, Vector]]:
+    """Key, name and position [m] of what stands at a place of its own: devices, and objects of worlds."""
+    for index, device in enumerate(prepared.scenario.devices):
         if not device.on:
-            yield _Placed(f"devices[{index}].position_m", device.name, device.position_m)
-
-
-def _placed_objects(scenario: Scenario) -> Iterator[_Placed]:
-    for place, world, settings in _configured(scenario, "world"):
+            yield f"devices[{index}].position_m", device.name, device.position_m
+    for world in prepared.of_role("world"):
         try:
-            placements = list(world.placements(settings)) if issubclass(world, World) else []
+            placements = list(world.cls.placements(world.settings)) if issubclass(world.cls, World) else []
         except ScenarioError:
             continue  # the world refuses it itself, with the remedy
         for key, thing, positions in placements:
             for position in positions[:: max(1, math.ceil(len(positions) / LOOKED_AT))]:
-                yield _Placed(f"{place.key}.{key}", thing, position)
+                yield f"{world.place.key}.{key}", thing, position
 
 
 class _Ground:
     """The scenery of a scenario: how far it reaches, and what is below its ground."""
 
     def __init__(self, triangles: Float64Array) -> None:
+        from caviar_space.obstacles import Surfaces  # which a scenario without scenery does not need
+
         corners = triangles.reshape(-1, 3)
         self._low, self._high = corners.min(0), corners.max(0)
         self._surfaces = Surfaces(triangles, lambda triangle, normal: True)
 
-    @classmethod
-    def of(cls, scenario: Scenario) -> _Ground | None:
-        """Load the scenery; None where there is none, or its world will refuse it, with the remedy."""
-        worlds = [spec for spec in scenario.services.values() if spec.role == "world"]
-        try:
-            found = [
-                scenery_triangles(scenery_assets(str(spec.settings.get("scenery") or ""))) for spec in worlds
-            ]
-        except (AssetError, ScenarioError, SetupError):
-            return None
-        triangles = np.concatenate(found) if found else np.zeros((0, 3, 3))
-        return cls(triangles) if len(triangles) else None
-
     def implausible(self, position: Float64Array) -> str:
-        """What is wrong with a position [m], Shape ``[3]``; empty: nothing."""
+        """Fault of a position [m], Shape ``[3]``; empty: none."""
         if (position[:2] < self._low[:2]).any() or (position[:2] > self._high[:2]).any():
             return f"outside the scenery, which reaches {_span(self._low, self._high)}"
         # Under the ground, and not under a roof or a bridge: something is above and nothing below.
@@ -331,13 +303,24 @@ class _Ground:
         return ""
 
 
+def _scenery_of(scenario: Scenario) -> _Ground | None:
+    """Load the scenery; None where there is none, or its world will refuse it, with the remedy."""
+    worlds = [spec.settings for spec in scenario.services.values() if spec.role == "world"]
+    try:
+        found = [scenery_triangles(scenery_assets(str(each.get("scenery") or ""))) for each in worlds]
+    except (AssetError, ScenarioError, SetupError):
+        return None
+    triangles = np.concatenate(found) if found else np.zeros((0, 3, 3))
+    return _Ground(triangles) if len(triangles) else None
+
+
 def _span(low: Sequence[float] | Float64Array, high: Sequence[float] | Float64Array) -> str:
     axes = zip("xyz", low, high, strict=True)
     return ", ".join(f"{axis} {a:.4g} to {b:.4g} m" for axis, a, b in axes)
 
 
 def _meant(value_hz: float, low: float, high: float) -> str:
-    """What a frequency that is written in another unit may mean; empty where no unit makes it plausible."""
+    """Hint at a frequency that is written in another unit; empty where no unit makes it plausible."""
     for exponent, unit in ((9, "GHz"), (6, "MHz"), (3, "kHz")):
         if value_hz < _MOST_OF_A_UNIT and low <= value_hz * 10.0**exponent <= high:
             return f"; {value_hz:g} {unit} is written {value_hz:g}e{exponent}"

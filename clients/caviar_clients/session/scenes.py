@@ -1,4 +1,4 @@
-"""The scenes that all settings are measured on: those of a scenario's worlds, or of a recording.
+"""Scenes without channels: those of a scenario's worlds, or of a recording.
 
 Of a scenario only the worlds run, and the agents that steer them, embedded in this process and free of pace.
 """
@@ -6,30 +6,23 @@ Of a scenario only the worlds run, and the agents that steer them, embedded in t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario, names_class
 from caviar_clients.session.embedded import EmbeddedRun
-from caviar_protocol.errors import RecordingError, RunError, ScenarioError
+from caviar_clients.session.prepared import PreparedScenario, names_class, prepare
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.recording import RecordedFrame, Recording
-from caviar_protocol.scenario import DeviceSpec, Scenario, ServiceSpec
-from caviar_protocol.space.scene import pairs_of
+from caviar_protocol.scenario import DeviceSpec, ServiceSpec
+from caviar_protocol.scenario.rules import with_overrides
 from caviar_protocol.topics import Carrier, Scene
-from caviar_services.registry import load
 from caviar_services.service import Preparation, Prepared, Service, StepResult
-
-T = TypeVar("T")
-
-CONSECUTIVE = 21
-"""Consecutive frames that keyframes are measured on: two intervals of ten, and the frame before."""
 
 KEEPER = "tradeoff-scenes"
 """Name of the service that keeps the scenes."""
@@ -82,45 +75,13 @@ class Scenes:
         return dict(next(found, {}))
 
 
-def scenes_of(path: Path, frames: int) -> Scenes:
-    """Take scenes, spread evenly over the first episode of a scenario or a recording.
-
-    Args:
-        path: Scenario file, run directory or segment.
-        frames: Number of scenes, about: those without a transmitter or a receiver are left out.
-
-    Raises:
-        ScenarioError: The scenario is wrong, or has no carrier.
-        RecordingError: The recording is wrong, or holds no scene.
-        RunError: The worlds fail, or no scene has both a transmitter and a receiver.
-
-    Example:
-        >>> scenes = scenes_of(Path("runs/smoke-20261122-101500"), 2)
-        >>> len(scenes.instants), scenes.carriers[0].name
-        (2, 'mmwave')
-    """
-    found = _of_recording(path, frames) if is_recording(path) else _of_scenario(path, frames)
-    if not found.carriers:
-        raise ScenarioError(
-            "a channel needs at least one carrier; add [[carriers]] with name and frequency_hz",
-            key="carriers",
-        )
-    # A scene without a pair has no channel: it would count as one that costs nothing.
-    served = tuple(instant for instant in found.instants if pairs_of(instant.scene))
-    if not served:
-        raise RunError(
-            f"none of the {len(found.instants)} scenes of {found.origin} has a transmitter and a receiver; "
-            "there is no channel to compare"
-        )
-    return dataclasses.replace(found, instants=served, consecutive=_run(found.consecutive))
-
-
-def scene_at(path: Path, frame: int = 0) -> Scenes:
+def scene_at(path: Path, frame: int = 0, prepared: PreparedScenario | None = None) -> Scenes:
     """Take the scene of one frame of the first episode, as the only instant.
 
     Args:
         path: Scenario file, run directory or segment.
         frame: Number of the frame.
+        prepared: The scenario of that file; None: it is prepared here.
 
     Raises:
         ScenarioError: The scenario is wrong.
@@ -130,43 +91,32 @@ def scene_at(path: Path, frame: int = 0) -> Scenes:
     if is_recording(path):
         recording = Recording(path)
         episode = recording.entry(0).episode if len(recording) else 0
-        recorded = recording.frame(episode, frame)
-        instant = _instant(recorded)
-        if instant is None:
+        found = recorded_instants([recording.frame(episode, frame)])
+        if not found:
             raise RecordingError(f"frame {frame} of {path} has no scene; choose another with --frame")
-        return _recorded(recording, (instant,))
-    scenario = checked_scenario(path)
+        return recorded_scenes(recording, found)
+    prepared = prepared or prepare(path)
+    scenario = prepared.scenario
     if not 0 <= frame < scenario.run.frames:
         last = scenario.run.frames - 1
         raise RunError(f"--frame {frame}: scenario {scenario.run.name!r} has the frames 0 to {last}")
     # A world's scene may depend on every frame before: the run is cut after the frame, not begun at it.
-    scenario = checked_scenario(path, frames=frame + 1)
-    instants, assets = _simulated(scenario)
-    return _planned(path, scenario, instants[-1:], assets)
+    scenario = with_overrides(scenario, frames=frame + 1)
+    every = simulated_scenes(path, dataclasses.replace(prepared, scenario=scenario))
+    return dataclasses.replace(every, instants=every.instants[-1:])
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a run directory or a segment, and not a scenario."""
+    """Tell whether a path is a run directory or a segment, and not a scenario."""
     return path.is_dir() or path.suffix == ".mcap"
 
 
-def _of_recording(path: Path, frames: int) -> Scenes:
-    recording = Recording(path)
-    first = recording.entry(0).episode if len(recording) else 0
-    # Of the first episode alone, as of a scenario: another one has other objects of the same names.
-    kept = [frame for frame in recording.frames() if frame.episode == first]
-    instants = [instant for frame in _spread(kept, frames) if (instant := _instant(frame)) is not None]
-    block = [instant for frame in _middle(kept) if (instant := _instant(frame)) is not None]
-    if not instants:
-        raise RecordingError(
-            f'{path} holds no scene; record the topic: record = ["scene", …] in the table [run]'
-        )
-    return _recorded(recording, tuple(instants), tuple(block))
+def recorded_scenes(recording: Recording, instants: Sequence[Instant]) -> Scenes:
+    """Put scenes of a recording beside what its scenario says.
 
-
-def _recorded(
-    recording: Recording, instants: tuple[Instant, ...], consecutive: tuple[Instant, ...] = ()
-) -> Scenes:
+    Raises:
+        RecordingError: The scenario in the metadata cannot be read.
+    """
     metadata = recording.metadata
     try:
         scenario = metadata.scenario
@@ -181,32 +131,37 @@ def _recorded(
     return Scenes(
         name=metadata.name,
         origin=f"recording {recording.directory.name}",
-        instants=instants,
+        instants=tuple(instants),
         carriers=carriers,
         devices=devices,
         assets=recording.assets,
         services=services,
         seed=metadata.seed,
         sampling_period_ns=metadata.sampling_period_ns,
-        consecutive=consecutive,
     )
 
 
-def _instant(frame: RecordedFrame) -> Instant | None:
-    scene = frame.scene()
-    return None if scene is None else Instant(frame.number, frame.t_ns, scene)
+def recorded_instants(frames: Iterable[RecordedFrame]) -> list[Instant]:
+    """Collect the scenes of those frames that have one."""
+    scenes = ((frame, frame.scene()) for frame in frames)
+    return [Instant(frame.number, frame.t_ns, scene) for frame, scene in scenes if scene is not None]
 
 
-def _of_scenario(path: Path, frames: int) -> Scenes:
-    scenario = checked_scenario(path)
-    instants, assets = _simulated(scenario)
-    return _planned(path, scenario, _spread(instants, frames), assets, _middle(instants))
+def simulated_scenes(path: Path, prepared: PreparedScenario) -> Scenes:
+    """Run the worlds of a scenario for an episode, and keep the scene of each frame.
 
+    Args:
+        path: The scenario, as the user calls it.
+        prepared: The same, as `prepare` returns it.
 
-def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
-    """Run the worlds of a scenario; their scene of each frame, and the files of their scenery."""
-    prepared: list[Preparation] = []
-    run = EmbeddedRun(worlds_only(scenario), None, seats={KEEPER: _keeper(prepared.append)})
+    Raises:
+        RunError: The worlds fail.
+    """
+    scenario = prepared.scenario
+    preparations: list[Preparation] = []
+    # A class and not an object: an embedded run makes its services itself, as any other run does.
+    keeper = type("Keeper", (Keeper,), {"on_prepare": staticmethod(preparations.append)})
+    run = EmbeddedRun(worlds_only(prepared), None, seats={KEEPER: keeper})
     seat, instants = run.seats[KEEPER], list[Instant]()
     for _ in run.steps():
         if seat.frame is not None:
@@ -214,52 +169,42 @@ def _simulated(scenario: Scenario) -> tuple[list[Instant], Mapping[str, Path]]:
             seat.answer(StepResult())
     if run.outcome is None or run.outcome.error:
         raise RunError(run.outcome.error if run.outcome else "the worlds ended without an outcome")
-    return instants, prepared[0].assets if prepared else {}
-
-
-def _planned(
-    path: Path,
-    scenario: Scenario,
-    instants: Sequence[Instant],
-    assets: Mapping[str, Path],
-    consecutive: Sequence[Instant] = (),
-) -> Scenes:
     return Scenes(
         name=scenario.run.name,
         origin=f"scenario {path.name}, {scenario.run.frames} frame{'s' * (scenario.run.frames != 1)}",
         instants=tuple(instants),
         carriers=scenario.carriers,
         devices=scenario.devices,
-        assets=assets,
+        assets=preparations[0].assets if preparations else {},
         services=scenario.services,
         seed=scenario.run.seed,
         sampling_period_ns=scenario.run.sampling_period_ns,
-        consecutive=tuple(consecutive),
     )
 
 
-def worlds_only(scenario: Scenario) -> Scenario:
+def worlds_only(prepared: PreparedScenario) -> PreparedScenario:
     """Reduce a scenario to one episode of its worlds and of the agents that need no channel.
 
     An agent that takes a channel or sensors cannot decide here; what it steers stays as it starts. A service
     that keeps the scenes takes the place of all others.
     """
-    kept = services_kept(scenario)
+    scenario = prepared.scenario
+
+    def is_kept(name: str, spec: ServiceSpec) -> bool:
+        if spec.role != "agent" or spec.remote:
+            return spec.role == "world"
+        inputs = prepared.services[name].cls.inputs
+        return {given.topic for given in inputs if given.required} <= {"scene"}
+
+    kept = {name: spec for name, spec in scenario.services.items() if is_kept(name, spec)}
     budget_ms = 1e3  # never reached: nothing is late in an embedded run
     # It has the role of sensors, since these may take scenes without making anything of them.
     kept[KEEPER] = ServiceSpec(role="sensors", use=KEEPER, budget_ms=budget_ms)
-    return replace(scenario, services=kept, run=replace(scenario.run, episodes=1, record=(), pace="free"))
-
-
-def services_kept(scenario: Scenario) -> dict[str, ServiceSpec]:
-    """Select the services that make the scenes: worlds, and agents that need no channel."""
-
-    def is_kept(spec: ServiceSpec) -> bool:
-        if spec.role != "agent" or spec.remote:
-            return spec.role == "world"
-        return {given.topic for given in load("agent", spec.use).inputs if given.required} <= {"scene"}
-
-    return {name: spec for name, spec in scenario.services.items() if is_kept(spec)}
+    run = replace(scenario.run, episodes=1, record=(), pace="free")
+    return PreparedScenario(
+        replace(scenario, services=kept, run=run),
+        {name: service for name, service in prepared.services.items() if name in kept},
+    )
 
 
 class KeeperSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -282,38 +227,3 @@ class Keeper(Service[KeeperSettings]):
     def step(self, frame: Any) -> StepResult:
         """Never called: the seat answers."""
         raise RunError(f"{KEEPER} is answered by its seat")
-
-
-def _keeper(on_prepare: Callable[[Preparation], None]) -> type[Keeper]:
-    """Make the class of a keeper that passes on what it is prepared with."""
-    # A class and not an object: an embedded run makes its services itself, as any other run does.
-    return type("Keeper", (Keeper,), {"on_prepare": staticmethod(on_prepare)})
-
-
-def _spread(entries: Sequence[T], count: int) -> list[T]:
-    """Take ``count`` entries, evenly spread, the first and the last among them; all where there are fewer."""
-    if len(entries) <= count:
-        return list(entries)
-    # Rounding may hit an entry twice where there are few.
-    return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, count).round().astype(int))]
-
-
-def _middle(entries: Sequence[T]) -> list[T]:
-    """Take `CONSECUTIVE` entries from the middle; all where there are fewer."""
-    first = max(0, (len(entries) - CONSECUTIVE) // 2)
-    return list(entries[first : first + CONSECUTIVE])
-
-
-def _run(instants: Sequence[Instant]) -> tuple[Instant, ...]:
-    """Find the longest run of frames with successive numbers that have a transmitter and a receiver."""
-    runs: list[list[Instant]] = [[]]
-    for instant in instants:
-        if runs[-1] and instant.frame != runs[-1][-1].frame + 1:
-            runs.append([])
-        if pairs_of(instant.scene):
-            runs[-1].append(instant)
-        elif runs[-1]:
-            runs.append([])
-    # Of several equal ones the first, so that two comparisons take the same frames.
-    longest: list[Instant] = max(runs, key=lambda run: len(run))
-    return tuple(longest)

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from caviar_broker.core.plan import RunPlan, duration
 from caviar_protocol import messages as m
 from caviar_protocol.codec import message_type
-from caviar_services.places import place_in
+from caviar_services.conversion import place_in
 from caviar_services.service import Frame, Service
 
 LOOK_S = 1.0
@@ -146,7 +146,7 @@ class Watchdog:
 
 
 def _doing(task: m.Message | Frame | None) -> str:
-    """What a service does, after «waiting for …»."""
+    """Work of a service in words, after «waiting for …»."""
     match task:
         case None:
             return "to close"

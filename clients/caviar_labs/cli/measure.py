@@ -13,7 +13,6 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
@@ -30,7 +29,7 @@ from caviar_clients.cli.shared import (
     write_json,
 )
 from caviar_clients.files import require_folder, reserved, write_file
-from caviar_clients.session.checks import checked_scenario
+from caviar_clients.session.prepared import PreparedScenario, prepare
 from caviar_protocol.errors import SetupError
 from caviar_protocol.host import has_extra, install_command
 from caviar_protocol.scenario.toml import MAX_SIZE, parse_toml
@@ -226,13 +225,13 @@ def trade(
 
     if out is not None:
         require_folder("--out", out, "tables and pictures")
-    _require_extras_of_ladder(source, options, with_pictures=out is not None)
+    prepared = _require_extras_of_ladder(source, options, with_pictures=out is not None)
     if json_file is not None:
         require_parent(json_file)
     files = [file for file in (json_file, out and out / "tradeoff.md") if file is not None]
     # Files that are still empty after an error are removed: an empty table looks like a result.
     with reserved(*files):
-        report = _compared(source, frames, options, console)
+        report = _compared(source, prepared, frames, options, console)
     if warning := _other_reference(options, report):
         print_line(console, warning, style="yellow")
     console.print(screen_table(report))
@@ -266,19 +265,22 @@ def _other_reference(options: Options, report: Report) -> str:
     )
 
 
-def _require_extras_of_ladder(source: Path, options: Options, with_pictures: bool) -> None:
+def _require_extras_of_ladder(source: Path, options: Options, with_pictures: bool) -> PreparedScenario | None:
     """Raise `SetupError` with one command where the comparison cannot be made with what is installed.
 
     Then the command installs what the rest of the ladder needs, too; alone, that is left out and reported.
+
+    Returns:
+        The scenario; None of a recording.
     """
-    from caviar_clients.session.scenes import is_recording, services_kept
+    from caviar_clients.session.scenes import is_recording, worlds_only
     from caviar_labs.tradeoff import ladder
     from caviar_labs.tradeoff.campaign import candidates
 
     needed = {"plot"} if with_pictures else set[str]()
-    if not is_recording(source):
-        scenario = checked_scenario(source)
-        needed.update(extras_of(replace(scenario, services=services_kept(scenario))))
+    prepared = None if is_recording(source) else prepare(source)
+    if prepared is not None:
+        needed.update(extras_of(worlds_only(prepared)))
     known = (*ladder.LADDER, *ladder.spacing_settings())
     choices = (
         candidates(options.reference, ladder.REFERENCES, known, "--reference"),
@@ -288,15 +290,17 @@ def _require_extras_of_ladder(source: Path, options: Options, with_pictures: boo
         extras = {load("channel", setting.use).extra for setting in settings}
         # One candidate that the base install can compute is enough.
         needed |= extras if "" not in extras else set()
-    if all(has_extra(extra) for extra in needed):
-        return
-    needed |= {load("channel", setting.use).extra for setting in known} - {""}
-    require_installed("the comparison", sorted(needed))
+    if not all(has_extra(extra) for extra in needed):
+        needed |= {load("channel", setting.use).extra for setting in known} - {""}
+        require_installed("the comparison", sorted(needed))
+    return prepared
 
 
-def _compared(source: Path, frames: int, options: Options, console: Console) -> Report:
-    from caviar_clients.session.scenes import scenes_of
+def _compared(
+    source: Path, prepared: PreparedScenario | None, frames: int, options: Options, console: Console
+) -> Report:
     from caviar_labs.tradeoff.report import compare
+    from caviar_labs.tradeoff.scenes import scenes_of
     from caviar_services.recorder.base import machine
 
     with progress_bar(console, TimeElapsedColumn(), TextColumn("{task.fields[left]}")) as bar:
@@ -307,7 +311,7 @@ def _compared(source: Path, frames: int, options: Options, console: Console) -> 
             left = f"{minutes}:{seconds:02d} left" if news.left_s > 0 else "time is up: ending what began"
             bar.update(task, description=news.text, completed=news.done, left=left)
 
-        return compare(scenes_of(source, frames), options, machine(), show)
+        return compare(scenes_of(source, frames, prepared), options, machine(), show)
 
 
 # --- caviar measure stability ----------------------------------------------------------------------------

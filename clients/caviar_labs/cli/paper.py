@@ -238,7 +238,7 @@ def pizza(
 
     from caviar_clients.cli.shared import print_line, require_installed
     from caviar_clients.files import require_folder, reserved
-    from caviar_clients.session.checks import checked_scenario
+    from caviar_clients.session.prepared import prepare
 
     require_folder("--out", out, "pictures, tables and figures")
     require_installed("the experiment", ("channel", "plot"))
@@ -252,7 +252,7 @@ def pizza(
     settings = replace(
         settings, episodes=episodes or settings.episodes, addresses=addresses or settings.addresses
     )
-    scenario = checked_scenario(Path(SCENARIO))
+    scenario = prepare(Path(SCENARIO)).scenario
     name = "pizza-quick" if quick else "pizza"
     console = Console()
     with reserved(out / f"{name}.md", out / f"{name}.json"):

@@ -16,12 +16,12 @@ from caviar_labs.conform.session import ACTIVE, Session
 from caviar_protocol import scene_validation as scenes
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.codec import decode_payload
-from caviar_protocol.part_validation import PartCheck
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scene_validation import SceneRules
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import Carrier, Channel, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_protocol.validation import PartCheck
 
 FRAMES = 4
 # Between two frames [rad]: beyond half a turn (π) the other way round is the shorter one, and the rotation

@@ -11,9 +11,9 @@ from caviar_labs.conform.canonical import Answer
 from caviar_labs.conform.case import Kit, case
 from caviar_labs.conform.client import Failed, Fields, NotApplicable
 from caviar_labs.conform.session import ACTIVE, JOINED, Session
+from caviar_protocol.assets import is_mesh_name, read_unit_mesh, wrong_name
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.errors import AssetError
-from caviar_protocol.geometry import is_mesh_name, read_unit_mesh, wrong_name
 from caviar_protocol.messages import Asset
 from caviar_protocol.topics import Scene
 

@@ -31,8 +31,7 @@ from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import Interaction, Scene
-from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.geometry import path_geometry
+from caviar_services.channel.paths import Antenna, path_geometry
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from caviar_labs.paper.pizza_radio import RadioTable
 from caviar_labs.paper.pizza_town import Ways, draw_places, points_along
 from caviar_protocol.arrays import Float64Array, Int64Array
-from caviar_services.agent.perceptron import Perceptron
+from caviar_services.agent.learner import Perceptron
 
 STEP_M = 4.0
 """That the drone flies from one frame to the next at most: 8 m/s, two frames a second."""

@@ -16,7 +16,7 @@ import numpy as np
 from caviar_labs.paper.pizza_beams import STEP_M
 from caviar_labs.paper.pizza_town import Found, Ways, draw_places, points_along
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.agent.perceptron import Perceptron
+from caviar_services.agent.learner import Perceptron
 
 WORTHS = (0.0, 2.0, 8.0)
 """What a metre at rate 0 costs beyond one at the best rate, of each kind of way; 0: the shortest."""

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from caviar_clients.envs.deliveries import Deliveries
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import open_session
+from caviar_clients.session.prepared import prepare
 from caviar_labs.paper.pizza_flight import Legs
 from caviar_labs.paper.pizza_town import HEIGHT_M, Round
 from caviar_protocol.arrays import BoolArray, Float64Array
@@ -138,14 +138,15 @@ class Loop(AbstractContextManager["Loop"]):
     """
 
     def __init__(self, scenario: str | Path) -> None:
-        described = checked_scenario(Path(scenario))
+        prepared = prepare(Path(scenario))
+        described = prepared.scenario
         flown = described.services["world"].settings["flown"][0]
         self._drone, self._speed = str(flown["name"]), float(flown["max_speed_m_s"])
         self.frame_s = described.run.sampling_period_ns / 1e9
         """Duration of a frame."""
         self.bandwidth_hz = described.carriers[0].bandwidth_hz
         wanted = (Input(topic="scene"), Input(topic="link", lag=1, required=False))
-        self._session = open_session(described, "pilot", wanted, beside=("beams",))
+        self._session = open_session(prepared, "pilot", wanted, beside=("beams",))
         self._users = Users(described, ("*",))
 
     def __exit__(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from caviar_clients.session.checks import checked_scenario
 from caviar_clients.session.connected import open_session
+from caviar_clients.session.prepared import prepare
 from caviar_labs.paper.pizza_town import HEIGHT_M, is_free
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.errors import RunError
@@ -25,7 +25,7 @@ from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import directions
 from caviar_protocol.topics import Channel
 from caviar_services.link.base import channels_of
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.link.beams import BeamLinkSettings
 from caviar_services.link.link_budget import LinkBudget
 
@@ -80,7 +80,7 @@ def radio_table(scenario: str | Path, cell_m: float) -> RadioTable:
     xs, ys = (np.arange(a, b + 1e-9, cell_m) for a, b in zip(_LOW_M, _HIGH_M, strict=True))
     grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1)
     places = grid[is_free(grid, _GRID_WALL_M)]
-    standing = _standing(checked_scenario(Path(scenario)), places)
+    standing = _standing(prepare(Path(scenario)).scenario, places)
     wanted = (Input(topic="scene"), Input(topic="channel", parts=("h",)))
     with open_session(standing, "beams", wanted) as session:
         frame = session.reset(seed=0)

@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.env import RadioStrikeEnv, Returned
-from caviar_clients.envs.radio_strike.rules import (
+from caviar_labs.paper.radio_strike_published import PublishedRun, Run, made_again, read_run
+from caviar_labs.radio_strike.env import RadioStrikeEnv, Returned
+from caviar_labs.radio_strike.rules import (
     BEAMS,
     USERS,
     Rays,
@@ -19,9 +20,8 @@ from caviar_clients.envs.radio_strike.rules import (
     rules_of,
     straight_lines,
 )
-from caviar_clients.envs.radio_strike.sources import Source, episode_loaders
-from caviar_clients.envs.radio_strike.trajectories import Episode
-from caviar_labs.paper.radio_strike_published import PublishedRun, Run, made_again, read_run
+from caviar_labs.radio_strike.sources import Source, episode_loaders
+from caviar_labs.radio_strike.trajectories import Episode
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.seeding import derive_seed
 

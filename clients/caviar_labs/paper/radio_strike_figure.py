@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.rules import USERS
 from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, VERMILION, figure
 from caviar_labs.paper.radio_strike import RULES, AgentName, Played, Report
+from caviar_labs.radio_strike.rules import USERS
 from caviar_protocol.arrays import Float64Array
 
 _COLOURS: Mapping[AgentName, str] = {

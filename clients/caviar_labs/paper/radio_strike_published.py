@@ -1,7 +1,7 @@
 """The run that was published with Radio-Strike, and the first version of its simulator, which made it.
 
 The data are 7,399 rows of an oracle that schedules the users in turn. They do not come from the simulator of
-the challenge (`caviar_clients.envs.radio_strike`, ``rules="legacy"``) but from the first version of its code,
+the challenge (`caviar_labs.radio_strike`, ``rules="legacy"``) but from the first version of its code,
 with
 
 * 64 antennas in a row along x instead of 8×8, steering vectors of norm 1 and the same codebook;
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.rules import (
+from caviar_labs.radio_strike.rules import (
     BEAMS,
     LEGACY,
     MAX_AGE,

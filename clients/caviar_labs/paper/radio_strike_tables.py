@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from caviar_clients.envs.radio_strike.rules import USERS, RulesName
 from caviar_labs.paper.comparison import Comparison, number, with_interval, with_range
 from caviar_labs.paper.radio_strike import RULES, Report, Settings
 from caviar_labs.paper.radio_strike_published import PublishedRun
+from caviar_labs.radio_strike.rules import USERS, RulesName
 
 _ORIGIN = (
     "The paper has no figures of Radio-Strike; it announces the challenge, which published its code and "

@@ -16,6 +16,7 @@ import numpy as np
 
 from caviar_clients.session.scenes import Scenes
 from caviar_protocol.arrays import Complex128Array, Float64Array, quantity
+from caviar_protocol.multipath import power_spread
 from caviar_protocol.scenario.conversion import convert_settings
 from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.topics import Channel, Scene
@@ -42,25 +43,6 @@ def path_gain_db(a: Complex128Array) -> float:
     """
     power = float((np.abs(a) ** 2).sum())
     return 10 * float(np.log10(power)) if power > 0 else -np.inf
-
-
-def delay_spread_s(tau: Float64Array, power: Float64Array) -> float:
-    """Compute the root mean square delay spread [s] (Recommendation ITU-R P.1407-8, second central moment).
-
-    S = sqrt(Σ P_p τ_p² / ΣP − (Σ P_p τ_p / ΣP)²). 0 for a single path.
-
-    Args:
-        tau: Delays of the paths [s], Shape ``[P]``.
-        power: Their powers, Shape ``[P]``.
-
-    Example:
-        >>> delay_spread_s(np.array([0.0, 1e-7]), np.array([1.0, 1.0]))
-        5e-08
-    """
-    # About the mean: the difference of two squares of a microsecond keeps no picoseconds.
-    total = power.sum()
-    mean = (power * tau).sum() / total
-    return float(np.sqrt((power * (tau - mean) ** 2).sum() / total))
 
 
 def angular_spread_rad(angle: Float64Array, power: Float64Array) -> float:
@@ -244,7 +226,7 @@ def _user_channel(
     return UserChannel(
         los=los,
         path_gain_db=path_gain_db(a),
-        delay_spread_s=delay_spread_s(channel.tau[paths], power),
+        delay_spread_s=float(power_spread(power, channel.tau[paths])),
         angular_spread_rad=np.array([angular_spread_rad(angle, power) for angle in directions.T]),
         h=h,
         capacity_bps_hz=capacity_bps_hz(h, transmit_power(user) / noise_w),

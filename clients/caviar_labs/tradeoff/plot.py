@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure, place_labels
+from caviar_clients.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, figure
 from caviar_labs.tradeoff.errors import Row
+from caviar_labs.tradeoff.labels import place_labels
 from caviar_labs.tradeoff.report import Point, Report
 
 RUNG_COLOURS = {

@@ -1,9 +1,9 @@
 """Bytes to typed objects and back: messages, payloads, frames of a WebSocket."""
 
-from caviar_protocol.codec.decoding import Buffer
 from caviar_protocol.codec.messages import (
     BIG_ENDIAN,
     SUBPROTOCOL,
+    Buffer,
     check_parts,
     check_version,
     decode_message,

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import MAX_DIMENSIONS, WIRE_DTYPES, Payload, require_finite
-from caviar_protocol.codec.decoding import Buffer, decode_bounded
+from caviar_protocol.codec.messages import Buffer, decode_bounded
 from caviar_protocol.errors import DecodeError, LimitError, PayloadError
 from caviar_protocol.fields import MAX_BODY, MAX_HEADER
 from caviar_protocol.topics import PAYLOADS
@@ -333,7 +333,15 @@ def _converter(hint: Any) -> Convert:
     if origin in (Union, UnionType):
         return _union(arguments)
     if origin is Literal:
-        return _literal(frozenset(arguments))
+        allowed = frozenset(arguments)
+
+        def convert(value: Any, _: BodyWriter) -> Any:
+            # msgspec checks literals when it decodes, not when it encodes.
+            if value not in allowed:
+                raise ValueError(f"expected one of {', '.join(sorted(map(str, allowed)))}")
+            return value
+
+        return convert
     if origin is tuple:
         return _sequence(arguments[0]) if arguments[1:] == (...,) else _tuple(arguments)
     if origin is np.ndarray:
@@ -380,16 +388,6 @@ def _runtime_type(hint: Any) -> type:
         return _runtime_type(get_args(hint)[0])
     found: type = get_origin(hint) or hint
     return found
-
-
-def _literal(allowed: frozenset[Any]) -> Convert:
-    def convert(value: Any, _: BodyWriter) -> Any:
-        # msgspec checks literals when it decodes, not when it encodes.
-        if value not in allowed:
-            raise ValueError(f"expected one of {', '.join(sorted(map(str, allowed)))}")
-        return value
-
-    return convert
 
 
 def _sequence(item: Any) -> Convert:

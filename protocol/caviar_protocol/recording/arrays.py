@@ -11,7 +11,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -100,6 +100,10 @@ class Column(Generic[S]):
         return found
 
 
+# Python evaluates type hints anew at each call, and a payload has a dozen columns.
+_type_hints = cache(partial(get_type_hints, include_extras=True))
+
+
 def payload_column(
     dtype: type[S],
     cls: type[Payload],
@@ -116,7 +120,7 @@ def payload_column(
         axes: Leading axes of the field that count rows.
         rows: Rows of one product; by default those of the field along its first axis.
     """
-    spec, hint = array_fields(cls)[name], get_type_hints(cls, include_extras=True)[name]
+    spec, hint = array_fields(cls)[name], _type_hints(cls)[name]
     candidates = (hint, *get_args(hint))  # an optional field is a union with the annotated type
     doc = next(
         str(meta.description)

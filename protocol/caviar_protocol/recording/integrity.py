@@ -11,9 +11,9 @@ from pathlib import Path
 
 import msgspec
 
+from caviar_protocol.assets import digest_in, recorded_meshes
 from caviar_protocol.digest import RunDigest, file_digest
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.geometry import digest_in, recorded_meshes
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import (
     FORMAT,
@@ -336,7 +336,14 @@ def recorded_digest(recorded: RecordedSegments) -> RunDigestReport:
             earlier = entry
             damage += [f"{at}: {fault}" for fault in faults]
             chain.add_frame(entry.episode, entry.frame, fresh)
-        damage += _altered(segment, recorded, places)
+        # Ranges of a segment that are not as they were written, other than those of ``reported`` damage.
+        record = recorded.record(segment)
+        found = segment.altered(record.crc if record is not None and len(segment) == record.size else None)
+        damage += [
+            f"{segment.path}: bytes {start} to {stop} are not what was written (CRC-32)"
+            for start, stop in found
+            if not any(start < end and begin < stop for begin, end in places)
+        ]
     damage += damaged_assets(recorded)
     frames = sum(len(segment.entries) for segment in recorded.segments)
     return RunDigestReport(digest=chain.hexdigest(), frames=frames, damage=tuple(damage))
@@ -387,17 +394,6 @@ def _damaged_meshes(recorded: RecordedSegments) -> list[str]:
         if digest != digest_in(name):
             found.append(f"{file}: its digest is {digest}, was {digest_in(name)}")
     return found
-
-
-def _altered(segment: Segment, recorded: RecordedSegments, reported: list[tuple[int, int]]) -> list[str]:
-    """Ranges of a segment that are not as they were written, other than those of ``reported`` damage."""
-    record = recorded.record(segment)
-    found = segment.altered(record.crc if record is not None and len(segment) == record.size else None)
-    return [
-        f"{segment.path}: bytes {start} to {stop} are not what was written (CRC-32)"
-        for start, stop in found
-        if not any(start < end and begin < stop for begin, end in reported)
-    ]
 
 
 def _faults(

@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 import numpy as np
 
 from caviar_protocol.arrays import Payload
+from caviar_protocol.assets import recorded_meshes
 from caviar_protocol.errors import RecordingError, suggestion
-from caviar_protocol.geometry import recorded_meshes
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import (
     FrameEntry,
@@ -36,22 +36,20 @@ from caviar_protocol.recording.integrity import (
     metadata_of,
     recorded_digest,
 )
-from caviar_protocol.recording.scene import (
-    CameraArrays,
-    DepthArrays,
-    LidarArrays,
-    SceneArrays,
-    SegmentationArrays,
-)
 from caviar_protocol.recording.segment import Channel, Segment
-from caviar_protocol.recording.topics import (
-    TOPIC_ARRAYS,
-    ActionArrays,
-    ChannelArrays,
-    LinkArrays,
-)
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
+
+# Columns read the type hints of all payloads: what looks at frames and digests alone does without.
+if TYPE_CHECKING:
+    from caviar_protocol.recording.scene import (
+        CameraArrays,
+        DepthArrays,
+        LidarArrays,
+        SceneArrays,
+        SegmentationArrays,
+    )
+    from caviar_protocol.recording.topics import ActionArrays, ChannelArrays, LinkArrays
 
 T = TypeVar("T", bound=str)
 Key: TypeAlias = T | tuple[T, str]
@@ -102,7 +100,15 @@ class Recording:
         self._starts = [0]
         for segment in self._segments:
             self._starts.append(self._starts[-1] + len(segment.chunks))
-        self._index = self._build_index()
+        # Segments of two runs in one folder would interleave: numbers must ascend without exception.
+        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
+        for earlier, later in pairwise(order):
+            if later <= earlier:
+                raise RecordingError(
+                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
+                    f"episode {earlier[0]}: segments of two runs are mixed"
+                )
+        self._index = {key: index for index, key in enumerate(order)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Its files are mapped into the memory of this process: another one opens them itself.
@@ -187,6 +193,8 @@ class Recording:
                 f"recording[{key!r}] is no topic, which is a text, as in recording['link']; frames are "
                 "recording.frame(episode=0, frame=7) and recording.frames()"
             )
+        from caviar_protocol.recording.topics import TOPIC_ARRAYS
+
         topic, source = (key, "") if isinstance(key, str) else key
         return TOPIC_ARRAYS[check_topic(topic)](
             self, topic, self._sources(topic, source), np.arange(len(self), dtype=np.int64)
@@ -398,17 +406,6 @@ class Recording:
             for item in entry.inputs
             if item.status is Status.LATE
         }
-
-    def _build_index(self) -> dict[tuple[int, int], int]:
-        # Segments of two runs in one folder would interleave: numbers must ascend without exception.
-        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
-        for earlier, later in pairwise(order):
-            if later <= earlier:
-                raise RecordingError(
-                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
-                    f"episode {earlier[0]}: segments of two runs are mixed"
-                )
-        return {key: index for index, key in enumerate(order)}
 
     def _read_metadata(self) -> RecordingMetadata:
         found = [metadata_of(segment) for segment in self._segments]

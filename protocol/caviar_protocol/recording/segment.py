@@ -125,7 +125,19 @@ class Segment:
             raise RecordingError(f"{path} cannot be read: {error.strerror} (errno {error.errno})") from error
         self._scan()
         if not self.finished and self._seals:
-            self._cut_behind_last_good_seal()
+            # Keep what is sealed of a segment that was not closed: after a power loss, pages in the middle
+            # may be zero while later ones are there, and CRCs find them.
+            good, crc = 0, 0
+            for place, recorded in self._seals:
+                if zlib.crc32(self._data[good:place], crc) != recorded:
+                    self.damage.append(f"bytes {good} to {place} are not what was written (CRC-32)")
+                    break
+                good, crc = place + _SEAL.size, zlib.crc32(seal(recorded), recorded)
+            self.readable = good
+            self.chunks = [chunk for chunk in self.chunks if chunk.stop <= good]
+            # Not even the metadata are sealed: the segment counts as one without any.
+            if not self.chunks and not good:
+                self.metadata = {}
         self._read_entries()
 
     def __len__(self) -> int:
@@ -218,21 +230,6 @@ class Segment:
 
     def _end_is_in_place(self) -> bool:
         return len(self) > len(MAGIC) and self._data[-len(MAGIC) :] == MAGIC
-
-    def _cut_behind_last_good_seal(self) -> None:
-        """Of a segment that was not closed, and may have holes after a power loss, keep what is sealed."""
-        # After a power loss pages in the middle may be zero while later ones are there: CRCs find them.
-        good, crc = 0, 0
-        for place, recorded in self._seals:
-            if zlib.crc32(self._data[good:place], crc) != recorded:
-                self.damage.append(f"bytes {good} to {place} are not what was written (CRC-32)")
-                break
-            good, crc = place + _SEAL.size, zlib.crc32(seal(recorded), recorded)
-        self.readable = good
-        self.chunks = [chunk for chunk in self.chunks if chunk.stop <= good]
-        # Not even the metadata are sealed: the segment counts as one without any.
-        if not self.chunks and not good:
-            self.metadata = {}
 
     def _read_record(self, opcode: int, start: int, stop: int) -> str:
         """Read one record into `metadata`, `channels`, `chunks` or the seals; what is wrong with it."""

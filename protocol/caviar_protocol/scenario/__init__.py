@@ -6,6 +6,13 @@
 
 `schema` has the types of the tables, `rules` what holds between keys, `instants` frames at given instants,
 `conversion` the errors about a value, and `toml` the lines of keys.
+
+Attachments: services that the command line attaches to a scenario, ``caviar run --attach NAME=VALUE``.
+
+An installed distribution adds one by an entry point of the group ``caviar.attachments``: a function that is
+given the scenario and ``VALUE``, and returns the scenario with what it attaches. The first line of its
+docstring is the help of ``caviar run --NAME VALUE``. The command and the broker both call it: its module
+imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -19,12 +26,14 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from importlib import resources
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeAlias
 
 import msgspec
 
-from caviar_protocol.errors import DeclarationError, ScenarioError
+from caviar_protocol.errors import DeclarationError, ScenarioError, suggestion
 from caviar_protocol.fields import MAX_SUBCARRIERS
+from caviar_protocol.plugins import load_plugin, origin, plugins
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario.conversion import FILE, Place, Source, convert_table
 from caviar_protocol.scenario.instants import instants_ns, with_instants
@@ -159,7 +168,14 @@ def parse_scenario(
     scenario = msgspec.structs.replace(scenario, source=_with_device_names(source, scenario))
     check_scenario(scenario)
     # After the rules: what follows from keys is never what an error is about.
-    scenario = _with_numerologies(scenario)
+    # The scenario with all that follows from the keys of its carriers written out.
+    run, place = scenario.run, Place("carriers", scenario.source)
+    # Given instants have no period, so that slots need a duration of their own.
+    period = None if run.instants_s else run.sampling_period_ns
+    carriers = tuple(
+        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
+    )
+    scenario = msgspec.structs.replace(scenario, carriers=carriers)
     return _with_files(scenario, folder or Path())
 
 
@@ -288,7 +304,14 @@ def _toml_remedy(line: str) -> str:
 def _beside(path: Path) -> str:
     """The scenarios that stand where one was looked for, or those that ship."""
     if path.is_dir():
-        return _in_folder(path)
+        # Remedy for a folder: the scenarios in it, or what can be done with a run.
+        run = RunDirectory(path)
+        if run.record.exists() or run.manifest.exists():
+            return f"; it is the directory of a run, whose world runs again with: caviar replay {path}"
+        names = sorted(file.name for file in path.glob("*.toml"))
+        if not names:
+            return "; a scenario is a TOML file: caviar new NAME writes one"
+        return f"; {path.resolve()} has {', '.join(names)}: name one of them, as {path / names[0]}"
     shipped = shipped_scenarios()
     file = path.with_name(path.name + ".toml")
     if file.is_file():
@@ -308,28 +331,6 @@ def _beside(path: Path) -> str:
     close = difflib.get_close_matches(path.name, names, n=1)
     meant = f"; did you mean {path.with_name(close[0])}?" if close else ""
     return f"{meant}; {path.parent.resolve()} has {', '.join(names)}"
-
-
-def _in_folder(folder: Path) -> str:
-    """Remedy for a folder: the scenarios in it, or what can be done with a run."""
-    run = RunDirectory(folder)
-    if run.record.exists() or run.manifest.exists():
-        return f"; it is the directory of a run, whose world runs again with: caviar replay {folder}"
-    names = sorted(file.name for file in folder.glob("*.toml"))
-    if not names:
-        return "; a scenario is a TOML file: caviar new NAME writes one"
-    return f"; {folder.resolve()} has {', '.join(names)}: name one of them, as {folder / names[0]}"
-
-
-def _with_numerologies(scenario: Scenario) -> Scenario:
-    """The scenario with all that follows from the keys of its carriers written out."""
-    run, place = scenario.run, Place("carriers", scenario.source)
-    # Given instants have no period, so that slots need a duration of their own.
-    period = None if run.instants_s else run.sampling_period_ns
-    carriers = tuple(
-        with_numerology(carrier, period, place.at(index)) for index, carrier in enumerate(scenario.carriers)
-    )
-    return msgspec.structs.replace(scenario, carriers=carriers)
 
 
 def with_numerology(carrier: Carrier, sampling_period_ns: int | None, place: Place) -> Carrier:
@@ -475,3 +476,48 @@ def absolute_paths(value: Any, folder: Path, place: Place) -> Any:
     if not path.exists():
         raise place.error(f"there is no {path}; {value!r} is relative to the folder of the scenario")
     return str(path)
+
+
+ATTACHMENTS = "caviar.attachments"
+"""Group of entry points."""
+
+
+def attached(scenario: Scenario, attachments: Sequence[str]) -> Scenario:
+    """Attach services to a scenario, one after the other.
+
+    Args:
+        scenario: Checked, as it was loaded.
+        attachments: ``NAME=VALUE`` each.
+
+    Raises:
+        ScenarioError: Nothing has the name, or it cannot be attached to this scenario.
+        DeclarationError: What a distribution registers is no attachment.
+
+    Example:
+        >>> from caviar_protocol.scenario import load_scenario
+        >>> attached(load_scenario("smoke"), ["engine"])
+        Traceback (most recent call last):
+            ...
+        caviar_protocol.errors.ScenarioError: --attach engine: write it as NAME=VALUE
+    """
+    for text in attachments:
+        name, separator, value = text.partition("=")
+        if not separator:
+            raise ScenarioError(f"--attach {text}: write it as NAME=VALUE")
+        known = plugins(ATTACHMENTS)
+        if name not in known:
+            hint = suggestion(name, sorted(known)) if known else "nothing that is installed can be attached"
+            raise ScenarioError(f"--attach {text}: {name!r} does not exist; {hint}")
+        scenario = load_plugin(known[name], FunctionType)(scenario, value)
+        if not isinstance(scenario, Scenario):
+            raise DeclarationError(f"--attach {text}: {origin(known[name])} returns no scenario")
+    return scenario
+
+
+def summary(name: str) -> str:
+    """First line of what an attachment says of itself; of one that cannot be loaded, why."""
+    try:
+        text = load_plugin(plugins(ATTACHMENTS)[name], FunctionType).__doc__ or ""
+    except DeclarationError as error:
+        return str(error)
+    return text.strip().partition("\n")[0].rstrip(".")

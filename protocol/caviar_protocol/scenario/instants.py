@@ -82,7 +82,20 @@ def with_instants(table: Mapping[str, Any], place: Place, folder: Path = Path())
         written = [(value, here.at(index).error) for index, value in enumerate(values)]
     seconds: list[float] = []
     for index, (value, refuse) in enumerate(written):
-        seconds.append(_instant(value, key, refuse))
+        # Seconds of an instant as it is written: a number, or a line of a file.
+        if key == NANOSECONDS and (type(value) is not int or value < 0):
+            raise refuse(f"is {value!r}, write whole nanoseconds ≥ 0")
+        try:
+            exact = Decimal(str(value)).scaleb(-9 if key == NANOSECONDS else 0)
+        except InvalidOperation as error:
+            raise refuse(f"{value!r} is no number; write seconds") from error
+        # The range first: of 1e300 a remainder cannot be computed.
+        is_whole = exact.is_finite() and 0 <= exact < _LATEST_S and not exact.scaleb(9) % 1
+        if not is_whole and key == KEY:
+            raise refuse(f"is {value}, write seconds ≥ 0 with at most 9 decimals")
+        if not is_whole or _nanoseconds(float(exact)) != exact.scaleb(9):
+            raise refuse(f"is {value}, so late that nanoseconds are not distinguished; write at most 1e6 s")
+        seconds.append(float(exact))
         if index and seconds[index] <= seconds[index - 1]:
             raise refuse(f"{value} does not come after {written[index - 1][0]}; order the instants by time")
     # By their shortest decimal form, as it stands in the file: 0.1 s is 100,000,000 ns and not a bit more.
@@ -98,23 +111,6 @@ def _lines_of(path: Path, place: Place) -> list[tuple[Any, Refuse]]:
     if len(rows) < 2:
         raise ScenarioError(f"holds no instant; write {COLUMN}, then one a line", str(path), place.key)
     return [(row.text.strip(), partial(ScenarioError, file=str(path), line=row.number)) for row in rows[1:]]
-
-
-def _instant(value: Any, key: str, refuse: Refuse) -> float:
-    """Seconds of an instant as it is written: a number, or a line of a file."""
-    if key == NANOSECONDS and (type(value) is not int or value < 0):
-        raise refuse(f"is {value!r}, write whole nanoseconds ≥ 0")
-    try:
-        exact = Decimal(str(value)).scaleb(-9 if key == NANOSECONDS else 0)
-    except InvalidOperation as error:
-        raise refuse(f"{value!r} is no number; write seconds") from error
-    # The range first: of 1e300 a remainder cannot be computed.
-    is_whole = exact.is_finite() and 0 <= exact < _LATEST_S and not exact.scaleb(9) % 1
-    if not is_whole and key == KEY:
-        raise refuse(f"is {value}, write seconds ≥ 0 with at most 9 decimals")
-    if not is_whole or _nanoseconds(float(exact)) != exact.scaleb(9):
-        raise refuse(f"is {value}, so late that nanoseconds are not distinguished; write at most 1e6 s")
-    return float(exact)
 
 
 def _nanoseconds(seconds: float) -> Decimal:

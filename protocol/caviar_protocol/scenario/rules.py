@@ -75,7 +75,13 @@ def check_scenario(scenario: Scenario) -> None:
     root = Place("", scenario.source)
     _check_duration(scenario, root.at("run"))
     _check_record(scenario, root.at("run").at("record"))
-    _check_timeouts(scenario, root.at("timeouts"))
+    place = root.at("timeouts")
+    timeouts = scenario.timeouts
+    if timeouts.heartbeat_s >= timeouts.liveness_s:
+        raise place.error(
+            f"heartbeat_s = {timeouts.heartbeat_s} leaves no heartbeat within liveness_s = "
+            f"{timeouts.liveness_s}; write at most {timeouts.liveness_s / 2}"
+        )
     _check_limits(scenario, root.at("limits"))
     _unique((carrier.name for carrier in scenario.carriers), "carrier", root.at("carriers"))
     _unique((device.name for device in scenario.devices), "device", root.at("devices"))
@@ -318,15 +324,6 @@ def _check_record(scenario: Scenario, place: Place) -> None:
             raise place.at(index).error(problem)
     if scenario.run.record and not any(s.role == "recorder" for s in scenario.services.values()):
         raise place.error('topics to record need a recorder; add [services.recorder] with role = "recorder"')
-
-
-def _check_timeouts(scenario: Scenario, place: Place) -> None:
-    timeouts = scenario.timeouts
-    if timeouts.heartbeat_s >= timeouts.liveness_s:
-        raise place.error(
-            f"heartbeat_s = {timeouts.heartbeat_s} leaves no heartbeat within liveness_s = "
-            f"{timeouts.liveness_s}; write at most {timeouts.liveness_s / 2}"
-        )
 
 
 def _check_limits(scenario: Scenario, place: Place) -> None:

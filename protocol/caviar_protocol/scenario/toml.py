@@ -167,7 +167,8 @@ class _Scanner:
         while True:
             self.skip(_SPACE)
             if self.text[self.at] in "\"'":
-                parts.append(_unquoted(self.skip(_STRING)))
+                parsed: dict[str, Any] = tomllib.loads(f"key = {self.skip(_STRING)}")
+                parts.append(str(parsed["key"]))
             else:
                 parts.append(self.skip(_BARE_KEY))
             self.skip(_SPACE)
@@ -220,11 +221,6 @@ class _Scanner:
             self.skip(_BLANK)
             if self.text[self.at] == ",":
                 self.at += 1
-
-
-def _unquoted(raw: str) -> str:
-    parsed: dict[str, Any] = tomllib.loads(f"key = {raw}")
-    return str(parsed["key"])
 
 
 def toml_text(document: Mapping[str, Any]) -> str:

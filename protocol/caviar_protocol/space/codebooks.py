@@ -29,9 +29,18 @@ import numpy as np
 from caviar_protocol.arrays import Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import ScenarioError, suggestion
 from caviar_protocol.plugins import plugin_class, plugins
-from caviar_protocol.space.antenna_arrays import Subarray, facing, steering_vector, subarrays
+from caviar_protocol.space.antenna_arrays import (
+    Subarray,
+    beam_gain,
+    beam_towards,
+    dft_beam,
+    dft_codebook,
+    facing,
+    pointing_directions,
+    steering_vector,
+    subarrays,
+)
 from caviar_protocol.space.coordinates import rotation_matrix
-from caviar_protocol.space.dft import beam_gain, beam_towards, dft_beam, dft_codebook, pointing_directions
 from caviar_protocol.topics.scene import AntennaArray
 
 DFT = "dft"

@@ -11,7 +11,7 @@ import operator
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
-from typing import ClassVar, NoReturn, TypeVar
+from typing import ClassVar, TypeVar
 
 import msgspec
 
@@ -241,7 +241,10 @@ def checked_choices(
             raise PayloadError(f"{author} chose {_shown(choice)}, which is no BeamChoice; write {_FORM}")
         tx, rx, carrier = choice.tx, choice.rx, choice.carrier
         if not (isinstance(tx, str) and isinstance(rx, str) and isinstance(carrier, str)):
-            _refuse_name(author, choice)
+            values = (("tx", choice.tx), ("rx", choice.rx), ("carrier", choice.carrier))
+            name, value = next(entry for entry in values if not isinstance(entry[1], str))
+            form = "the carrier's name, a text" if name == "carrier" else f"{name}=pair.{name}.name"
+            raise PayloadError(f"{author}: {name}={_shown(value)} is no name; write {form}")
         pair = served.get((tx, rx))
         if pair is None:
             known = ", ".join(f"{one} → {other}" for one, other in served) or "none"
@@ -278,13 +281,6 @@ def _check_beam(author: str, name: str, choice: BeamChoice, device: AntennaDevic
     raise PayloadError(
         f"{author}: {name}={_shown(beam)} for {_user(choice)}; write {allowed} of {device.name!r}"
     )
-
-
-def _refuse_name(author: str, choice: BeamChoice) -> NoReturn:
-    values = (("tx", choice.tx), ("rx", choice.rx), ("carrier", choice.carrier))
-    name, value = next(entry for entry in values if not isinstance(entry[1], str))
-    form = "the carrier's name, a text" if name == "carrier" else f"{name}=pair.{name}.name"
-    raise PayloadError(f"{author}: {name}={_shown(value)} is no name; write {form}")
 
 
 def _user(choice: BeamChoice) -> str:

@@ -17,13 +17,12 @@ import msgspec
 from caviar_protocol.arrays import quantity
 from caviar_protocol.messages import Input
 from caviar_protocol.space.beams import best_pairs, straight_beams
-from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, directions
 from caviar_protocol.topics import BeamChoice, Scene, WaypointCommand
 from caviar_services.agent.base import Agent, AgentSettings
 from caviar_services.checkpoint import restored, saved
 from caviar_services.link.base import User, Users, channels_of, require_channel
-from caviar_services.link.beam_sweep import sweep_users
+from caviar_services.link.beam_scores import sweep_users
 from caviar_services.service import Frame, RunInfo
 
 
@@ -155,18 +154,16 @@ class WaypointsAgent(Agent[WaypointsSettings]):
         if name not in scene.names:
             return
         x, y, z = scene.position[scene.names.index(name)].tolist()
-        yield WaypointCommand(object=name, position=self._target((x, y, z)), speed=self.settings.speed_m_s)
-
-    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
-        """The straight-line pair of each user."""
-        return straight_choices(scene, pairs)
-
-    def _target(self, position: Vector) -> Vector:
-        """The first waypoint not yet reached."""
+        # The first waypoint not yet reached.
+        position = (x, y, z)
         points = self.settings.waypoints_m
         # A loop, not a step: waypoints that lie closer together than the reach are passed in one frame.
         while (
             self._next < len(points) - 1 and math.dist(position, points[self._next]) <= self.settings.reach_m
         ):
             self._next += 1
-        return points[self._next]
+        yield WaypointCommand(object=name, position=points[self._next], speed=self.settings.speed_m_s)
+
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
+        """The straight-line pair of each user."""
+        return straight_choices(scene, pairs)

@@ -136,7 +136,11 @@ class Fingerprints:
             return ()
         cell = self._cell(position)
         if cell not in self._seen[key]:
-            cell = self._nearest(key, cell)
+            if key not in self._cells:
+                known = sorted(self._seen[key])
+                self._cells[key] = known, np.array(known, np.float64)
+            known, places = self._cells[key]
+            cell = known[int(((places - cell) ** 2).sum(1).argmin())]
         if (key, cell) not in self._ranked:
             seen = self._seen[key][cell]
             order = sorted(seen, key=lambda pair: (-seen[pair][0], -seen[pair][1], pair))
@@ -146,13 +150,6 @@ class Fingerprints:
     def _cell(self, position: Vector) -> Cell:
         x, y, z = (math.floor(value / self._cell_m) for value in position)
         return x, y, z
-
-    def _nearest(self, key: Codebooks, cell: Cell) -> Cell:
-        if key not in self._cells:
-            known = sorted(self._seen[key])
-            self._cells[key] = known, np.array(known, np.float64)
-        known, places = self._cells[key]
-        return known[int(((places - cell) ** 2).sum(1).argmin())]  # of equal ones the first
 
 
 def learnt(path: Path, cell_m: float) -> Fingerprints:
@@ -237,7 +234,8 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
             pairs = self._table.pairs(Codebooks.of(user, user.carrier.name), position)
             if not pairs:
                 sounding.note(UNKNOWN)
-                yield Measured(index, *_straight(sounding.scene, user))
+                at_tx, at_rx = directions(sounding.scene, [user])
+                yield Measured(index, *straight_beams(user.tx.array, at_tx[0], user.rx.array, at_rx[0]))
                 continue
             found = sounding.best_of(index, pairs[: self.settings.candidates])
             if found is not None:
@@ -248,8 +246,3 @@ def _codebook(array: AntennaArray) -> tuple[int, str]:
     """Size and name of a scenario's codebook, as they are in a scene."""
     published = published_array(array)
     return beam_count(published), published.codebook
-
-
-def _straight(scene: Scene, pair: Pair) -> tuple[int, int]:
-    at_tx, at_rx = directions(scene, [pair])
-    return straight_beams(pair.tx.array, at_tx[0], pair.rx.array, at_rx[0])

@@ -323,7 +323,16 @@ class PolicyAgent(Agent[PolicySettings]):
         """The policy's choice for each user; its digest among the decisions."""
         imposed, wanted = frame.imposed.get(DECISION, ""), frame.imposed.get(NEXT, "")
         if imposed:
-            self._served = self._imposed(imposed, frame.number)
+            # The policy that decided a frame that is computed again.
+            if imposed not in self._loaded and imposed in self._paths:
+                self._loaded[imposed] = self._load(self._paths[imposed], f"policy {imposed[:12]}…", imposed)
+            if imposed not in self._loaded:
+                raise ScenarioError(
+                    f"frame {frame.number} was decided by the policy of SHA-256 {imposed}, and this file has "
+                    f"{self._served.model.digest}; give the replay the same file",
+                    key=self.run.settings_place.at("file").key,
+                )
+            self._served = self._loaded[imposed]
         elif wanted:
             self._served = self._loaded.get(wanted, self._served)
         made = super().step(frame)
@@ -335,18 +344,6 @@ class PolicyAgent(Agent[PolicySettings]):
             self._asked.discard(wanted)
             decisions[REFUSED] = f"{wanted} {self._refused.pop(wanted)}"
         return replace(made, decisions=decisions)
-
-    def _imposed(self, digest: str, frame: int) -> Served:
-        """The policy that decided a frame that is computed again."""
-        if digest not in self._loaded and digest in self._paths:
-            self._loaded[digest] = self._load(self._paths[digest], f"policy {digest[:12]}…", digest)
-        if digest not in self._loaded:
-            raise ScenarioError(
-                f"frame {frame} was decided by the policy of SHA-256 {digest}, and this file has "
-                f"{self._served.model.digest}; give the replay the same file",
-                key=self.run.settings_place.at("file").key,
-            )
-        return self._loaded[digest]
 
     def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
         """The policy's choice for each user, the same on every carrier, and that of ``others``."""

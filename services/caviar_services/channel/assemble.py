@@ -15,12 +15,7 @@ from typing import Protocol, TypeVar
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Complex128Array,
-    Float64Array,
-    Int64Array,
-)
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, suggestion
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, angles
 from caviar_protocol.space.scene import device_pose
@@ -45,16 +40,23 @@ from caviar_services.channel.arrays.channel_matrices import (
     subarray_amplitudes,
     wideband_parts,
 )
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields, stable_ids
+from caviar_services.channel.paths import (
+    Antenna,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_ends,
+    path_geometry,
+    stable_ids,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
 
 Part = TypeVar("Part", ChannelMatrix, ChannelResponse, ChannelTaps)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Product:
-    """What a product says about itself beside its paths."""
+    """Header of a product: all that it says about itself beside its paths."""
 
     rung: str
     options: ChannelOptions
@@ -97,7 +99,18 @@ def assemble(
     table = _canonical_names(table)
     row = np.arange(len(table.pair))
     with np.errstate(invalid="ignore"):  # what is not finite is dropped and counted below
-        geometry = _geometry(table, transmitters, receivers)
+        (start, end), (start_velocity, end_velocity) = (
+            path_ends(table.pair, transmitters, receivers, field) for field in ("position", "velocity")
+        )
+        geometry = path_geometry(
+            start,
+            table.points,
+            end,
+            (table.types != 0).sum(1),
+            start_velocity,
+            table.point_velocity,
+            end_velocity,
+        )
         a = _amplitudes(product.carriers, table, geometry, transmitters, receivers)
         if product.absorption_db_per_km is not None:
             a = a * amplitude_factor(product.absorption_db_per_km, geometry.tau)
@@ -106,12 +119,12 @@ def assemble(
     dropped_pairs: frozenset[int] = frozenset()
     if dropped:
         dropped_pairs = frozenset(table.pair[~finite].tolist())
-        table, geometry, a, row = table.take(finite), _select(geometry, finite), a[:, finite], row[finite]
+        table, geometry, a, row = table.take(finite), geometry.take(finite), a[:, finite], row[finite]
     aod, aoa = angles(geometry.departure), angles(geometry.arrival)
     # Pairs that ascend, with one path each, as in free space, are in order.
     if np.count_nonzero(table.pair[1:] > table.pair[:-1]) < len(table.pair) - 1:
         order = _order(table, geometry, aod, aoa, a)
-        table, geometry, a, row = table.take(order), _select(geometry, order), a[:, order], row[order]
+        table, geometry, a, row = table.take(order), geometry.take(order), a[:, order], row[order]
         aod, aoa = aod[order], aoa[order]
 
     pairs = len(transmitters) * len(receivers)
@@ -120,13 +133,19 @@ def assemble(
     h: tuple[ChannelMatrix, ...] = ()
     wideband = Wideband()
     if product.with_h or product.wideband:
-        located = _located(product, row, table, offsets, geometry, a)
+        transfer, absorption = table.transfer, product.absorption_db_per_km
+        if absorption is not None:
+            transfer = transfer * amplitude_factor(absorption, geometry.tau)[..., None, None]
+        located = Located(row, table.pair, offsets, geometry, a, transfer, absorption)
         made = (matrices or PlaneWaves)(product.carriers, transmitters, receivers, located)
         if product.with_h:
-            kept = _in_single_precision if product.rounds_h else np.asarray
+            # Rounded values stay of the protocol's type: zeros at their ends compress.
             h = tuple(
                 ChannelMatrix(
-                    carrier=index, tx=pair // len(receivers), rx=pair % len(receivers), h=kept(between)
+                    carrier=index,
+                    tx=pair // len(receivers),
+                    rx=pair % len(receivers),
+                    h=between.astype(np.complex64).astype(np.complex128) if product.rounds_h else between,
                 )
                 for index in range(len(product.carriers))
                 for pair, between in enumerate(made.matrices(index))
@@ -138,7 +157,7 @@ def assemble(
     # H is made by now; the list of paths is that of the centres of the arrays.
     if table.hidden is not None and table.hidden.any():
         shown = ~table.hidden
-        table, geometry, a = table.take(shown), _select(geometry, shown), a[:, shown]
+        table, geometry, a = table.take(shown), geometry.take(shown), a[:, shown]
         aod, aoa = aod[shown], aoa[shown]
         offsets = np.searchsorted(table.pair, np.arange(pairs + 1)).astype(np.int64)
     frequency = np.array([carrier.frequency_hz for carrier in product.carriers])
@@ -170,25 +189,6 @@ def assemble(
     return channel, dropped_pairs
 
 
-def _in_single_precision(h: Complex128Array) -> Complex128Array:
-    """The values that single precision has, in the type of the protocol: zeros at their ends compress."""
-    return h.astype(np.complex64).astype(np.complex128)
-
-
-def _located(
-    product: Product,
-    row: Int64Array,
-    table: PathTable,
-    offsets: Int64Array,
-    geometry: PathGeometry,
-    a: Complex128Array,
-) -> Located:
-    transfer, absorption = table.transfer, product.absorption_db_per_km
-    if absorption is not None:
-        transfer = transfer * amplitude_factor(absorption, geometry.tau)[..., None, None]
-    return Located(row, table.pair, offsets, geometry, a, transfer, absorption)
-
-
 def _canonical_names(table: PathTable) -> PathTable:
     """Names that occur, sorted; points and objects past the last interaction set to their filler."""
     if not table.types.shape[1]:
@@ -215,24 +215,6 @@ def _canonical_names(table: PathTable) -> PathTable:
         faces=None if table.faces is None else np.where(used, table.faces, 0).astype(np.int32),
         joined_faces=table.joined_faces,
         hidden=table.hidden,
-    )
-
-
-def _geometry(
-    table: PathTable, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
-) -> PathGeometry:
-    def stacked(antennas: Sequence[Antenna], field: str) -> Float64Array:
-        return np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
-
-    tx, rx = np.divmod(table.pair, max(len(receivers), 1))
-    return path_geometry(
-        start=stacked(transmitters, "position")[tx],
-        points=table.points,
-        end=stacked(receivers, "position")[rx],
-        count=(table.types != 0).sum(1),
-        start_velocity=stacked(transmitters, "velocity")[tx],
-        point_velocity=table.point_velocity,
-        end_velocity=stacked(receivers, "velocity")[rx],
     )
 
 
@@ -266,12 +248,6 @@ def _amplitudes(
                 power = np.nansum(np.abs(every) ** 2, axis=(2, 3))
                 a[:, rows] = every[np.unravel_index(np.argmax(power), power.shape)]
     return a
-
-
-def _select(geometry: PathGeometry, which: Int64Array | BoolArray) -> PathGeometry:
-    return PathGeometry(
-        geometry.tau[which], geometry.departure[which], geometry.arrival[which], geometry.doppler_ratio[which]
-    )
 
 
 def _finite(table: PathTable, geometry: PathGeometry, a: Complex128Array) -> BoolArray:
@@ -368,7 +344,7 @@ def restricted(
 
 
 class Surroundings(Protocol):
-    """What a channel model knows about places; in the state of the last frame."""
+    """Knowledge of a channel model about places, in the state of the last frame."""
 
     @property
     def extent(self) -> tuple[Float64Array, Float64Array] | None:
@@ -443,7 +419,7 @@ class _Ends:
         return {name: around for name, around in sorted(self._around.items()) if around}
 
     def cause(self, t: int, r: int) -> Cause:
-        """Why a pair has no path."""
+        """Cause for which a pair has no path."""
         channel = self._channel
         names = channel.tx[t], channel.rx[r]
         start, end = (self._position(name) for name in names)
@@ -468,7 +444,7 @@ class _Ends:
         return self._around[name]
 
     def _is_beside(self, position: Float64Array) -> bool:
-        """Whether a place is beside the scenery or below it; above it, the sky goes on."""
+        """Test whether a place is beside the scenery or below it; above it, the sky goes on."""
         if self._surroundings.extent is None:
             return False
         low, high = self._surroundings.extent

@@ -2,25 +2,29 @@
 
 `PathModel` is for models that find paths, `ChannelModel` for all others. What both report beside the product
 is counted here as well.
+
+`ChannelBatch` makes the channels of many episodes of one run at once, for environments of which a learner
+steps a batch. The episodes of a batch are its *members*. They are in the same frame, and in the same scene:
+the worlds of a batch show the same in every episode. Each has a seed of its own, and so other draws.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array
+from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.host import keep_large_buffers
-from caviar_protocol.messages import Input, Role
+from caviar_protocol.messages import GrantInput, Input, Role, Status
 from caviar_protocol.multipath import changes
 from caviar_protocol.scenario.schema import PATTERNS
 from caviar_protocol.scene_validation import numbers_are_right, wrong_device_number, wrong_number
@@ -30,12 +34,11 @@ from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, Channel
 from caviar_protocol.topics.scene import Device
 from caviar_services.channel.arrays.channel_matrices import Matrices, check_size, empty_parts
 from caviar_services.channel.assemble import Product, assemble, outage_counts, restricted
-from caviar_services.channel.batch import ChannelBatch
 from caviar_services.channel.paths import Antenna, PathTable
 from caviar_services.channel.propagation.atmosphere import Atmosphere, specific_attenuation
 from caviar_services.channel.propagation.patterns import Patterns
 from caviar_services.pattern_files import read_pattern
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
+from caviar_services.service import Frame, FrameInput, Preparation, Prepared, RunInfo, Service, StepResult
 
 
 class ChannelSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,7 +61,7 @@ S = TypeVar("S", bound=ChannelSettings)
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What the `PathModel.paths` of a model found in a frame."""
+    """Paths of a frame, with counts, as `PathModel.paths` returns them."""
 
     table: PathTable
     """Paths of all pairs, in any order."""
@@ -75,7 +78,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class Modelled:
-    """What the `ChannelModel.model` of a model made of a frame."""
+    """Channel of a frame, with counts and durations, as `ChannelModel.model` returns it."""
 
     channel: Channel
     counts: dict[str, int] = field(default_factory=dict)
@@ -140,13 +143,13 @@ class ChannelModel(Service[S]):
 
     @property
     def needs_assets(self) -> bool:
-        """Whether files are read in `prepare`: scenery, meshes of objects, or pattern files of antennas."""
+        """True if files are read in `prepare`: scenery, meshes of objects, or pattern files of antennas."""
         arrays = [spec.array for spec in self.run.devices if spec.array is not None]
         return self.uses_scenery or any(array.pattern_file for array in arrays)
 
     @property
     def options(self) -> ChannelOptions:
-        """What the products model, beside absorption."""
+        """Options that the products model, beside absorption."""
         return ChannelOptions()
 
     @cached_property
@@ -176,7 +179,7 @@ class ChannelModel(Service[S]):
 
     @property
     def room(self) -> Mapping[str, int]:
-        """How many objects of each mesh a scene may have, by asset, ``""`` for those without one; known once
+        """Limit of objects of each mesh in a scene, by asset, ``""`` for those without one; known once
         `load` is through. Empty: objects are no obstacles to the model."""
         return {}
 
@@ -411,3 +414,106 @@ class PathModel(ChannelModel[S]):
             return {}
         turnover = changes(before[2], channel)
         return {"births": turnover.births, "deaths": turnover.deaths}
+
+
+class SceneAt(NamedTuple):
+    """The scene of one frame, that of all members."""
+
+    number: int
+    t_ns: int
+    scene: Scene
+
+
+class MemberSeed(NamedTuple):
+    """Seed and number of a member's episode, on which its random numbers depend (contract, clause 19)."""
+
+    seed: int
+    seed_episode: int
+    """Episodes since the first one with this seed."""
+
+
+class BatchChannels(NamedTuple):
+    """Channels of K frames; M is the number of members, or 1 where all have the same."""
+
+    h: list[Complex128Array]
+    """Of each pair, by transmitter, then receiver, Shape ``[M, K, C, Nr, Nt]``; zeros without a path."""
+    has_path: BoolArray
+    """Whether a path has an amplitude other than 0, Shape ``[M, K, pairs, C]``."""
+    los: BoolArray
+    """Whether the line of sight is free, Shape ``[K, pairs]``."""
+
+
+class ChannelBatch(ABC):
+    """The channels of many episodes; a channel model makes one with `ChannelModel.batch`."""
+
+    @abstractmethod
+    def begin(self, members: Sequence[MemberSeed]) -> None:
+        """Begin an episode of each member."""
+
+    @abstractmethod
+    def reach(self, number: int) -> int:
+        """Number of frames that can be computed together from a frame on."""
+
+    @abstractmethod
+    def width(self, members: int) -> int:
+        """Numbers that are held at once for each element of an H, with so many members."""
+
+    @abstractmethod
+    def channels(self, frames: Sequence[SceneAt]) -> BatchChannels:
+        """Compute the channels of frames that follow on each other, whose scenes have the same devices.
+
+        Args:
+            frames: At most `reach` of the first one.
+        """
+
+
+class SameChannels(ChannelBatch):
+    """Channels that depend on the scene alone, so that one product is that of all members.
+
+    Args:
+        model: Draws nothing, and remembers nothing.
+    """
+
+    def __init__(self, model: ChannelModel[Any]) -> None:
+        self._model, self._name = model, model.run.name
+
+    def begin(self, members: Sequence[MemberSeed]) -> None:
+        """Nothing depends on seeds."""
+
+    def reach(self, number: int) -> int:
+        return 64  # products that are held at once
+
+    def width(self, members: int) -> int:
+        return 1
+
+    def channels(self, frames: Sequence[SceneAt]) -> BatchChannels:
+        products = [self._product(at) for at in frames]
+        first = products[0]
+        carriers, pairs = len(first.carriers), len(first.offsets) - 1
+        has_path = np.zeros((1, len(frames), pairs, carriers), np.bool_)
+        for k, product in enumerate(products):
+            ends = product.offsets.tolist()
+            for pair in range(pairs):
+                has_path[0, k, pair] = product.a[:, ends[pair] : ends[pair + 1]].any(axis=1)
+        receivers = len(first.rx)
+        made = [{(m.carrier, m.tx * receivers + m.rx): m.h for m in product.h} for product in products]
+        h = []
+        for pair in range(pairs):
+            # A pair has no matrix on a carrier that it does not use, and no user who looks at it.
+            blank = np.zeros(next((m.shape for (_, p), m in made[0].items() if p == pair), (1, 1)), complex)
+            h.append(np.array([[one.get((c, pair), blank) for c in range(carriers)] for one in made])[None])
+        return BatchChannels(h, has_path, np.array([product.los.reshape(-1) for product in products]))
+
+    def _product(self, at: SceneAt) -> Channel:
+        entry = GrantInput(topic="scene", source="world", status=Status.FRESH, frame=at.number)
+        frame = Frame(
+            episode=0,
+            number=at.number,
+            t_ns=at.t_ns,
+            inputs=(FrameInput(entry, payload=at.scene),),
+            service=self._name,
+        )
+        product = self._model.step(frame).products["channel"]
+        if not isinstance(product, Channel):
+            raise TypeError(f"channel {self._name!r} made a {type(product).__name__}")
+        return product

@@ -1,6 +1,9 @@
-"""Paths between antennas as a channel model finds them, before any antenna is applied, and their stable ids.
+"""Paths between antennas as a channel model finds them, before any antenna is applied: tables, delays and
+directions, stable ids, attenuation, and the lines of sight of near pairs.
 
-An id is that of contract, clause 21: the same path has the same id in other frames and products.
+An id is that of contract, clause 21: the same path has the same id in other frames and products. Points,
+lengths and directions are those of an antenna's true position, from wherever it was traced
+(`caviar_space.obstacles.CLEARANCE`).
 """
 
 from __future__ import annotations
@@ -22,12 +25,105 @@ from caviar_protocol.arrays import (
     UInt64Array,
 )
 from caviar_protocol.space.antenna_arrays import subarrays
-from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
-from caviar_services.channel.propagation.geometry import Rows
 from caviar_services.channel.propagation.patterns import ElementPattern, Field, Patterns, radiated_field
-from caviar_space.vectors import cross
+from caviar_space.obstacles import Surfaces
+from caviar_space.vectors import Rows, cross
+
+
+@dataclass(frozen=True, eq=False)
+class PathGeometry(Rows):
+    """Delays, directions and Doppler shifts of P paths."""
+
+    tau: Float64Array
+    """Absolute delay [s], Shape ``[P]``."""
+    departure: Float64Array
+    """Unit vectors from TX along the first segment, world axes, Shape ``[P, 3]``."""
+    arrival: Float64Array
+    """Unit vectors from RX back along the last segment, world axes, Shape ``[P, 3]``."""
+    doppler_ratio: Float64Array
+    """Doppler shift over carrier frequency, Shape ``[P]``."""
+
+
+def path_geometry(
+    start: Float64Array,
+    points: Float64Array,
+    end: Float64Array,
+    count: Int64Array,
+    start_velocity: Float64Array,
+    point_velocity: Float64Array,
+    end_velocity: Float64Array,
+) -> PathGeometry:
+    """Compute delays, directions and Doppler shifts of paths start → points → end.
+
+    Args:
+        start: Position of TX of each path [m], Shape ``[P, 3]``; ``end`` that of RX.
+        points: Interaction points [m], Shape ``[P, D, 3]``; entries from ``count`` on are ignored.
+        end: See ``start``.
+        count: Number of interactions of each path, Shape ``[P]``.
+        start_velocity: Of TX [m/s], Shape ``[P, 3]``; ``end_velocity`` that of RX.
+        point_velocity: Of the surface at each point [m/s], Shape ``[P, D, 3]``.
+        end_velocity: See ``start_velocity``.
+
+    Example:
+        >>> row = lambda *values: np.array([values], np.float64)
+        >>> point, none = np.zeros((1, 0, 3)), np.zeros(1, np.int64)
+        >>> still, towards = row(0, 0, 0), row(-30, 0, 0)
+        >>> made = path_geometry(row(0, 0, 0), point, row(300, 0, 0), none, still, point, towards)
+        >>> made.departure.tolist(), round(float(made.doppler_ratio[0]) * 28e9)  # [Hz] at 28 GHz
+        ([[1.0, 0.0, 0.0]], 2802)
+
+    Doppler shift to first order in v/c, with unit vector k_i of the segment after corner i:
+    f_D / f = Σ_i (v_i − v_{i+1})·k_i / c (a source that approaches raises the frequency).
+    """
+    paths = len(points)
+    if not points.shape[1]:
+        return _straight(end - start, end_velocity - start_velocity)
+    corners = path_corners(start, points, end, count)
+    velocity = path_corners(start_velocity, point_velocity, end_velocity, count)
+
+    segment = np.diff(corners, axis=1)
+    length = np.sqrt((segment**2).sum(-1))
+    along = segment / np.where(length > 0, length, 1.0)[..., None]
+    rows = np.arange(paths)
+    return PathGeometry(
+        tau=length.sum(-1) / SPEED_OF_LIGHT,
+        departure=along[:, 0],
+        arrival=-along[rows, count],
+        doppler_ratio=-(np.diff(velocity, axis=1) * along).sum((1, 2)) / SPEED_OF_LIGHT,
+    )
+
+
+def path_corners(
+    start: Float64Array, points: Float64Array, end: Float64Array, count: Int64Array
+) -> Float64Array:
+    """Corners of paths start → points → end, Shape ``[P, D + 2, 3]``; arguments are those of `path_geometry`.
+
+    Unused corners are at the receiver, so that their segments have length zero.
+
+    Example:
+        >>> start, end = np.zeros((1, 3)), np.array([[8.0, 0.0, 0.0]])
+        >>> unused = np.full((1, 1, 3), np.nan)
+        >>> path_corners(start, unused, end, np.array([0])).tolist()
+        [[[0.0, 0.0, 0.0], [8.0, 0.0, 0.0], [8.0, 0.0, 0.0]]]
+    """
+    corners = np.concatenate([start[:, None], points, end[:, None]], axis=1)
+    unused = np.arange(corners.shape[1]) > count[:, None]
+    return np.where(unused[..., None], end[:, None], corners)
+
+
+def _straight(line: Float64Array, separation: Float64Array) -> PathGeometry:
+    """Geometry of paths without interactions: TX to RX [m], and its change [m/s], Shape ``[P, 3]`` each."""
+    length = np.sqrt((line**2).sum(-1))
+    along = line / np.where(length > 0, length, 1.0)[:, None]
+    return PathGeometry(
+        tau=length / SPEED_OF_LIGHT,
+        departure=along,
+        arrival=-along,
+        doppler_ratio=-(separation * along).sum(-1) / SPEED_OF_LIGHT,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +159,7 @@ class Antenna:
             np.array(pose.position),
             rotation_matrix(pose.orientation),
             device_velocity(scene, device),
-            None if patterns is None else patterns.of(device.array),
+            None if patterns is None else patterns.element(device.array),
         )
 
     @cached_property
@@ -106,7 +202,7 @@ def antenna_fields(
         arrival: Whether the antennas receive.
 
     Example:
-        >>> element = Patterns().of(AntennaArray())
+        >>> element = Patterns().element(AntennaArray())
         >>> mast = Antenna("bs", AntennaArray(), np.zeros(3), np.eye(3), np.zeros(3), element)
         >>> antenna_fields([mast], np.array([0]), np.array([[1.0, 0.0, 0.0]])).tolist()
         [[0.0, 0.0, -1.0]]
@@ -126,7 +222,7 @@ def antenna_fields(
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """How K named objects turn."""
+    """Turning of K named objects."""
 
     centre: Float64Array
     """What they turn about [m], Shape ``[K, 3]``."""
@@ -134,7 +230,7 @@ class Turning:
     """In world axes [rad/s], Shape ``[K, 3]``."""
 
     def take(self, which: Sequence[int]) -> Turning:
-        """Those of some objects, in this order.
+        """Turning of some objects, in this order.
 
         Args:
             which: Numbers of objects.
@@ -267,3 +363,123 @@ def _mix(x: UInt64Array) -> UInt64Array:
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
+
+
+NEAR_PAIR = 0.05
+"""[m]; pairs nearer than this have their line of sight by formula, not from the ray tracer."""
+
+
+def spread_anew(
+    transfer: Complex128Array, specular: BoolArray, traced: Float64Array, length: Float64Array
+) -> Complex128Array:
+    """Dyads of paths that were traced with one length and have another.
+
+    Args:
+        transfer: As traced, Shape ``[C, P, 3, 3]``.
+        specular: Paths of reflections and transmissions, whose field falls as one over the length, ``[P]``.
+        traced: Length as traced [m], Shape ``[P]``.
+        length: Length of the path [m], Shape ``[P]``.
+
+    Example:
+        >>> dyads = np.ones((1, 1, 3, 3), np.complex128)
+        >>> spread_anew(dyads, np.array([True]), np.array([10.0]), np.array([20.0]))[0, 0, 0, 0]
+        np.complex128(0.5+0j)
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(specular & (length > 0), traced / length, 1.0)
+    scaled: Complex128Array = transfer * factor[None, :, None, None]
+    return scaled
+
+
+def with_near_pairs(
+    table: PathTable,
+    los: BoolArray,
+    transmitters: Sequence[Antenna],
+    receivers: Sequence[Antenna],
+    wavelengths: Float64Array,
+    surfaces: Surfaces,
+) -> tuple[PathTable, int]:
+    """Paths with the lines of sight of near pairs by formula.
+
+    A pair closer than one wavelength of a carrier is outside of the far field in which λ/(4πd) holds, and has
+    no direct path; paths by way of surfaces stay.
+
+    Args:
+        table: Paths of all pairs.
+        los: Whether the line of sight of each pair is free, Shape ``[T·R]``; corrected in place.
+        transmitters: T antennas.
+        receivers: R antennas.
+        wavelengths: Of the carriers [m], Shape ``[C]``.
+        surfaces: Of the scene.
+
+    Returns:
+        The paths, and the number of pairs that are too close for a direct one.
+    """
+    start, end = path_ends(np.arange(len(los)), transmitters, receivers)
+    distance = np.sqrt(((end - start) ** 2).sum(-1))
+    near = np.flatnonzero(distance < max(NEAR_PAIR, wavelengths.max()))
+    tx, rx = np.divmod(near, max(len(receivers), 1))
+    other = [transmitters[t].name != receivers[r].name for t, r in zip(tx.tolist(), rx.tolist(), strict=True)]
+    near, tx, rx = near[other], tx[other], rx[other]
+    if not len(near):
+        return table, 0
+    los[near] = [
+        not surfaces.between(transmitters[t].position, receivers[r].position)
+        for t, r in zip(tx.tolist(), rx.tolist(), strict=True)
+    ]
+    far = distance[near] >= wavelengths.max()
+    straight = (table.types == 0).all(1)
+    free = los[near]
+    if table.hidden is not None:  # elements beside the centres may see each other where these do not
+        free |= np.isin(near, table.pair[straight & table.hidden])
+    table = table.take(~(straight & np.isin(table.pair, near)))
+    direct = near[far & free]
+    made = with_direct(table, direct, ~los[direct], distance[direct], wavelengths)
+    return made, int(np.count_nonzero(~far))
+
+
+def with_direct(
+    table: PathTable, pairs: Int64Array, hidden: BoolArray, distance: Float64Array, wavelengths: Float64Array
+) -> PathTable:
+    """Paths with a direct one for each of N more pairs.
+
+    Args:
+        table: Paths.
+        pairs: Numbers of the pairs, Shape ``[N]``.
+        hidden: Whether only elements beside the centres have the direct path, Shape ``[N]``.
+        distance: Of each pair [m], Shape ``[N]``.
+        wavelengths: Of the carriers [m], Shape ``[C]``.
+    """
+    depth = table.types.shape[1]
+    spreading = wavelengths[:, None] / (4 * np.pi * distance)
+    made = spreading[:, :, None, None] * np.eye(3, dtype=np.complex128)
+    empty = np.zeros((len(pairs), depth), np.uint8)
+    return replace(
+        table,
+        pair=np.concatenate([table.pair, pairs]),
+        transfer=np.concatenate([table.transfer, made], axis=1),
+        types=np.concatenate([table.types, empty]),
+        objects=np.concatenate([table.objects, np.full((len(pairs), depth), -1, np.int32)]),
+        points=np.concatenate([table.points, np.zeros((len(pairs), depth, 3))]),
+        hidden=None if table.hidden is None else np.concatenate([table.hidden, hidden]),
+        traced=None if table.traced is None else np.concatenate([table.traced, np.full(len(pairs), -1)]),
+        faces=None if table.faces is None else np.concatenate([table.faces, empty.astype(np.int32)]),
+    )
+
+
+def path_ends(
+    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna], field: str = "position"
+) -> tuple[Float64Array, Float64Array]:
+    """Positions [m] of TX and RX of paths, or another vector of theirs, each of Shape ``[P, 3]``.
+
+    Args:
+        pair: Pair of each path, Shape ``[P]``.
+        transmitters, receivers: Antennas.
+        field: Name of the vector in `Antenna`.
+    """
+    tx, rx = np.divmod(pair, max(len(receivers), 1))
+    start, end = (
+        np.array([getattr(antenna, field) for antenna in antennas]).reshape(-1, 3)
+        for antennas in (transmitters, receivers)
+    )
+    return start[tx], end[rx]

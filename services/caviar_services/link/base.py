@@ -22,7 +22,7 @@ from caviar_protocol.messages import GrantInput, Input, Role, Status
 from caviar_protocol.space.codebooks import beam_count
 from caviar_protocol.space.scene import Pair, pairs_of
 from caviar_protocol.topics import Action, AntennaArray, BeamChoice, Carrier, Channel, Scene, UserSchedule
-from caviar_services.channel.batch import ChannelBatch, MemberSeed, SceneAt
+from caviar_services.channel.base import ChannelBatch, MemberSeed, SceneAt
 from caviar_services.service import Frame, Service
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -353,7 +353,15 @@ class _FrameCommands:
             previous = self.chosen.get(index)
             if previous is not None and self._first_wins(index, previous, action, command):
                 continue
-            self._require_in_codebook(action, self.users[index], command)
+            user = self.users[index]
+            for side, beam, device in (("TX", command.tx_beam, user.tx), ("RX", command.rx_beam, user.rx)):
+                count = beam_count(device.array)
+                if not 0 <= beam < count:
+                    raise _wrong(
+                        action,
+                        f"it chose {side} beam {beam} for {_user(user.tx.name, user.rx.name)}; "
+                        f"the codebook of {device.name!r} has beams 0 to {count - 1}",
+                    )
             self.chosen[index] = (action.source, command)
 
     def schedule_receiver(self, action: GrantInput, command: UserSchedule) -> None:
@@ -391,16 +399,6 @@ class _FrameCommands:
             "let one of them own the receiver (services.<agent>.users)"
         )
         raise _contradiction(first_agent, action, problem)
-
-    def _require_in_codebook(self, action: GrantInput, user: User, command: BeamChoice) -> None:
-        for side, beam, device in (("TX", command.tx_beam, user.tx), ("RX", command.rx_beam, user.rx)):
-            count = beam_count(device.array)
-            if not 0 <= beam < count:
-                raise _wrong(
-                    action,
-                    f"it chose {side} beam {beam} for {_user(user.tx.name, user.rx.name)}; "
-                    f"the codebook of {device.name!r} has beams 0 to {count - 1}",
-                )
 
     def _no_such_user(self, action: GrantInput, tx: str, rx: str, carrier: str) -> None:
         # A fresh action was made from this frame's scene; a held one from an earlier frame's, whose devices

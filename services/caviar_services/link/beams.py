@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.cell.rates import shannon
+from caviar_protocol.cell.link_adaptation import shannon
 from caviar_protocol.space.beams import beam_gains, straight_beams
 from caviar_protocol.space.scene import antennas, directions
 from caviar_protocol.topics import Carrier, Link
-from caviar_services.channel.batch import BatchChannels, ChannelBatch, MemberSeed, SceneAt
+from caviar_services.channel.base import BatchChannels, ChannelBatch, MemberSeed, SceneAt
 from caviar_services.link.base import BatchLink, LinkBatch, User, Users
-from caviar_services.link.beam_scores import RewardKind, Scored, SweepingLink, SweepSettings
-from caviar_services.link.interference import Interferers
+from caviar_services.link.beam_scores import Interferers, RewardKind, Scored, SweepingLink, SweepSettings
 from caviar_services.link.link_budget import LinkBudget
 from caviar_services.service import Frame, StepResult
 
@@ -202,7 +201,13 @@ class BeamBatch(LinkBatch):
                 break
             frames.append(following)
         found = self._channels.channels(frames)
-        places = _places(first, budget.users, self._carriers)
+        # Number of the pair, and of the carrier, of each user.
+        tx, rx = ([device.name for device in antennas(first.scene, role)] for role in ("tx", "rx"))
+        names = [carrier.name for carrier in self._carriers]
+        places = [
+            (tx.index(user.tx.name) * len(rx) + rx.index(user.rx.name), names.index(user.carrier.name))
+            for user in budget.users
+        ]
         swept, best, baseline = [], [], []
         towards = [directions(at.scene, budget.users) for at in frames]
         for u, (user, (pair, carrier)) in enumerate(zip(budget.users, places, strict=True)):
@@ -222,16 +227,6 @@ class BeamBatch(LinkBatch):
             has_path=found.has_path[:, :, pairs, of_carrier],
             los=found.los[:, pairs],
         )
-
-
-def _places(at: SceneAt, users: Users, carriers: Sequence[Carrier]) -> list[tuple[int, int]]:
-    """Number of the pair, and of the carrier, of each user."""
-    tx, rx = ([device.name for device in antennas(at.scene, role)] for role in ("tx", "rx"))
-    names = [carrier.name for carrier in carriers]
-    return [
-        (tx.index(user.tx.name) * len(rx) + rx.index(user.rx.name), names.index(user.carrier.name))
-        for user in users
-    ]
 
 
 def _swept(found: BatchChannels, user: User, pair: int, carrier: int) -> Float64Array:

@@ -17,35 +17,43 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_protocol.cell.buffers import Totals, delays_in_seconds
-from caviar_protocol.cell.rates import HIGHEST_SPECTRAL_EFFICIENCY
-from caviar_protocol.cell.scheduling import (
+from caviar_protocol.cell.buffers import (
+    Totals,
     averaged,
     chosen,
+    delays_in_seconds,
     max_rate,
     note_turns,
     proportional_fair,
     round_robin,
 )
+from caviar_protocol.cell.link_adaptation import HIGHEST_SPECTRAL_EFFICIENCY
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.topics import Link
 from caviar_services.checkpoint import restored, saved
-from caviar_services.link.association import Layout, associate
 from caviar_services.link.base import wrong_choice
 from caviar_services.link.beam_scores import Scored, SweepingLink
-from caviar_services.link.cell_settings import CellSettings, check_cell_settings, check_traffic_users
 from caviar_services.link.nr import Blocks, NrRates, load_blocks
-from caviar_services.link.slot_channel import band_points, responses
 from caviar_services.link.slot_rates import (
     Gains,
+    Layout,
     ShannonRates,
     SlotRates,
     SlotSinr,
+    associate,
+    band_points,
     noise_rise,
+    responses,
     swept_gains,
 )
-from caviar_services.link.terminals import Terminals, TerminalState
+from caviar_services.link.terminals import (
+    CellSettings,
+    Terminals,
+    TerminalState,
+    check_cell_settings,
+    check_traffic_users,
+)
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
 
@@ -106,7 +114,7 @@ class CellLink(SweepingLink[CellSettings]):
 
     @classmethod
     def check_settings(cls, settings: CellSettings, place: Place) -> None:
-        """See `caviar_services.link.cell_settings.check_cell_settings`."""
+        """See `caviar_services.link.terminals.check_cell_settings`."""
         check_cell_settings(settings, place)
 
     def __init__(self, settings: CellSettings, run: RunInfo) -> None:

@@ -225,7 +225,13 @@ class McapRecorder(Recorder[McapSettings]):
         # Before the first byte of the frame: a product that is wrong leaves no half of a frame behind.
         new = [item for item in inputs if self._stored.is_new(item.provenance)]
         for item in new:
-            self._look_at(item)
+            # Raise `ProductError` where a product is not that of its digest, or one that may have no
+            # other consumer cannot be.
+            if item.provenance.digest:
+                check_digest(item.provenance, item.header, item.body)
+            topic = item.provenance.topic
+            if topic in _LOOKED_INTO or self.parts.get(topic):
+                item.look()
         try:
             segment.write(entry, new, base_ns)
             self._kept.written(segment)
@@ -259,15 +265,6 @@ class McapRecorder(Recorder[McapSettings]):
             self._persistence.close()
         except OSError as error:
             raise self._failed(segment, error) from error
-
-    def _look_at(self, item: FrameInput) -> None:
-        """Raise `ProductError` where a product is not that of its digest, or one that may have no other
-        consumer cannot be."""
-        if item.provenance.digest:
-            check_digest(item.provenance, item.header, item.body)
-        topic = item.provenance.topic
-        if topic in _LOOKED_INTO or self.parts.get(topic):
-            item.look()
 
     @property
     def _kept(self) -> Persistence:

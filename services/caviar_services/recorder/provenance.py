@@ -92,7 +92,15 @@ def used_versions(scenario: Mapping[str, Any]) -> dict[str, str]:
                 names.add("sionna-rt")
             if key == "engine" and value in plugins(PLANTS):
                 names.update(plant_named(value).packages)
-    return _versions([*names, *_imported_distributions(_own_modules(scenario))])
+    # Distributions of which modules, or what they import, import something.
+    imported = {
+        _top(name)
+        for module in _own_modules(scenario)
+        for source, file in _sources(module).items()
+        for name in _imports(source, file)
+    }
+    known = _distributions() if imported else {}
+    return _versions({*names, *(distribution for name in imported for distribution in known.get(name, ()))})
 
 
 def code_digests(scenario: Mapping[str, Any]) -> dict[str, str]:
@@ -177,11 +185,13 @@ def _sources(module: str) -> dict[str, Path]:
         name = waiting.pop()
         if name in found or (file := _file_of(name)) is None:
             continue
-        if _is_installed(file) and _top(name) != _top(module):
+        if not {"site-packages", "dist-packages"}.isdisjoint(file.parts) and _top(name) != _top(module):
             continue
         found[name] = file
         waiting += _imports(name, file)
-        waiting += _packages_of(name)
+        # The packages that are imported with a module: ``a`` and ``a.b`` of ``a.b.c``.
+        parts = name.split(".")
+        waiting += [".".join(parts[:count]) for count in range(1, len(parts))]
     return found
 
 
@@ -226,32 +236,10 @@ def _imports(module: str, file: Path) -> set[str]:
     return {name for name in found if _top(name) not in sys.stdlib_module_names | OWN | {""}}
 
 
-def _packages_of(module: str) -> list[str]:
-    """The packages that are imported with a module: ``a`` and ``a.b`` of ``a.b.c``."""
-    parts = module.split(".")
-    return [".".join(parts[:count]) for count in range(1, len(parts))]
-
-
-def _imported_distributions(modules: Iterable[str]) -> set[str]:
-    """Distributions of which modules, or what they import, import something."""
-    imported = {
-        _top(name)
-        for module in modules
-        for source, file in _sources(module).items()
-        for name in _imports(source, file)
-    }
-    known = _distributions() if imported else {}
-    return {distribution for name in imported for distribution in known.get(name, ())}
-
-
 # Once a process: it reads the lists of files of everything that is installed.
 @cache
 def _distributions() -> Mapping[str, list[str]]:
     return metadata.packages_distributions()
-
-
-def _is_installed(file: Path) -> bool:
-    return not {"site-packages", "dist-packages"}.isdisjoint(file.parts)
 
 
 def _top(module: str) -> str:

@@ -168,20 +168,18 @@ class SegmentWriter:
         channel = self._channels.get((topic, source))
         if channel is None:
             product = bool(source)
+            text = _PRODUCT_SCHEMA if product else _FRAME_SCHEMA
+            if topic not in self._schemas:
+                self._schemas[topic] = self._mcap.add_schema(
+                    f"caviar.{topic}/1", _SCHEMA_ENCODING, text.format(topic=topic).encode()
+                )
             channel = self._channels[topic, source] = self._mcap.add_channel(
                 f"{topic}/{source}" if product else topic,
                 "caviar-product" if product else "msgpack",
-                self._schema(topic, _PRODUCT_SCHEMA if product else _FRAME_SCHEMA),
+                self._schemas[topic],
                 {"topic": topic, "source": source},
             )
         return channel
-
-    def _schema(self, topic: str, text: str) -> int:
-        if topic not in self._schemas:
-            self._schemas[topic] = self._mcap.add_schema(
-                f"caviar.{topic}/1", _SCHEMA_ENCODING, text.format(topic=topic).encode()
-            )
-        return self._schemas[topic]
 
 
 def stored_products(segment: Segment, index: int) -> Iterator[FrameInput]:

@@ -1,4 +1,4 @@
-"""What all sensor services share: the base class, and the scene as a ray tracer holds it.
+"""Base of all sensor services, and the scene as their ray tracer holds it.
 
 A sensor implements `Sensors.observe`; meshes are loaded and moved here, the same way for every sensor.
 
@@ -13,19 +13,18 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Payload, quantity
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
-from caviar_protocol.geometry import check_unit_box, is_mesh_name
 from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.space.coordinates import Pose, Vector
-from caviar_protocol.space.ply import read_ply
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
@@ -38,7 +37,16 @@ from caviar_services.drjit_setup import (
     limit_threads,
 )
 from caviar_services.service import Frame, Preparation, Prepared, Service, StepResult
-from caviar_space.meshes import Mesh, assign_bodies, contains, joined, placed, unit_box
+from caviar_space.meshes import (
+    Mesh,
+    assign_bodies,
+    coarse_centre,
+    contains,
+    joined,
+    object_meshes,
+    placed,
+    shown_asset,
+)
 from caviar_space.mitsuba_xml import SceneryShape, find_scenery, read_scenery, world_mesh
 
 NO_HIT = -1
@@ -46,7 +54,6 @@ NO_HIT = -1
 
 # [m]; where float32 has a step of 0.1 mm. A scene that is nearer to the origin is traced where it is.
 _NEAR = 2048.0
-_CENTRE_STEP = 128.0
 
 
 class SensorSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -143,8 +150,7 @@ class Sensors(Service[S]):
             AssetError: A file is no mesh.
         """
         if self.traced is not None:
-            bodies = {name: load_unit_mesh(path) for name, path in meshes.items()}
-            self.traced.use_meshes(bodies)
+            self.traced.use_meshes(object_meshes(meshes))
 
     def step(self, frame: Frame) -> StepResult:
         """Move the bodies to the objects of the frame, and observe."""
@@ -177,7 +183,7 @@ class Sensors(Service[S]):
 
     @abstractmethod
     def observe(self, mi: Any, traced: TracedScene, scene: Scene) -> dict[str, Payload]:
-        """What the sensors of a scene see.
+        """Observe a scene with all its sensors.
 
         Args:
             mi: Mitsuba, with the variant that is active.
@@ -198,12 +204,7 @@ class Sensors(Service[S]):
     def _load(self, mi: Any, assets: Mapping[str, Path]) -> TracedScene:
         file = find_scenery(assets)
         self.shapes = read_scenery(file).shapes if file is not None else ()
-        bodies = {"": unit_box()}
-        bodies |= {
-            name: load_unit_mesh(path)
-            for name, path in assets.items()
-            if PurePosixPath(name).match("objects/*.ply")
-        }
+        bodies = object_meshes(assets)
         unknown = sorted(self.settings.bodies.keys() - bodies.keys())
         if unknown:
             raise ScenarioError(
@@ -291,29 +292,6 @@ def active_variant(variant: str) -> Iterator[Any]:
             mi.set_variant(before)
 
 
-def load_unit_mesh(file: Path) -> Mesh:
-    """Read the mesh of a moving object.
-
-    Args:
-        file: A PLY file.
-
-    Raises:
-        AssetError: The file is no mesh, or its bounding box is not −½…½ on every axis.
-
-    Example:
-        >>> import tempfile
-        >>> from caviar_space.meshes import ply
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     file = Path(folder, "box.ply")
-        ...     _ = file.write_bytes(ply(unit_box()))
-        ...     len(load_unit_mesh(file).faces)
-        12
-    """
-    vertices, faces = read_ply(file)
-    check_unit_box(vertices, str(file))
-    return Mesh(vertices, faces.astype(np.int32))
-
-
 class _Part:
     """One merged mesh in a ray-tracing scene of its own."""
 
@@ -377,16 +355,15 @@ class TracedScene:
         capacity: Mapping[str, int],
     ) -> None:
         self._scenery_names = names
-        self._bodies = dict(bodies)
+        self._first_bodies = self._bodies = dict(bodies)
         self._capacity = dict(capacity)
-        self._later: dict[str, Mesh] = {}
         self._scenery: _Part | None = None
         scenery, self._scenery_owner = joined(meshes), _owners(meshes)
         self.scenery_faces = len(scenery.faces)
         self.centre: Float64Array = np.zeros(3)
         """Where positions of rays count from [m], Shape ``[3]``; 0 for a scene near the origin."""
         if self.scenery_faces:
-            self.centre = _centre((scenery.vertices.min(0) + scenery.vertices.max(0)) / 2)
+            self.centre = _far_centre((scenery.vertices.min(0) + scenery.vertices.max(0)) / 2)
             self._scenery = _Part(mi, "scenery", Mesh(scenery.vertices - self.centre, scenery.faces))
         self._scenery_normals = _normals(scenery)
         # A triangle without area, within the scene, which no ray can hit: a mesh has one at least.
@@ -403,13 +380,11 @@ class TracedScene:
         Args:
             bodies: By asset name; those of an earlier call that are not here are gone.
         """
-        self._later = dict(bodies)
+        self._bodies = {**self._first_bodies, **bodies}
 
     def _body(self, asset: str) -> Mesh:
-        """The unit mesh of an asset; the box for one that came later and is not there, or was refused."""
-        if is_mesh_name(asset):
-            return self._later.get(asset) or self._bodies.get(asset) or self._bodies[""]
-        return self._bodies[asset]
+        """The unit mesh that stands for an asset (`shown_asset`)."""
+        return self._bodies[shown_asset(asset, self._bodies)]
 
     def update(self, mi: Any, scene: Scene) -> None:
         """Bring the bodies to where the scene's objects are.
@@ -438,7 +413,7 @@ class TracedScene:
         ]
         self._set_bodies(scene.names, meshes)
         if self._scenery is None:
-            self.centre = _centre(np.median(scene.position, axis=0)) if meshes else np.zeros(3)
+            self.centre = _far_centre(np.median(scene.position, axis=0)) if meshes else np.zeros(3)
         self._moving.replace(mi, self._joined_bodies, self.centre)
 
     def _set_bodies(self, names: Sequence[str], meshes: list[Mesh]) -> None:
@@ -477,7 +452,7 @@ class TracedScene:
         return dr.select(moving, hit.t, fixed.t), face
 
     def occluded(self, ray: Any, active: Any, coherent: bool) -> Any:
-        """Whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
+        """Test whether each ray hits anything, as a Dr.Jit array that may wait for evaluation.
 
         Args:
             ray: Rays whose origins count from `centre`, as `mitsuba.Ray3f`.
@@ -497,7 +472,7 @@ class TracedScene:
         return np.concatenate([self._scenery_normals, _normals(self._joined_bodies)])
 
     def is_inside(self, asset: str, dimensions: Float64Array, point: Vector) -> bool:
-        """Whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
+        """Test whether a point in an object's body axes [m] lies in its mesh, deeper than a millimetre."""
         # `contains` is undecided on the surface, where sensors are mounted: so points around it are asked.
         if not (dimensions > 0).all():
             return False
@@ -505,10 +480,9 @@ class TracedScene:
         return all(contains(self._body(asset), place) for place in around / dimensions)
 
 
-def _centre(middle: Float64Array) -> Float64Array:
-    """Where to count from [m], coarse enough to be the same in float32, for a scene about a place."""
-    far: Float64Array = np.where(np.abs(middle) > _NEAR, np.round(middle / _CENTRE_STEP) * _CENTRE_STEP, 0.0)
-    return far
+def _far_centre(middle: Float64Array) -> Float64Array:
+    """Centre to count from [m], for a scene about a place; 0 along axes on which that is near the origin."""
+    return np.where(np.abs(middle) > _NEAR, coarse_centre(middle), 0.0)
 
 
 def _owners(meshes: list[Mesh]) -> Int32Array:

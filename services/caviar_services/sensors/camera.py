@@ -67,7 +67,7 @@ class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_f
 
 @dataclass(frozen=True, eq=False)
 class _Hits:
-    """What the rays of a view hit, Shape ``[H·W]`` each."""
+    """Hits of the rays of a view, Shape ``[H·W]`` each."""
 
     distance: Float32Array
     """[m]; infinite where nothing is hit."""
@@ -218,7 +218,7 @@ class CameraSensors(Sensors[CameraSettings]):
 
 
 def _first_hits(mi: Any, traced: TracedScene, view: View) -> _Hits:
-    """What the ray through the centre of each pixel hits."""
+    """Hits of the rays through the centres of pixels."""
     import drjit as dr
 
     world = _ray_directions(view)

@@ -257,7 +257,7 @@ def _trace(
     with_world: bool,
     measure: Callable[[LidarDevice, Float32Array], Float32Array] | None,
 ) -> _Returns:
-    """What comes back of rays from sensors at these poses, at ranges that ``measure`` may change.
+    """Returns of rays from sensors at these poses, at ranges that ``measure`` may change.
 
     Positions and directions are float64 until they are those of a ray or a point.
     """
@@ -324,7 +324,7 @@ def _trace(
 
 
 def _mounts(sensors: list[tuple[LidarDevice, Pose]], centre: Float64Array) -> Float64Array:
-    """Of sensors, the rotation matrix, row by row, position from a centre [m], least and
+    """Rotation matrix of each sensor, row by row, position from a centre [m], least and
     greatest range [m], Shape ``[14, S]``."""
     return np.array(
         [
@@ -357,7 +357,7 @@ MAX_CELLS = 1 << 26
 
 
 class GridSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the grid is and what goes into it. Give either ``cells`` or ``cell_m``.
+    """Settings of the grid: its place and its content. Give either ``cells`` or ``cell_m``.
 
     Index i along an axis stands for coordinate minimum + i·cell, with cell =
     (maximum − minimum)/cells.

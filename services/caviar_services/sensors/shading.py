@@ -51,7 +51,7 @@ P = TypeVar("P", bound=np.generic)
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one camera sees at one instant is looked at through this: device, optics and world pose."""
+    """View of one camera at one instant: device, optics and world pose."""
 
     device: CameraDevice
     optics: Intrinsics
@@ -59,7 +59,7 @@ class View:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """What every image says of its camera: sensor, intrinsics, position and orientation."""
+        """Fields of every image about its camera: sensor, intrinsics, position and orientation."""
         return {
             "sensor": self.device.name,
             "intrinsics": self.optics,
@@ -127,7 +127,7 @@ class Painter:
         return mean
 
     def _trace(self, view: View, x: Float64Array, y: Float64Array, index: Int64Array) -> _Seen:
-        """What is seen at points of the image [px]; ``index`` [0, 16) chooses where to look for sky."""
+        """Surfaces and light at points of the image [px]; ``index`` [0, 16) chooses where to look for sky."""
         import drjit as dr
 
         mi = self._mi
@@ -225,7 +225,7 @@ class Painter:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What samples of a picture see, as Dr.Jit arrays."""
+    """Surfaces and light that samples of a picture see, as Dr.Jit arrays."""
 
     direction: Any
     distance: Any
@@ -238,7 +238,7 @@ class _Seen:
     hit: Any
 
     def same_surface(self, mi: Any, other: Any) -> Any:
-        """Whether each sample and its ``other`` one lie in one smooth surface."""
+        """Test whether each sample and its ``other`` one lie in one smooth surface."""
         import drjit as dr
 
         between = dr.gather(mi.Float, self.distance, other) * dr.gather(mi.Vector3f, self.direction, other)
@@ -249,7 +249,7 @@ class _Seen:
         return self.hit & dr.gather(mi.Bool, self.hit, other) & flat & alike
 
     def same_picture(self, mi: Any, other: Any) -> Any:
-        """Whether no edge of a surface, a colour or a shadow runs between each sample and its other."""
+        """Test whether no edge of a surface, a colour or a shadow runs between each sample and its other."""
         import drjit as dr
 
         both = dr.gather(mi.Bool, self.hit, other)

@@ -20,8 +20,7 @@ except ModuleNotFoundError as missing:
     raise SetupError(f"the conformance tests need pytest; run: {install_command('testing')}") from missing
 
 from caviar_services.testing.base import Played, ServiceConformance
-from caviar_services.testing.codebooks import CodebookConformance
-from caviar_services.testing.noise import NoiseConformance
+from caviar_services.testing.plugins import CodebookConformance, NoiseConformance
 from caviar_services.testing.roles import (
     CONFORMANCE,
     AgentConformance,

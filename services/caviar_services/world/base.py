@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, quantity
+from caviar_protocol.assets import is_mesh_name
 from caviar_protocol.errors import AssetError, PayloadError, RunError, ScenarioError, SetupError
 from caviar_protocol.fields import PRINTABLE
-from caviar_protocol.geometry import is_mesh_name
 from caviar_protocol.messages import Role
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.scenario.conversion import Place
@@ -29,10 +29,8 @@ from caviar_protocol.scenario.schema import carries, fixed_device, mounted_devic
 from caviar_protocol.space.coordinates import UnitQuaternion, Vector
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import WITHOUT_OBJECT_PREFIX, Device
-from caviar_services.returned import series_of
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult
-from caviar_services.world.assets import object_assets, pattern_assets
-from caviar_services.world.run_time_meshes import RunTimeMeshes
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, Service, StepResult, series_of
+from caviar_services.world.assets import RunTimeMeshes, object_assets, pattern_assets
 from caviar_space.scenery import scenery_assets, scenery_file
 
 
@@ -213,16 +211,7 @@ class World(Service[W]):
             ScenarioError: A device is mounted on an object that can never come; names its key.
         """
         series_of(str, f"{type(self).__name__}.prefixes", self.prefixes())
-        self._check_parents()
-        self._meshes.max_faces = preparation.max_faces
-        scenery = self.settings.scenery or "none"
-        return Prepared(
-            prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
-            notes=(f"scenery: {scenery}",),
-        )
-
-    def _check_parents(self) -> None:
-        """Refuse a device on an object that can never come."""
+        # Refuse a device on an object that can never come.
         # It would be missing in each frame, which looks like bad coverage.
         objects, prefixes = self.known_objects(self.settings), self.prefixes()
         known = prefixes if objects is None else tuple(objects)
@@ -243,6 +232,12 @@ class World(Service[W]):
                     f"{self.run.name!r} can be: {meant}{others}",
                     key=Place("devices").at(spec.name).at("on").key,
                 )
+        self._meshes.max_faces = preparation.max_faces
+        scenery = self.settings.scenery or "none"
+        return Prepared(
+            prefixes=tuple(sorted({*self.prefixes(), *self._mounts.fixed_names})),
+            notes=(f"scenery: {scenery}",),
+        )
 
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
         """Begin an episode; the same arguments lead to the same scenes, bit by bit."""

@@ -18,16 +18,15 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import ITU_MATERIALS
 from caviar_protocol.errors import AssetError, CaviarError, PayloadError, suggestion
-from caviar_protocol.geometry import ITU_MATERIALS
 from caviar_protocol.messages import Input
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.topics import Action
 from caviar_protocol.topics.link import Command
 from caviar_protocol.topics.scene import MESH_REFUSED_PREFIX
 from caviar_services.checkpoint import restored, saved
-from caviar_services.returned import series_of
-from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
+from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult, series_of
 from caviar_services.world.base import ObjectState, World, WorldSettings
 from caviar_space.meshes import Mesh, fitted, ply
 from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
@@ -307,7 +306,12 @@ class EngineWorld(World[WorldSettings]):
                 self._refusals.add(problem)
                 self._refused[f"{MESH_REFUSED_PREFIX}{name}"] = 1
                 _log.warning("%s; objects with it are boxes", problem)
-            return OfferedMesh("", *_box_of(mesh))
+            # Dimensions and centre of the finite vertices of what is no mesh.
+            there = mesh.vertices[np.isfinite(mesh.vertices).all(axis=1)]
+            if not len(there):
+                there = np.zeros((1, 3))
+            low, high = there.min(axis=0), there.max(axis=0)
+            return OfferedMesh("", _vector(np.maximum(high - low, SMALLEST_M)), _vector((low + high) / 2))
         content = ply(unit, material)
         file = f"objects/{name}.ply"
         asset = self.add_mesh(content) if self._is_prepared else self._offered(file, content)
@@ -356,12 +360,3 @@ def _mesh(vertices: Triples, triangles: Triples) -> Mesh:
 def _vector(numbers: Float64Array) -> Vector:
     x, y, z = numbers.tolist()
     return (x, y, z)
-
-
-def _box_of(mesh: Mesh) -> tuple[Vector, Vector]:
-    """Dimensions and centre of the finite vertices of what is no mesh."""
-    there = mesh.vertices[np.isfinite(mesh.vertices).all(axis=1)]
-    if not len(there):
-        there = np.zeros((1, 3))
-    low, high = there.min(axis=0), there.max(axis=0)
-    return _vector(np.maximum(high - low, SMALLEST_M)), _vector((low + high) / 2)

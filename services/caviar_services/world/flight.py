@@ -31,15 +31,19 @@ from caviar_protocol.topics.scene import LEFT_GEOFENCE_PREFIX, OUTSIDE_GEOFENCE_
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, turning
-from caviar_services.world.flight_commands import motion_of, order_of, place_outside
-from caviar_services.world.flight_dynamics import Flyer, FlyerState, Limits
+from caviar_services.world.flight_dynamics import (
+    Flyer,
+    FlyerState,
+    Limits,
+    motion_of,
+    order_of,
+    place_outside,
+)
 from caviar_services.world.quadrotor.airframe import GRAVITY, Airframe, plant_named
-from caviar_services.world.quadrotor.contacts import OnCollision
-from caviar_services.world.quadrotor.control import Controller
+from caviar_services.world.quadrotor.control import Battery, Controller, QuadrotorState
 from caviar_services.world.quadrotor.fleet import Fleet
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
-from caviar_services.world.quadrotor.state import Battery, QuadrotorState
-from caviar_services.world.quadrotor.wind import Wind
+from caviar_services.world.quadrotor.surroundings import OnCollision, Wind
 from caviar_services.world.trajectory import (
     MovingObject,
     NamedObject,

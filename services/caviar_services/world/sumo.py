@@ -1,4 +1,10 @@
-"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process."""
+"""World ``sumo``: road traffic and people of Eclipse SUMO, in this process.
+
+World ``sumo-actuated``: the world ``sumo`` whose vehicles and traffic lights agents command.
+
+It is an implementation of its own because commands close the loop: a frame waits for the actions of the one
+before, while frames of ``sumo`` overlap.
+"""
 
 from __future__ import annotations
 
@@ -14,26 +20,28 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import Vector3, quantity
 from caviar_protocol.errors import RunError, ScenarioError
+from caviar_protocol.messages import Input
 from caviar_protocol.seeding import derive_seed
 from caviar_protocol.space.coordinates import Vector
+from caviar_protocol.topics import Action
 from caviar_protocol.topics.scene import BESIDE_ROAD_PREFIX, SIMULATOR_SAYS_PREFIX
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
-from caviar_services.world.people import People
-from caviar_services.world.sumo_commands import Commanded, carry_out
+from caviar_services.world.sumo_commands import Commanded, carry_out, traffic_commands
 from caviar_services.world.sumo_conventions import (
     Heading,
+    People,
     Placement,
     body_pose,
+    check_spacing,
     distance_to_line,
     heading,
     object_class,
+    step_length_ms,
 )
 from caviar_services.world.sumo_inputs import Inputs, checked_inputs
-from caviar_services.world.sumo_process import Simulation, load_libsumo
-from caviar_services.world.sumo_states import TrafficStates
-from caviar_services.world.sumo_steps import check_spacing, step_length_ms
+from caviar_services.world.sumo_process import Simulation, TrafficStates, load_libsumo
 from caviar_space.meshes import SHAPES
 
 _NS_PER_MS = 1_000_000
@@ -196,7 +204,16 @@ class SumoWorld(World[SumoSettings]):
             if not states.file(episode).exists():
                 states.make(episode + 1, self._passed)
             simulation.start(states.arguments(episode))
-            self._take_over(simulation)
+            # Note the vehicles and persons of a saved state, in the order of their departure.
+            for domain, known in (
+                (simulation.api.vehicle, self._vehicles),
+                (simulation.api.person, self._persons),
+            ):
+                names = domain.getIDList()
+                if domain is simulation.api.vehicle:
+                    names = sorted(names, key=lambda name: (simulation.api.vehicle.getDeparture(name), name))
+                for name in names:
+                    known[name] = self._kind(domain, name)
             self._begin_here(simulation)
             return
         simulation.start(self._arguments(derive_seed(seed, episode, self.run.name)))
@@ -248,18 +265,6 @@ class SumoWorld(World[SumoSettings]):
 
     def _passed(self, now_s: float, end_s: float) -> None:
         self.run.progress(f"one traffic for all episodes: {now_s:.0f} of {end_s:.0f} s", 0.0)
-
-    def _take_over(self, simulation: Simulation) -> None:
-        """Note the vehicles and persons of a saved state, in the order of their departure."""
-        for domain, known in (
-            (simulation.api.vehicle, self._vehicles),
-            (simulation.api.person, self._persons),
-        ):
-            names = domain.getIDList()
-            if domain is simulation.api.vehicle:
-                names = sorted(names, key=lambda name: (simulation.api.vehicle.getDeparture(name), name))
-            for name in names:
-                known[name] = self._kind(domain, name)
 
     def objects_at(self, elapsed_ns: int) -> Iterable[ObjectState]:
         """Vehicles, then persons, each in the order of their departure."""
@@ -391,7 +396,17 @@ class SumoWorld(World[SumoSettings]):
             speed = domain.getSpeed(name)
             pose = body_pose(bumper, towards, dimensions[0], dimensions[2], self._placement)
             if dimensions[0] > _LONG_M:
-                self._follow(name, bumper, angle, dimensions)
+                # Note a long vehicle whose rear is beside the way that its front has gone: it is one
+                # rigid box.
+                length, width, _ = dimensions
+                front = complex(bumper[0], bumper[1])
+                rear = front - cmath.rect(length, math.radians(90.0 - angle))
+                trail = self._trails.setdefault(name, [rear])
+                trail.append(front)
+                if distance_to_line(rear, trail) > width:
+                    self._beside_road.add(self._prefix + name)
+                while len(trail) > 2 and abs(trail[1] - front) > 2 * length:
+                    del trail[0]
             fx, fy, fz = towards.forward
             yield ObjectState(
                 name=self._prefix + name,
@@ -425,18 +440,6 @@ class SumoWorld(World[SumoSettings]):
                 angular_velocity=(0.0, 0.0, turning(body.yaw_rate)),
             )
 
-    def _follow(self, name: str, bumper: Vector, angle: float, dimensions: Vector) -> None:
-        """Note a long vehicle whose rear is beside the way that its front has gone: it is one rigid box."""
-        length, width, _ = dimensions
-        front = complex(bumper[0], bumper[1])
-        rear = front - cmath.rect(length, math.radians(90.0 - angle))
-        trail = self._trails.setdefault(name, [rear])
-        trail.append(front)
-        if distance_to_line(rear, trail) > width:
-            self._beside_road.add(self._prefix + name)
-        while len(trail) > 2 and abs(trail[1] - front) > 2 * length:
-            del trail[0]
-
     def _yaw_rate(self, vehicle: str, angle: float) -> float:
         """[rad/s] Of a vehicle whose angle [°] is this, clockwise: over the last step. One that SUMO puts
         elsewhere has none."""
@@ -456,3 +459,78 @@ def _tuple(files: Files) -> tuple[str, ...]:
     if isinstance(files, str):
         return (files,) if files else ()
     return files
+
+
+class ActuatedSumoWorld(SumoWorld):
+    """Traffic of a SUMO network that obeys `DriveCommand` and `SignalCommand`.
+
+    Commands are carried out at the beginning of the frame after the one in which they were decided. Traffic
+    lights have the names of SUMO behind the world's prefix.
+
+    Args:
+        settings: Those of the world ``sumo``.
+        run: What the world knows about the run.
+
+    Example:
+        >>> world = ActuatedSumoWorld(SumoSettings(net="/maps/town.net.xml"), RunInfo(name="traffic"))
+        >>> [entry.topic for entry in world.inputs]
+        ['action']
+    """
+
+    inputs: ClassVar[tuple[Input, ...]] = (Input(topic="action", lag=1, required=False),)
+
+    def __init__(self, settings: SumoSettings, run: RunInfo) -> None:
+        super().__init__(settings, run)
+        self._alone = True
+        self._knows_past = False
+
+    def prepare(self, preparation: Preparation) -> Prepared:
+        """See `SumoWorld.prepare`.
+
+        Args:
+            preparation: Who else brings scenes, among others.
+        """
+        self._alone = len(preparation.producers.get("scene", ())) <= 1
+        return super().prepare(preparation)
+
+    def begin(self, episode: int, seed: int) -> None:
+        """See `SumoWorld.begin`.
+
+        Args:
+            episode, seed: Which.
+        """
+        self._knows_past = False
+        super().begin(episode, seed)
+
+    def step(self, frame: Frame) -> StepResult:
+        """See `SumoWorld.step`; commands act from the state of the frame before on.
+
+        Args:
+            frame: With the actions of the frame before.
+
+        Raises:
+            PayloadError: A command is for what is not there, or has a value that is not.
+            RunError: The process before this one took the commands of the episode with it.
+        """
+        if frame.number > 0 and not self._knows_past:
+            raise RunError(
+                f"world {self.run.name!r} came back in frame {frame.number}: what agents had commanded is "
+                "lost with the process that knew it; have states saved (run.checkpoint_frames above 0), "
+                "and start the run again"
+            )
+        self._knows_past = True
+        actions = frame.payloads("action", Action)
+        commands = traffic_commands(actions, self.run.name, self._prefix, alone=self._alone)
+        if commands:
+            carry_out(self._started().api, commands, self._prefix)
+            self._commanded.append(Commanded(step=self._steps, commands=commands))
+        return super().step(frame)
+
+    def restore(self, state: bytes) -> None:
+        """See `SumoWorld.restore`.
+
+        Args:
+            state: Of `checkpoint`, with all commands of the episode.
+        """
+        super().restore(state)
+        self._knows_past = True

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import PayloadError, suggestion
-from caviar_protocol.topics import Action, DriveCommand, RoadStop, SignalCommand
+from caviar_protocol.topics import Action, DriveCommand, SignalCommand
 from caviar_protocol.topics.link import Command, MotionCommand, TrafficCommand
 
 _WorldCommand = MotionCommand | TrafficCommand
@@ -168,23 +168,19 @@ def _check(api: Any, command: DriveCommand, road: str) -> None:
             f"lane {command.lane} is commanded"
         )
     if command.stop is not None:
-        _check_stop(api, command, command.stop)
-
-
-def _check_stop(api: Any, command: DriveCommand, stop: RoadStop) -> None:
-    _check_finite(command, stop.position, stop.duration)
-    lanes = api.edge.getLaneNumber(stop.road)
-    if stop.lane >= lanes:
-        raise PayloadError(
-            f"{command.object!r}: road {stop.road!r} has lanes 0 to {lanes - 1}, and a stop on lane "
-            f"{stop.lane} is commanded"
-        )
-    length = api.lane.getLength(f"{stop.road}_{stop.lane}")
-    if stop.position > length:
-        raise PayloadError(
-            f"{command.object!r}: road {stop.road!r} is {length:g} m long, and a stop at "
-            f"{stop.position:g} m is commanded"
-        )
+        _check_finite(command, command.stop.position, command.stop.duration)
+        lanes = api.edge.getLaneNumber(command.stop.road)
+        if command.stop.lane >= lanes:
+            raise PayloadError(
+                f"{command.object!r}: road {command.stop.road!r} has lanes 0 to {lanes - 1}, and a stop on "
+                f"lane {command.stop.lane} is commanded"
+            )
+        length = api.lane.getLength(f"{command.stop.road}_{command.stop.lane}")
+        if command.stop.position > length:
+            raise PayloadError(
+                f"{command.object!r}: road {command.stop.road!r} is {length:g} m long, and a stop at "
+                f"{command.stop.position:g} m is commanded"
+            )
 
 
 def _check_finite(command: TrafficCommand, *values: float) -> None:

@@ -1,5 +1,4 @@
 """The page of a dataset, ``caviar dataset look``: one HTML file that opens without a network.
 
-`page` puts it together of sections, and `description` says what the dataset is; `maps`, `distributions` and
-`scans` draw on `pictures`; `data` is what they draw, `html` the markup around it.
+`data` reads what is shown, `figures` and `maps` draw it, and `page` fills the template ``page.html``.
 """

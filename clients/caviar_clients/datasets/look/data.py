@@ -1,34 +1,30 @@
-"""What ``caviar dataset look`` shows of a dataset: users of the catalogue, times, a sample of recordings."""
+"""Data of the page of a dataset: users of the catalogue, times of episodes, a sample of recordings."""
 
 from __future__ import annotations
 
 import random
-import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from datetime import datetime
+from functools import partial
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from caviar_clients.datasets.catalogue import Catalogue
-from caviar_clients.datasets.look.units import time_text
 from caviar_clients.datasets.reader import Dataset
-from caviar_clients.plots.rays import Footprints
+from caviar_clients.datasets.rows import UserRow, whole_recording
+from caviar_clients.datasets.texts import time_text
+from caviar_clients.datasets.user_rows import Columns
+from caviar_clients.plots.rays import OUTLINE, Footprints, from_above
 from caviar_clients.plots.sensors import object_colours
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.space.scene import antennas, device_pose
-from caviar_protocol.topics import (
-    Camera,
-    Channel,
-    Depth,
-    Lidar,
-    LidarScan,
-    Scene,
-    Segmentation,
-)
+from caviar_protocol.topics import Camera, Channel, Depth, Lidar, LidarScan, Scene, Segmentation
 
 Progress = Callable[[str, int, int], None]
 """``progress(what, done, of)``: how far a part of the work is."""
@@ -80,14 +76,13 @@ class UserColumns:
 
     @property
     def placed(self) -> BoolArray:
-        """Which of them have a position."""
+        """Mask of the users that have a position."""
         return np.isfinite(self.x) & np.isfinite(self.y)
 
 
-_USER_COLUMNS: dict[str, Any] = {
-    "x_m": float, "y_m": float, "valid": bool, "los": bool, "paths": int, "gain_db": float,
-    "delay_spread_s": float, "tx_beam": int, "rx_beam": int,
-}  # fmt: skip
+_USER_COLUMNS = (
+    "x_m", "y_m", "valid", "los", "paths", "gain_db", "delay_spread_s", "tx_beam", "rx_beam", "carrier", "tx",
+)  # fmt: skip
 
 
 def read_users(catalogue: Catalogue, progress: Progress) -> UserColumns:
@@ -101,27 +96,23 @@ def read_users(catalogue: Catalogue, progress: Progress) -> UserColumns:
     _, ((rows,),) = catalogue.query("SELECT count(*) FROM users")
     _, pairs = catalogue.query("SELECT DISTINCT carrier, tx FROM users ORDER BY carrier, tx")
     groups = {pair: at for at, pair in enumerate(pairs)}
+
+    def arrays_of(found: list[Any]) -> list[Any]:
+        columns = Columns.of_rows(UserRow, _USER_COLUMNS, found)
+        *numbers, carrier, tx = columns.values()
+        return [*numbers, np.array([groups[pair] for pair in zip(carrier, tx, strict=True)], dtype=int)]
+
     together = max(1, _ROWS_AT_ONCE * len(episodes) // max(rows, 1))
-    names = ", ".join(_USER_COLUMNS)
-    parts: list[list[Any]] = [[] for _ in range(len(_USER_COLUMNS) + 1)]
+    parts = [arrays_of([])]
     for start in range(0, len(episodes), together):
         wanted = episodes[start : start + together]
         _, found = catalogue.query(
-            f"SELECT {names}, carrier, tx FROM users WHERE episode BETWEEN ? AND ?",  # noqa: S608 - our own
+            f"SELECT {', '.join(_USER_COLUMNS)} FROM users WHERE episode BETWEEN ? AND ?",  # noqa: S608 - our own
             (wanted[0], wanted[-1]),
         )
-        if found:
-            *columns, carrier, tx = zip(*found, strict=True)
-            for part, values, kind in zip(parts, columns, _USER_COLUMNS.values(), strict=False):
-                given = [-1 if value is None else value for value in values] if kind is int else values
-                part.append(np.array(given, dtype=kind))
-            parts[-1].append(np.array([groups[pair] for pair in zip(carrier, tx, strict=True)], dtype=int))
+        parts.append(arrays_of(found))
         progress("users of the catalogue", min(start + together, len(episodes)), len(episodes))
-    kinds = (*_USER_COLUMNS.values(), int)
-    arrays: list[Any] = [
-        np.concatenate(part or [np.zeros(0, kind)]) for part, kind in zip(parts, kinds, strict=True)
-    ]
-    return UserColumns(tuple(pairs), *arrays)
+    return UserColumns(tuple(pairs), *map(np.concatenate, zip(*parts, strict=True)))
 
 
 # --- a sample of the recordings --------------------------------------------------------------------------
@@ -131,22 +122,15 @@ ZENITH_EDGES = np.linspace(0.0, 180.0, 181)
 """Limits of the classes of angles [°]."""
 
 
-@dataclass
-class Angles:
-    """How often directions occur, at one end of the paths: counts by class, zenith and azimuth."""
-
-    zenith: Int64Array = field(default_factory=lambda: np.zeros(len(ZENITH_EDGES) - 1, dtype=np.int64))
-    azimuth: Int64Array = field(default_factory=lambda: np.zeros(len(AZIMUTH_EDGES) - 1, dtype=np.int64))
-
-    def add(self, angles: Float64Array) -> None:
-        """Count directions.
-
-        Args:
-            angles: Zenith and azimuth [rad], Shape ``[P, 2]``.
-        """
-        degrees = np.degrees(angles)
-        self.zenith += np.histogram(degrees[:, 0], ZENITH_EDGES)[0]
-        self.azimuth += np.histogram((degrees[:, 1] + 180.0) % 360.0 - 180.0, AZIMUTH_EDGES)[0]
+def _angle_counts(angles: Float64Array) -> Int64Array:
+    """Count directions (zenith and azimuth [rad], Shape ``[P, 2]``) by class, Shape ``[2, 180]``."""
+    zenith, azimuth = np.degrees(angles).T
+    return np.stack(
+        [
+            np.histogram(zenith, ZENITH_EDGES)[0],
+            np.histogram((azimuth + 180.0) % 360.0 - 180.0, AZIMUTH_EDGES)[0],
+        ]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +150,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What one camera saw at one instant."""
+    """Pictures of one camera at one instant."""
 
     sensor: str
     moment: str
@@ -176,7 +160,7 @@ class Shot:
 
 @dataclass
 class Sample:
-    """What was read of some recordings.
+    """Numbers of some recordings.
 
     Args:
         episodes: Numbers of the episodes.
@@ -191,11 +175,9 @@ class Sample:
     cut: bool = False
     """Whether the episodes have more scenes than were read."""
     paths: int = 0
-    departure: Angles = field(default_factory=Angles)
-    arrival: Angles = field(default_factory=Angles)
-    strongest_departure: Angles = field(default_factory=Angles)
-    """Of the strongest path of each user only."""
-    strongest_arrival: Angles = field(default_factory=Angles)
+    angles: Int64Array = field(default_factory=lambda: np.zeros((4, 2, 180), dtype=np.int64))
+    """Counts of directions: at departure and arrival of all paths, then of the strongest path of each user;
+    each by class of zenith and of azimuth, Shape ``[4, 2, 180]``."""
     has_h: bool = False
     apart_s: list[float] = field(default_factory=list)
     """Time between two scenes [s], of which ``correlation`` is."""
@@ -209,7 +191,7 @@ class Sample:
 
     @property
     def read(self) -> int:
-        """How many episodes were read."""
+        """Number of episodes that were read."""
         return len(self.episodes) - len(self.left_out)
 
     def add(self, other: Sample) -> None:
@@ -217,10 +199,7 @@ class Sample:
         self.scenes += other.scenes
         self.cut |= other.cut
         self.paths += other.paths
-        for name in ("departure", "arrival", "strongest_departure", "strongest_arrival"):
-            counts, more = getattr(self, name), getattr(other, name)
-            counts.zenith += more.zenith
-            counts.azimuth += more.azimuth
+        self.angles += other.angles
         self.has_h |= other.has_h
         self.apart_s += other.apart_s
         self.correlation += other.correlation
@@ -245,21 +224,13 @@ def read_sample(data: Dataset, topics: set[str], progress: Progress) -> Sample:
     for at, number in enumerate(numbers):
         part = Sample((number,), there=1)
         try:
-            _read_episode(part, _whole(data, number), topics, at, scans=len(sample.scans))
+            recording = whole_recording(partial(data.episode, number))
+            _read_episode(part, recording, topics, at, scans=len(sample.scans))
             sample.add(part)
         except RecordingError as error:
             sample.left_out.append((number, str(error)))
         progress("sample of the recordings", at + 1, len(numbers))
     return sample
-
-
-def _whole(data: Dataset, number: int) -> Recording:
-    """The recording of an episode, without a gap."""
-    with warnings.catch_warnings(action="ignore"):  # of damage, which is the error
-        recording = data.episode(number)
-    if recording.damage or not recording.complete:
-        raise RecordingError(recording.damage[0] if recording.damage else f"{recording.path} breaks off")
-    return recording
 
 
 def _read_episode(part: Sample, recording: Recording, topics: set[str], at: int, scans: int) -> None:
@@ -296,16 +267,14 @@ def _add_angles(sample: Sample, channel: Channel) -> None:
     power = (np.abs(channel.a) ** 2).sum(axis=0)
     some = power > 0.0
     sample.paths += int(some.sum())
-    sample.departure.add(channel.aod[some])
-    sample.arrival.add(channel.aoa[some])
     best = []
     for tx in channel.tx:
         for rx in channel.rx:
             pair = channel.pair(tx, rx)
             if tx != rx and power[pair].any():
                 best.append(pair.start + int(power[pair].argmax()))
-    sample.strongest_departure.add(channel.aod[best])
-    sample.strongest_arrival.add(channel.aoa[best])
+    ends = channel.aod[some], channel.aoa[some], channel.aod[best], channel.aoa[best]
+    sample.angles += np.stack(list(map(_angle_counts, ends)))
 
 
 def _add_correlation(
@@ -330,8 +299,6 @@ def _add_correlation(
 
 
 def _add_scan(sample: Sample, frame: RecordedFrame, scene: Scene | None) -> bool:
-    from caviar_clients.plots.rays import OUTLINE, from_above
-
     for lidar in frame.payloads("lidar", Lidar).values():
         for scan in lidar.scans:
             if not len(scan.range) and scan.grid is None:
@@ -394,9 +361,112 @@ def _moment(frame: RecordedFrame) -> str:
     return f"episode {frame.episode}, scene {frame.number}, t = {time_text(frame.t_ns * 1e-9)}"
 
 
+# --- times of the generation -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Throughput:
+    """Speed of the generation: scenes per second over time, and the time of each service."""
+
+    edges_s: Float64Array
+    """Limits of the intervals, from the first episode, interruptions left out [s], Shape ``[N + 1]``."""
+    rate: Float64Array
+    """Scenes per second, Shape ``[N]``."""
+    interruptions_s: tuple[float, ...]
+    """Where nothing was played for long, on the same axis [s]."""
+    scenes: int
+    """Of the episodes whose times are known."""
+    episodes: int
+    busy_s: float
+    """Wall time of the episodes, added up: with two workers two seconds pass in one [s]."""
+    services_s: Mapping[str, float]
+    """Wall time of each service, added up; what is left of ``busy_s`` is start, reset and saving [s]."""
+    hosts: int
+    processes: int
+
+    @property
+    def elapsed_s(self) -> float:
+        """Without interruptions [s]."""
+        return float(self.edges_s[-1])
+
+
+INTERVALS = 60
+_INTERRUPTION_S = 60.0
+
+
+def read_throughput(catalogue: Catalogue) -> Throughput | None:
+    """Read how fast the episodes were played; None where no times are known."""
+    _, rows = catalogue.query(
+        "SELECT t.started, t.wall_s, t.host, t.pid, t.detail, e.scenes FROM timings t JOIN episodes e "
+        "USING (episode) WHERE t.started IS NOT NULL AND t.wall_s > 0"
+    )
+    if not rows:
+        return None
+    started, wall, hosts, pids, details, scenes = zip(*rows, strict=True)
+    begin = np.array([_instant(catalogue, text) for text in started])
+    walls, counts = np.array(wall), np.array(scenes, dtype=float)
+    begin, interruptions = _without_interruptions(begin, walls)
+    # Intervals are of two episodes or more each, unless there are few.
+    intervals = min(INTERVALS, max(len(rows) // 2, min(len(rows), 10)))
+    edges = np.linspace(0.0, float((begin + walls).max()), intervals + 1)
+    # Scenes of an episode are spread evenly over its time.
+    played = [float((counts * np.clip((edge - begin) / walls, 0.0, 1.0)).sum()) for edge in edges]
+    services: dict[str, float] = {}
+    for detail in details:
+        for name, seconds in _services_s(catalogue, detail).items():
+            services[name] = services.get(name, 0.0) + seconds
+    return Throughput(
+        edges_s=edges,
+        rate=np.diff(played) / np.diff(edges),
+        interruptions_s=interruptions,
+        scenes=int(counts.sum()),
+        episodes=len(rows),
+        busy_s=float(walls.sum()),
+        services_s=services,
+        hosts=len(set(hosts)),
+        processes=len(set(zip(hosts, pids, strict=True))),
+    )
+
+
+def _instant(catalogue: Catalogue, text: str) -> float:
+    """Seconds since 1970 of a time of the table of times."""
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError) as error:
+        raise RecordingError(
+            f"{catalogue.path}: timings.started is {text!r:.80}, no time of ISO 8601"
+        ) from error
+
+
+class _Detail(msgspec.Struct):
+    services_s: dict[str, Annotated[float, msgspec.Meta(ge=0)]] = {}
+
+
+def _services_s(catalogue: Catalogue, text: str | None) -> dict[str, float]:
+    """Wall time of each service by the table of times [s]."""
+    try:
+        return msgspec.json.decode(text or "{}", type=_Detail).services_s
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise RecordingError(f"{catalogue.path}: timings.detail is {text!r:.80}: {error}") from error
+
+
+def _without_interruptions(begin: Float64Array, wall: Float64Array) -> tuple[Float64Array, tuple[float, ...]]:
+    """Times from the first one, moved together where nothing was played for long, and where that was."""
+    longest = max(_INTERRUPTION_S, 10.0 * float(np.median(wall)))
+    order = np.argsort(begin, kind="stable")
+    moved, cut, busy_until, places = np.zeros(len(begin)), float(begin[order[0]]), -np.inf, list[float]()
+    for at in order:
+        if begin[at] - busy_until > longest and np.isfinite(busy_until):
+            cut += float(begin[at] - busy_until)
+            places.append(float(begin[at]) - cut)
+        moved[at] = begin[at] - cut
+        busy_until = max(busy_until, float(begin[at] + wall[at]))
+    return moved, tuple(places)
+
+
 @dataclass(frozen=True, eq=False)
 class Content:
-    """All that the sections are made of."""
+    """Data of all sections of a page."""
 
     data: Dataset
     catalogue: Catalogue

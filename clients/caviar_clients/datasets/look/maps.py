@@ -1,30 +1,29 @@
-"""Maps of the page of a dataset: where users are, their gain, and what hides them."""
+"""Figures of the page of a dataset that are seen from above: users, their gain, LIDAR scans."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from caviar_clients.datasets.look.data import (
-    UserColumns,
-)
-from caviar_clients.datasets.look.pictures import (
-    CELLS,
-    DOTS,
-    Draw,
-    Theme,
-)
+from caviar_clients.datasets.look.data import Scan, UserColumns
+from caviar_clients.datasets.look.figures import Draw, Theme, legend_of_all, plain
 from caviar_clients.plots.map import View, colour_limits, draw_scenery
 from caviar_clients.plots.rays import Footprints
 from caviar_clients.plots.style import VERMILION, legend_square
 from caviar_protocol.arrays import BoolArray, Float64Array
 
+DOTS = 3000
+"""Places up to this number are dots in a map of gains; more are cells."""
+CELLS = 80
+"""Cells of a map, along its longer side."""
+
 
 @dataclass(frozen=True, eq=False)
 class MapOf:
-    """What stands still in the maps."""
+    """The parts of all maps that stand still."""
 
     footprints: Footprints | None
     transmitters: Float64Array
@@ -76,17 +75,10 @@ def _dots(users: UserColumns) -> Float64Array | None:
     return np.column_stack([x[order][starts], y[order][starts], median])
 
 
-def _gains(users: UserColumns, place: MapOf) -> Float64Array:
-    """What is coloured: of the dots, or of all users that have a place and a path."""
-    if place.dots is not None:
-        return place.dots[:, 2]
-    return users.gain_db[users.placed & np.isfinite(users.gain_db)]
-
-
 def _within(
     footprints: Footprints | None, left: float, right: float, bottom: float, top: float
 ) -> Footprints | None:
-    """What of a town's scenery lies in the view."""
+    """The part of a town's scenery that lies in the view."""
     if footprints is None:
         return None
 
@@ -114,7 +106,8 @@ def draw_gain(users: UserColumns, place: MapOf) -> Draw:
         from matplotlib.colors import ListedColormap
 
         axes = _map_axes(drawn, theme, place)
-        gains = _gains(users, place)
+        some = users.placed & np.isfinite(users.gain_db)
+        gains = users.gain_db[some] if place.dots is None else place.dots[:, 2]
         low, high, extend = colour_limits(gains[np.isfinite(gains)])
         colours: dict[str, Any] = {"cmap": theme.colours, "vmin": low, "vmax": high}
         shown = None
@@ -133,7 +126,6 @@ def draw_gain(users: UserColumns, place: MapOf) -> Draw:
                     edgecolors=theme.paper, zorder=3, **colours,
                 )  # fmt: skip
         else:
-            some = users.placed & np.isfinite(users.gain_db)
             without = users.placed & ~some
             if without.any():
                 # Below the others: what shows are cells in which nobody has a path.
@@ -183,9 +175,7 @@ def _finish_map(drawn: Any, axes: Any, theme: Theme, place: MapOf) -> None:
             linewidths=0.8 if few else 0.3, zorder=5, label=label,
         )  # fmt: skip
     axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        drawn.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    legend_of_all(drawn, "lower", 3)
 
 
 def cell_m(place: MapOf) -> float:
@@ -197,7 +187,7 @@ def cell_m(place: MapOf) -> float:
 
 
 def _cells(
-    axes: Any, place: MapOf, x: Float64Array, y: Float64Array, values: Float64Array, of: Any, **colours: Any
+    axes: Any, place: MapOf, x: Float64Array, y: Float64Array, values: Float64Array, mean: Any, **colours: Any
 ) -> Any:
     """Colour each cell by a number of the values within it."""
     (left, right), (bottom, top) = place.view
@@ -210,7 +200,7 @@ def _cells(
     cells, starts = np.unique(at[order], return_index=True)
     grid = np.full(rows * columns, np.nan)
     for cell, part in zip(cells, np.split(values[order], starts[1:]), strict=True):
-        grid[cell] = of(part)
+        grid[cell] = mean(part)
     shown = axes.imshow(
         np.ma.masked_invalid(grid.reshape(rows, columns)), origin="lower", interpolation="none",
         extent=(west, west + columns * edge, south, south + rows * edge), **{"zorder": 2, **colours},
@@ -219,4 +209,90 @@ def _cells(
     return shown
 
 
-# --- shares and histograms -------------------------------------------------------------------------------
+def draw_scans(scans: Sequence[Scan]) -> Draw:
+    """A panel for each LIDAR scan, from above."""
+
+    def draw(drawn: Any, theme: Theme) -> None:
+        rows, columns = (len(scans), 1) if _is_wide(scans) else (1, len(scans))
+        panels = drawn.subplots(rows, columns, squeeze=False)
+        for axes, scan in zip(panels.ravel(), scans, strict=True):
+            if scan.grid is not None:
+                _draw_grid(axes, scan.grid, theme)
+            else:
+                _draw_points(drawn, axes, scan, theme)
+            axes.scatter(
+                *scan.position, marker="*", s=130, color=VERMILION, edgecolors=theme.paper, linewidths=0.8,
+                zorder=5, label="the sensor",
+            )  # fmt: skip
+            (left, right), (bottom, top) = _scan_view(scan)
+            axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+            title = plain(scan.title)
+            axes.set_title(title.replace("\n", ", ") if columns == 1 else title, fontsize=9.5)
+        for axes in panels[-1]:
+            axes.set_xlabel("x, east [m]")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("y, north [m]")
+        if rows > 1 and len({_scan_view(scan) for scan in scans}) == 1:
+            for axes in panels[:-1, 0]:
+                axes.tick_params(labelbottom=False)  # as those below
+        legend_of_all(drawn, "lower", 4)
+
+    return draw
+
+
+def scans_height(scans: Sequence[Scan]) -> float:
+    """Height of the figure of these scans [inches]."""
+    if not _is_wide(scans):
+        return 4.7 if len(scans) > 1 else 6.2
+    heights = [(top - bottom) / (right - left) for (left, right), (bottom, top) in map(_scan_view, scans)]
+    return 0.9 + sum(max(7.8 * height, 0.7) + 0.45 for height in heights)
+
+
+def _is_wide(scans: Sequence[Scan]) -> bool:
+    """Check whether scans stand one below the other: those along a street."""
+    views = [_scan_view(scan) for scan in scans]
+    return all((right - left) > 2.0 * (top - bottom) for (left, right), (bottom, top) in views)
+
+
+def _draw_grid(axes: Any, grid: tuple[Float64Array, tuple[float, float, float, float]], theme: Theme) -> None:
+    from matplotlib.colors import ListedColormap
+
+    cells, extent = grid
+    colours = [theme.second, VERMILION, theme.area, theme.first]
+    axes.imshow(
+        cells, origin="lower", extent=extent, interpolation="none", vmin=-2.5, vmax=1.5,
+        cmap=ListedColormap(colours),
+    )  # fmt: skip
+    for value, label in ((1, "obstacle"), (-1, "transmitter"), (-2, "receiver")):
+        if (cells == value).any():
+            legend_square(axes, label, colours[value + 2], theme.muted)
+
+
+def _draw_points(drawn: Any, axes: Any, scan: Scan, theme: Theme) -> None:
+    from matplotlib.collections import PolyCollection
+
+    height = scan.points[:, 2]
+    low, high = np.percentile(height, [1, 99]) if len(height) else (0.0, 1.0)
+    shown = axes.scatter(
+        *scan.points[:, :2].T, c=height, s=1.2, linewidths=0, cmap=theme.colours, vmin=low,
+        vmax=max(high, low + 0.1),
+    )  # fmt: skip
+    drawn.colorbar(shown, ax=axes, label="Height z [m]", orientation="horizontal", shrink=0.8, pad=0.02)
+    boxes: Any = scan.boxes
+    style: dict[str, Any] = {"facecolors": "none", "edgecolors": theme.ink, "linewidths": 0.7}
+    axes.add_collection(PolyCollection(boxes, **style))
+
+
+def _scan_view(scan: Scan) -> View:
+    """Limits of what is shown [m]: a square around nearly all points, or the grid."""
+    if scan.grid is not None:
+        left, right, bottom, top = scan.grid[1]
+        return (left, right), (bottom, top)
+    around = np.array([scan.position])
+    if len(scan.points):
+        # Nearly: one hit on a distant tower would make the rest a dot.
+        around = np.vstack([around, np.percentile(scan.points[:, :2], [0.5, 99.5], axis=0)])
+    low, high = around.min(axis=0), around.max(axis=0)
+    half = max(float((high - low).max()) / 2 * 1.05, 10.0)
+    (x, y) = ((low + high) / 2).tolist()
+    return (x - half, x + half), (y - half, y + half)

@@ -1,40 +1,36 @@
-"""What physics says about the scenes of a dataset, computed anew from positions, scenery and H.
+"""Physics of the scenes of a dataset, computed anew from positions, scenery and H.
 
-`path_checks` has what paths and H have to be, `beam_checks` beams and SNRs. Here stand lines of sight,
-reciprocity, and how objects move from one scene to the next.
+`channel_checks` has what paths, H, beams and SNRs have to be. Here stand lines of sight, reciprocity, and how
+objects move from one scene to the next.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 
-from caviar_clients.datasets.verification.beam_checks import (
+from caviar_clients.datasets.verification import Finding
+from caviar_clients.datasets.verification.channel_checks import (
     BEAM,
-    FROM_PATHS,
-    User,
-    arrays_fit,
-    check_beams,
-    check_flags,
-    check_snr,
-)
-from caviar_clients.datasets.verification.findings import Finding
-from caviar_clients.datasets.verification.path_checks import (
     DELAY,
+    FROM_PATHS,
     GAIN_DB,
     Pair,
+    User,
+    check_beams,
+    check_flags,
     check_gains,
     check_geometry,
     check_matrix,
+    check_snr,
     matrix_of,
     pair_of,
 )
-from caviar_clients.datasets.verification.recording_checks import lacking_assets
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import AssetError, CaviarError
 from caviar_protocol.messages import Status
@@ -45,12 +41,10 @@ from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaDevice, Carrier, Channel, Link, Scene
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.clearance import Boxes, Surfaces
 from caviar_services.channel.propagation.patterns import Patterns
 from caviar_services.pattern_files import read_pattern
+from caviar_space.obstacles import Boxes, Surfaces
 from caviar_space.scenery import scenery_triangles
-
-__all__ = ["Finding", "PhysicsChecks"]
 
 T = TypeVar("T", Channel, Link)
 
@@ -122,7 +116,7 @@ class PhysicsChecks:
             if before is not None:
                 yield from _continuity(*before, frame, scene)
             before = frame, scene
-            for name, asset in lacking_assets(scene, assets):
+            for name, asset in _lacking_assets(scene, assets):
                 if (name, asset) not in said:  # in its first scene
                     said.add((name, asset))
                     what = f"file of {name}"
@@ -155,7 +149,7 @@ class PhysicsChecks:
                 h = recorded.get((c, pair.tx, pair.rx))
                 if h is not None:
                     yield from check_matrix(pair, c, h)
-                    if arrays_fit(h, pair.ends[0].array, pair.ends[1].array):
+                    if h.shape == (pair.ends[1].array.size, pair.ends[0].array.size):
                         matrices[user] = h, BEAM
                 elif channel.rung in PLANE_WAVES and (summed := matrix_of(pair, c)) is not None:
                     matrices[user] = summed, FROM_PATHS
@@ -191,8 +185,8 @@ class PhysicsChecks:
             yield pair.finding("line of sight", words[not is_free], words[is_free])
 
     def _hidden(self, scene: Scene, start: Float64Array, end: Float64Array) -> bool | None:
-        """Whether something stands between two points; None where that is a matter of `EDGE_M`, or of the
-        shape of a body within its box."""
+        """Check whether something stands between two points; None where that is a matter of `EDGE_M`, or of
+        the shape of a body within its box."""
         boxes = Boxes.of(scene)
         hidden = False
         if len(scene.names):
@@ -227,6 +221,17 @@ def _fresh(frame: RecordedFrame, topic: str, cls: type[T]) -> list[T]:
         and product.provenance.status is Status.FRESH
         and isinstance(product.payload, cls)
     ]
+
+
+def _lacking_assets(scene: Scene, assets: Set[str]) -> Iterator[tuple[str, str]]:
+    """Files that a scene names and that are in neither dataset nor recording, each with what names it."""
+    for name, asset in zip(scene.names, scene.assets, strict=True):
+        if asset and asset not in assets:
+            yield name, asset
+    for device in scene.devices:
+        pattern = device.array.pattern_file if isinstance(device, AntennaDevice) else ""
+        if pattern and pattern not in assets:
+            yield device.name, pattern
 
 
 def _carriers(settings: Mapping[str, Any]) -> tuple[Carrier, ...]:

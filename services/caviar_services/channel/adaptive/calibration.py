@@ -33,7 +33,7 @@ from msgspec.structs import replace
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.topics import Channel
-from caviar_services.channel.adaptive.settings import Rung
+from caviar_services.channel.adaptive.controller import Rung
 from caviar_services.channel.base import Modelled
 
 SHARE = 0.9
@@ -323,7 +323,7 @@ class Calibration:
         self._begins = False
 
     def is_due(self, number: int) -> bool:
-        """Whether errors are measured in the frame of this number."""
+        """Test whether errors are measured in the frame of this number."""
         return bool(self._every) and number % self._every == 0 and len(self._rungs) > 1
 
     # --- from episode to episode ---------------------------------------------------------------------
@@ -395,7 +395,7 @@ class Calibration:
         )
 
     def partner(self, chosen: int) -> int:
-        """Which rung computes a frame beside the chosen one to measure errors: the reference, or where that
+        """Rung that computes a frame beside the chosen one to measure errors: the reference, or where that
         was chosen the one that was measured least often."""
         if chosen != self.reference:
             return self.reference

@@ -31,14 +31,19 @@ from caviar_protocol.topics import AntennaDevice, Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.channel.adaptive.calibration import Calibration, CalibrationState
 from caviar_services.channel.adaptive.controller import (
+    AdaptiveSettings,
     Choice,
     Controller,
     ControllerState,
     CostModel,
     CostState,
+    Rung,
     Workload,
+    built,
+    models,
+    naming,
+    rung_of,
 )
-from caviar_services.channel.adaptive.settings import AdaptiveSettings, Rung, built, models, naming, rung_of
 from caviar_services.channel.assemble import outage_counts
 from caviar_services.channel.base import Modelled
 from caviar_services.channel.sionna.scene import shared_scenes
@@ -157,7 +162,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return min((float(extent[0][2]) for extent in extents if extent is not None), default=0.0)
 
     def _is_free(self, place: Vector) -> bool:
-        """Whether a point is in the open."""
+        """Test whether a point is in the open."""
         model = self._every[-1].model
         if model.extent is not None:
             low, high = model.extent
@@ -200,7 +205,10 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         self._current = choice.rung
         calibrates = self.calibration.is_due(frame.number)
         made, taken = self._modelled(rung, frame, scene, devices, with_h=calibrates)
-        self._observe(choice.rung, work, taken, calibrates)
+        # Calibration makes matrices: where frames do not ask for them, its duration says nothing about
+        # theirs.
+        if self._with_h or not calibrates:
+            self.costs.observe(choice.rung, work, taken)
         measured = {**made.measured, "rung": taken, "rung-predicted": round(predicted[choice.rung])}
         channel = self.calibration.stated(choice.rung, frame.number, made)
         if calibrates:
@@ -239,7 +247,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
     def _modelled(
         self, rung: Rung, frame: Frame, scene: Scene, devices: Devices, *, with_h: bool = False
     ) -> tuple[Modelled, int]:
-        """What a rung makes of a frame, and how long it took [ns]; ``with_h``: with matrices in any case."""
+        """Channel of a frame by a rung, and its duration [ns]; ``with_h``: with matrices in any case."""
         model = rung.model
         asked, model.with_h = model.with_h, model.with_h or with_h
         began = self.clock()
@@ -249,12 +257,6 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         finally:
             model.with_h = asked
         return made, self.clock() - began
-
-    def _observe(self, rung: int, work: Workload, taken: int, calibrates: bool) -> None:
-        # Calibration makes matrices: where frames do not ask for them, its duration says nothing about
-        # theirs.
-        if self._with_h or not calibrates:
-            self.costs.observe(rung, work, taken)
 
     def _calibrate(
         self, chosen: int, made: Modelled, frame: Frame, scene: Scene, devices: Devices
@@ -272,7 +274,7 @@ class AdaptiveChannel(Service[AdaptiveSettings]):
         return self.calibration.check(partner, frame.number, other, made.channel)
 
     def checkpoint(self) -> bytes:
-        """What is known of costs and errors, the rung, and what the rungs follow.
+        """Saved state: costs and errors, the rung, and what the rungs follow.
 
         Durations decide, so the same frames lead to the same rungs only where those are imposed.
         """
@@ -371,7 +373,8 @@ def rehearsal_scene(
         # An antenna in the middle of its object would be inside a body: its object is to have none.
         if carried is not None and (asset is None or carried.position == (0.0, 0.0, 0.0)):
             x, y, _ = here.tolist()
-            found.append(_alone(carried, (x, y, ground_m + _HEIGHT + 0.1 * number)))
+            place = (x, y, ground_m + _HEIGHT + 0.1 * number)
+            found.append(replace(carried, parent="", position=place))
         elif asset is not None:
             found += [] if carried is None else [carried]
             names.append((name, asset))
@@ -412,8 +415,3 @@ def _bodies(room: Mapping[str, int]) -> Iterator[str]:
         if not left:
             return
         yield from left
-
-
-def _alone(device: Device, position: Vector) -> Device:
-    """A device that stands in the world."""
-    return replace(device, parent="", position=position)

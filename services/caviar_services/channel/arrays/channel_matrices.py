@@ -24,8 +24,7 @@ from caviar_protocol.scenario.rules import undefined_part
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, ChannelResponse, ChannelTaps
-from caviar_services.channel.paths import Antenna
-from caviar_services.channel.propagation.geometry import PathGeometry
+from caviar_services.channel.paths import Antenna, PathGeometry
 from caviar_services.channel.propagation.patterns import radiated_field
 
 Part = Literal["hf", "taps"]
@@ -46,7 +45,7 @@ class Wideband(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """What is asked of one carrier in one part: J = S·K subcarriers or S·L taps."""
+    """Bins of one carrier in one wideband part: J = S·K subcarriers or S·L taps."""
 
     part: Part
     index: int
@@ -62,7 +61,7 @@ class Bins:
         return carrier.slots * (carrier.subcarriers if self.part == "hf" else carrier.taps)
 
     def weights(self, pair: int, tau: Float64Array, doppler: Float64Array) -> Complex128Array:
-        """What the amplitudes of a pair's paths are multiplied with, Shape ``[J, ...]``.
+        """Factors of the amplitudes of a pair's paths, Shape ``[J, ...]``.
 
         Args:
             pair: Number of the pair.
@@ -243,7 +242,7 @@ class PairMatrices(Protocol):
         """H of each pair on a carrier, by its index, Shape ``[Nr, Nt]`` each."""
 
     def responses(self, asked: Bins) -> Iterator[Complex64Array]:
-        """What `Bins` ask for of each pair, Shape ``[J, Nr, Nt]`` each."""
+        """Responses of each pair in `Bins`, Shape ``[J, Nr, Nt]`` each."""
 
 
 Matrices = Callable[[Sequence[Carrier], Sequence[Antenna], Sequence[Antenna], Located], PairMatrices]
@@ -303,7 +302,7 @@ class _Steered:
 
     @classmethod
     def of(cls, antennas: tuple[Antenna, Antenna], mine: slice, located: Located) -> _Steered:
-        """Of a pair whose paths are the rows ``mine``."""
+        """Waves of a pair whose paths are the rows ``mine``."""
         towards = located.geometry.departure[mine], located.geometry.arrival[mine]
         transmit, receive = (
             [steering_vector(part.array, along @ part.rotation) for part in end.subarrays]
@@ -336,7 +335,8 @@ class _Steered:
         )
 
     def _amplitudes(self, index: int, carrier: Carrier) -> Complex128Array:
-        """Of the paths between each subarray of the receiver and each of the transmitter, ``[R, T, p]``."""
+        """Amplitudes of paths between each subarray of the receiver and each of the transmitter, ``[R, T,
+        p]``."""
         located, mine = self.located, self.mine
         # The usual case: amplitudes of the product are those between the only subarrays.
         if len(self.transmit) * len(self.receive) == 1:

@@ -20,51 +20,42 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Carrier, Interaction
 from caviar_services.channel.arrays.channel_matrices import Bins, Located
-from caviar_services.channel.arrays.element_visibility import elements
-from caviar_services.channel.paths import Antenna, PathTable, antenna_fields
+from caviar_services.channel.arrays.element_paths import elements
+from caviar_services.channel.paths import (
+    Antenna,
+    PathGeometry,
+    PathTable,
+    antenna_fields,
+    path_ends,
+    path_geometry,
+    with_near_pairs,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
 from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.geometry import PathGeometry, path_geometry
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import path_ends, path_table
+from caviar_services.channel.sionna.path_table import path_table
 from caviar_services.channel.sionna.scene import SionnaScene
 
 
+@dataclass(frozen=True, eq=False)
 class ElementTracer:
-    """Traces the paths between single antenna elements of a frame.
+    """Traces the paths between single antenna elements of a frame."""
 
-    Args:
-        tracer: Set up for the options of the scenario.
-        scene: Of the frame.
-        velocity: Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``.
-        wavelengths: Of the carriers [m].
-        lanes: Candidates that are tested together at most.
-        los: Whether straight paths count.
-        losses: What paths lose in, of the frame: foliage, people.
-    """
-
-    def __init__(
-        self,
-        tracer: Tracer,
-        scene: SionnaScene,
-        velocity: Float64Array,
-        wavelengths: Float64Array,
-        lanes: int,
-        los: bool,
-        losses: Sequence[Attenuation] = (),
-    ) -> None:
-        self._losses = losses
-        self._tracer = tracer
-        self._scene = scene
-        self._velocity = velocity
-        self._wavelengths = wavelengths
-        self._lanes = lanes
-        self._los = los
-        self.counts: list[Int64Array] = []
-        """Paths between elements in this frame, of each carrier and transmitter: Shape ``[M, N]``, M elements
-        of all receivers."""
+    tracer: Tracer
+    """Set up for the options of the scenario."""
+    scene: SionnaScene
+    """Of the frame."""
+    velocity: Float64Array
+    """Of each object of the scene [m/s], Shape ``[len(scene.names), 3]``."""
+    wavelengths: Float64Array
+    """Of the carriers [m]."""
+    lanes: int
+    """Candidates that are tested together at most."""
+    los: bool
+    """Whether straight paths count."""
+    losses: Sequence[Attenuation] = ()
+    """What paths lose in, of the frame: foliage, people."""
 
     def __call__(
         self,
@@ -82,9 +73,9 @@ class ElementTracer:
         parts = [part for antenna in antennas for part in antenna.subarrays]
         placed = elements(parts, wavelength)
         return [
-            _Element(replace(part, position=at), replace(part, position=self._scene.surfaces.cleared(at)))
+            _Element(replace(part, position=at), replace(part, position=self.scene.surfaces.cleared(at)))
             for index, part in enumerate(parts)
-            for at in placed.of(index)
+            for at in placed.positions_of(index)
         ]
 
     def column(
@@ -121,36 +112,31 @@ class ElementTracer:
         """Paths between one element and others, as between antennas of one element."""
         from_, to = source.traced.position, np.array([end.traced.position for end in ends]).reshape(-1, 3)
         corners = Corners(from_[None], to[:, None])
-        traced = self._tracer.trace(from_, to, lanes=self._lanes, corners=corners)
+        traced = self.tracer.trace(from_, to, lanes=self.lanes, corners=corners)
         # Paths of reflections alone have been asked for once more, exactly: those that failed are dropped.
         mirrored = ((traced.types == 0) | (traced.types == Interaction.REFLECTION)).all(1)
         traced = traced.take(~mirrored | traced.hidden | traced.settled)
         # An array of one element has no corner beside its centre, so that no path is hidden from the centre
         # alone.
         traced = replace(traced, hidden=np.zeros(len(traced.hidden), np.bool_))
-        names = self._scene.names
+        names = self.scene.names
         places = [source.place], [end.place for end in ends]
         table = path_table(
-            self._scene,
+            self.scene,
             [(traced.receiver, traced)],
             names,
-            self._velocity,
+            self.velocity,
             places,
             ([source.traced], [end.traced for end in ends]),
         )
         los = np.zeros(len(ends), np.bool_)
-        table, _ = with_near_pairs(table, los, *places, self._wavelengths, self._scene.surfaces)
-        for loss in self._losses:
+        table, _ = with_near_pairs(table, los, *places, self.wavelengths, self.scene.surfaces)
+        for loss in self.losses:
             table = loss.attenuated(table, *path_ends(table.pair, *places))
-        return table if self._los else table.take((table.types != 0).any(1))
+        return table if self.los else table.take((table.types != 0).any(1))
 
     def _amplitudes(
-        self,
-        carrier: int,
-        wavelength: float,
-        table: PathTable,
-        source: Antenna,
-        targets: Sequence[Antenna],
+        self, carrier: int, wavelength: float, table: PathTable, source: Antenna, targets: Sequence[Antenna]
     ) -> tuple[Complex128Array, PathGeometry]:
         """Amplitudes with the phase of lengths in float64, Shape ``[P]``, and the geometry of the paths."""
         ends = np.array([target.position for target in targets]).reshape(-1, 3)[table.pair]
@@ -200,8 +186,7 @@ class _TracedPairs:
     def matrices(self, index: int) -> Iterator[Complex128Array]:
         for t in range(len(self._transmitters)):
             columns = self._traced(index, t)
-            h = np.stack([column.summed(column.a) for column in columns], axis=1)
-            self._tracer.counts.append(np.stack([column.counts for column in columns], axis=1))
+            h = np.stack([column.summed() for column in columns], axis=1)
             yield from (h[rows] for rows in self._rows)
 
     def responses(self, asked: Bins) -> Iterator[Complex64Array]:
@@ -240,19 +225,14 @@ class _ElementPaths:
     doppler: Float64Array
     """[Hz]."""
 
-    @property
-    def counts(self) -> Int64Array:
-        """Paths to each receiving element, Shape ``[M]``."""
-        return np.bincount(self.target, minlength=self.targets)
-
-    def summed(self, amplitudes: Complex128Array) -> Complex128Array:
+    def summed(self) -> Complex128Array:
         """Sum of amplitudes at each receiving element, Shape ``[M]``."""
         column = np.zeros(self.targets, np.complex128)
-        np.add.at(column, self.target, amplitudes)
+        np.add.at(column, self.target, self.a)
         return column
 
     def weighted(self, asked: Bins, pair: int, begin: int, end: int) -> Complex128Array:
-        """What `Bins` ask for at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
+        """Responses in `Bins` at the receiving elements ``begin`` to ``end``, Shape ``[J, end − begin]``."""
         mine = slice(*np.searchsorted(self.target, [begin, end]).tolist())
         weights = asked.weights(pair, self.tau[mine], self.doppler[mine]) * self.a[mine]
         response = np.zeros((len(weights), end - begin), np.complex128)

@@ -23,9 +23,18 @@ from caviar_protocol.arrays import Complex64Array, Complex128Array, Float64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import AntennaArray, Carrier
 from caviar_services.channel.arrays.channel_matrices import Bins, Blocks, Located, joined
-from caviar_services.channel.arrays.element_paths import Bend, ElementPaths, Lengths, Surfaces
-from caviar_services.channel.arrays.element_visibility import Elements, Look, Visibility, elements, visibility
-from caviar_services.channel.paths import Antenna
+from caviar_services.channel.arrays.element_paths import (
+    Bend,
+    ElementPaths,
+    Elements,
+    Lengths,
+    Look,
+    Surfaces,
+    Visibility,
+    elements,
+    visibility,
+)
+from caviar_services.channel.paths import Antenna, path_ends
 from caviar_services.channel.propagation.patterns import (
     ElementPattern,
     Field,
@@ -82,7 +91,7 @@ class ElementGains:
             # Nodes are odd in number along each side, so the middle one is the array's centre.
             self._parts[arrays] = (sent, taken - taken[:, [taken.shape[1] // 2]])
 
-    def of(
+    def amplitudes(
         self, rows: slice, transmit: AntennaArray, receive: AntennaArray
     ) -> tuple[Complex128Array, Complex128Array]:
         """Two parts whose sums are the amplitudes of paths between these arrays.
@@ -181,32 +190,23 @@ _BINS = 1 << 20
 _LANES = 1 << 15
 
 
+@dataclass(frozen=True, eq=False)
 class SphericalWaves:
     """Makes the matrices of a frame by exact lengths between elements.
 
     Coefficients of reflection, transmission, diffraction and scattering are those of the path between the
     arrays' centres, as in ``siso-rt``. Pattern and polarisation are each element's own, to first order in the
-    size of the arrays. Subarrays, of one panel and one polarisation, are looked at one by
-    one.
-
-    Args:
-        surfaces: What the paths meet, in the order of the model's table.
-        look: Asks this frame's scene.
-        traced_from: Transmitters and receivers off the surfaces that they are at: there their elements look.
-        memory: For looking at pairs of elements [bytes] at most; what is kept of each path comes on top.
+    size of the arrays. Subarrays, of one panel and one polarisation, are looked at one by one.
     """
 
-    def __init__(
-        self,
-        surfaces: Surfaces,
-        look: Look,
-        traced_from: tuple[Sequence[Antenna], Sequence[Antenna]],
-        memory: int,
-    ) -> None:
-        self._surfaces = surfaces
-        self._look = look
-        self._sources, self._targets = traced_from
-        self._memory = memory
+    surfaces: Surfaces
+    """What the paths meet, in the order of the model's table."""
+    look: Look
+    """Asks this frame's scene."""
+    traced_from: tuple[Sequence[Antenna], Sequence[Antenna]]
+    """Transmitters and receivers off the surfaces that they are at: there their elements look."""
+    memory: int
+    """For looking at pairs of elements [bytes] at most; what is kept of each path comes on top."""
 
     def __call__(
         self,
@@ -217,12 +217,11 @@ class SphericalWaves:
     ) -> _Fields:
         """The fields of all paths between elements; the arguments are those of `PlaneWaves`."""
         split = _Split.of(transmitters, receivers, located.pair)
-        paths = ElementPaths(self._surfaces.take(located.row[split.path]))
-        tx, rx = np.divmod(located.pair[split.path], max(len(receivers), 1))
-        start, end = _positions(transmitters)[tx], _positions(receivers)[rx]
+        paths = ElementPaths(self.surfaces.take(located.row[split.path]))
+        start, end = path_ends(located.pair[split.path], transmitters, receivers)
         # Amplitudes of paths that bend are as traced, those of others of their true length.
-        traced = _positions(self._sources)[tx, None], _positions(self._targets)[rx, None]
-        of_bent = paths.lengths(slice(0, len(tx)), *traced).spreading[:, 0, 0]
+        traced = (ends[:, None] for ends in path_ends(located.pair[split.path], *self.traced_from))
+        of_bent = paths.lengths(slice(0, len(start)), *traced).spreading[:, 0, 0]
         bent = paths.bend != Bend.NONE
         without_spreading = np.where(
             bent, 1 / np.where(bent, of_bent, 1.0), SPEED_OF_LIGHT * located.geometry.tau[split.path]
@@ -233,8 +232,8 @@ class SphericalWaves:
         for carrier, properties in enumerate(carriers):
             wavelength = SPEED_OF_LIGHT / properties.frequency_hz
             transmit, receive = elements(split.transmit, wavelength), elements(split.receive, wavelength)
-            looking = elements(_parts(self._sources), wavelength), elements(_parts(self._targets), wavelength)
-            seen = visibility(paths, *ends, *looking, self._look, self._memory)
+            sources, targets = (elements(_parts(side), wavelength) for side in self.traced_from)
+            seen = visibility(paths, *ends, sources, targets, self.look, self.memory)
             fields.append(
                 _Field(
                     paths=paths,
@@ -328,7 +327,8 @@ class _Split:
         return [t * len(self.of_receiver) + r for t in of_t for r in of_r]
 
     def joined(self, blocks: list[Blocks]) -> Iterator[Blocks]:
-        """Of each pair of devices, from what is of each pair of subarrays, Shape ``[..., M, N]``."""
+        """Blocks of each pair of devices, joined from those of each pair of subarrays, Shape ``[..., M,
+        N]``."""
         for sent in self.of_transmitter:
             for taken in self.of_receiver:
                 yield joined([[blocks[s * len(self.receive) + r] for s in sent] for r in taken])
@@ -374,7 +374,7 @@ class _Field:
                     yield waves[first:last].sum(0)
 
     def responses(self, split: _Split, asked: Bins, doppler: Float64Array) -> Iterator[Complex64Array]:
-        """What is asked, of each pair of subarrays in order, Shape ``[J, M, N]``."""
+        """Responses of each pair of subarrays in order, Shape ``[J, M, N]``."""
         arrays = [(rx.size, tx.size) for tx in self.transmit.arrays for rx in self.receive.arrays]
         ends = pairwise(split.offsets.tolist())
         for pair, sizes, (begin, end) in zip(split.pair, arrays, ends, strict=True):
@@ -397,7 +397,7 @@ class _Field:
         return self.paths.lengths(rows, self.transmit.positions[transmit], self.receive.positions[receive])
 
     def _waves(self, rows: slice, sizes: tuple[int, int]) -> Complex128Array:
-        """What each of some paths adds to H, Shape ``[p, M, N]``."""
+        """Waves of some paths, which add up to H, Shape ``[p, M, N]``."""
         tx, rx = self.transmitter[rows], self.receiver[rows]
         between = self._between(rows, sizes)
         # In place: these arrays are the largest of a frame.
@@ -410,7 +410,7 @@ class _Field:
         np.sin(turns, out=waves.imag)
         if len(tx):
             arrays = self.transmit.arrays[tx[0]], self.receive.arrays[rx[0]]
-            sent, taken = self.gains.of(rows, *arrays)
+            sent, taken = self.gains.amplitudes(rows, *arrays)
             waves *= taken[:, :, None] + sent[:, None]
         waves *= between.spreading
         for path in np.flatnonzero(~self.seen.every[rows]).tolist():
@@ -430,7 +430,7 @@ def _far_enough(
     every, some = seen.every.copy(), dict(seen.some)
     transmit, receive = ends
     for path in np.flatnonzero((paths.surfaces.types == 0).all(1)).tolist():
-        sent, taken = transmit.of(antennas[0][path]), receive.of(antennas[1][path])
+        sent, taken = transmit.positions_of(antennas[0][path]), receive.positions_of(antennas[1][path])
         # Bounding boxes first: only arrays that nearly touch need all distances.
         low = np.maximum(sent.min(0), taken.min(0))
         high = np.minimum(sent.max(0), taken.max(0))
@@ -440,10 +440,6 @@ def _far_enough(
         some[path] = far if every[path] else far & some.get(path, False)
         every[path] = False
     return Visibility(every, some)
-
-
-def _positions(antennas: Sequence[Antenna]) -> Float64Array:
-    return np.array([antenna.position for antenna in antennas]).reshape(-1, 3)
 
 
 def _groups(

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.beam_ends import SceneryViews, shown_scenery
 from caviar_services.channel.enumeration.image_beams import (
     ImageBeams,
+    SceneryViews,
     Targets,
     by_scenery,
     columns,
@@ -40,10 +40,12 @@ from caviar_services.channel.enumeration.image_beams import (
     places,
     reflected_beams,
     scenery_beams,
+    shown_scenery,
 )
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
@@ -71,8 +73,6 @@ class EdgeTargets:
     """
 
     def __init__(self, scene: SionnaScene, edges: SceneEdges, faces: FaceRectangles) -> None:
-        import mitsuba as mi
-
         # Bodies that no object of the frame uses are in the scene, too, but do not stand in it.
         number, piece = edges.of_bodies
         standing = np.array(scene.standing_bodies, np.int64) + scene.first_body_piece
@@ -107,7 +107,8 @@ class EdgeTargets:
         return len(self.number)
 
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:
-        """Whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge, ``[N]``."""
+        """Test whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge,
+        ``[N]``."""
         towards = points - self.ends[edges, 0]
         outside: BoolArray = (np.einsum("nc,nfc->nf", towards, self.normals[edges]) > 0).any(1)
         return outside
@@ -308,8 +309,6 @@ def _source_beams(points: Float64Array) -> ImageBeams:
 
 def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeams, owner: Int64Array) -> _Lit:
     """Edges that beams may light, except for edges of the face that reflected the beam last."""
-    import drjit as dr
-
     none = np.zeros(0, np.int64)
     if not (len(beams) and groups.pieces):
         return _Lit(beams, owner, none, none)
@@ -356,18 +355,14 @@ def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeam
 
 
 def _outside(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Whether images are in front of at least one face of edges."""
-    import drjit as dr
-
+    """Test whether images are in front of at least one face of edges."""
     back = gathered(beams.image, beam) - gathered(edges.a, edge)
     one, other = dr.dot(back, gathered(edges.one, edge)), dr.dot(back, gathered(edges.other, edge))
     return dr.maximum(one, other) > -targets.slack
 
 
 def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Whether edges may be lit: no side of the beam has both ends beyond it."""
-    import drjit as dr
-
+    """Test whether edges may be lit: no side of the beam has both ends beyond it."""
     image, a, b = gathered(beams.image, beam), gathered(edges.a, edge), gathered(edges.b, edge)
     normal = gathered(beams.lit, beam)
     lit = dr.maximum(dr.dot(normal, a), dr.dot(normal, b)) > gathered(beams.lit_from, beam) - targets.slack
@@ -379,7 +374,6 @@ def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any,
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
     """Pairs of a beam from each side that meet at an edge within both beams."""
-
     order = np.argsort(other.edge, kind="stable")
     sizes = np.bincount(other.edge, minlength=len(edges))
     begin, sizes = (np.cumsum(sizes) - sizes)[one.edge], sizes[one.edge]
@@ -416,8 +410,6 @@ def _kept(
     edge: Any,
 ) -> Int64Array:
     """Indices of the pairs of beams that meet at their edge, at the point of Keller's law."""
-    import drjit as dr
-
     origin, along = gathered(edges.a, edge), gathered(edges.along, edge)
     (s, from_source), (t, from_target) = (
         _unfolded(gathered(beams.image, beam) - origin, along) for beams, beam in (one, other)
@@ -434,7 +426,5 @@ def _kept(
 
 def _unfolded(point: Any, along: Any) -> tuple[Any, Any]:
     """Coordinate of points along lines through the origin, and their distance from these lines."""
-    import drjit as dr
-
     s = dr.dot(point, along)
     return s, dr.norm(point - s * along)

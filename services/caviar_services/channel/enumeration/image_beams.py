@@ -1,4 +1,5 @@
-"""Beam tracing: where waves can go that given faces have reflected, culled in the ray tracer's arrays.
+"""Beam tracing: chains of reflections by way of moving bodies, enumerated, and the receivers that they light,
+culled in the ray tracer's arrays.
 
 Mirrored in a face, a transmitter is an image, and what it lights by way of that face is the pyramid from the
 image through the face's rectangle. The next face mirrors the image and the last rectangle with it: a beam is
@@ -10,6 +11,12 @@ in float64 by the image method (`image_paths`).
 
 All of this is computed in float32, with a slack that is larger than its rounding. Every test is one kernel:
 its lanes are all pairs of two lists, for example of beams and faces.
+
+Where bodies are small, rays rarely meet them, so a launch misses most chains by way of them. `chain_pairs`
+takes every sequence of faces with a face of a body in it for a candidate, and leaves out sequences that beams
+cannot reach. With B for a face of a body and S for one of scenery, these are to a depth of three: B, SB, BS,
+BB, SSB, SBS, SBB, BSS, BSB, BBS and BBB. The last reflection needs no beam of its own: it exists where the
+receiver's image in the last face lies in the beam before it.
 """
 
 from __future__ import annotations
@@ -22,8 +29,10 @@ from typing import Any
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
+from caviar_space.rectangles import FaceRectangles
+from caviar_space.vectors import ranges
 
 # Pairs that one kernel tests at most, so that its memory is bounded.
 _LANES = 1 << 23
@@ -40,9 +49,6 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
     Returns:
         First and second index of each pair, as `mitsuba.UInt`.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     parts = []
     at_once = max(1, _LANES // max(second, 1))
     # Opaque: as a literal, each size would be another kernel to compile, and sizes change in every frame.
@@ -62,9 +68,7 @@ def pairs(first: int, second: int, test: Callable[[Any, Any], Any]) -> tuple[Any
 
 
 def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Those of pairs of indices that pass a test, evaluated."""
-    import drjit as dr
-
+    """Pairs of indices that pass a test, evaluated."""
     if not dr.width(numbers[0]):
         return numbers
     kept = dr.compress(test(*numbers))
@@ -75,22 +79,16 @@ def filtered(test: Callable[[Any, Any], Any], numbers: tuple[Any, Any]) -> tuple
 
 def gathered(column: Any, index: Any) -> Any:
     """Elements of a column of the ray tracer, by index."""
-    import drjit as dr
-
     return dr.gather(type(column), column, index)
 
 
 def indices(values: Int64Array | BoolArray) -> Any:
     """Indices, Shape ``[N]``, as `mitsuba.UInt`, a single one twice (`several`)."""
-    import mitsuba as mi
-
     return mi.UInt(aligned_indices(values[several(len(values))]))
 
 
 def columns(rows: Float64Array) -> list[Any]:
     """Rows, Shape ``[R, N]``, as one `mitsuba.Float` each, of a single number twice (`several`)."""
-    import mitsuba as mi
-
     return [mi.Float(column) for column in aligned_columns(rows[:, several(rows.shape[1])])]
 
 
@@ -101,9 +99,6 @@ def places(points: Float64Array) -> Any:
 
 def opaque(number: int) -> Any:
     """A number that a kernel reads from memory: as a literal, each number would be another kernel."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.opaque(mi.UInt, number)
 
 
@@ -124,7 +119,7 @@ _WIDE = 0.01
 
 
 class Targets:
-    """What beams of a frame may light: faces, and bodies by the spheres around them.
+    """Targets of a frame's beams: faces, and bodies by the spheres around them.
 
     Args:
         faces: Those of scenery first, then those of bodies, body after body.
@@ -132,9 +127,6 @@ class Targets:
     """
 
     def __init__(self, faces: FaceRectangles, sizes: Int64Array) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.faces = faces
         self.first_body = len(faces) - int(sizes.sum())
         """Number of the first face of a body."""
@@ -177,9 +169,7 @@ class Targets:
         return [centre - u - v, centre + u - v, centre + u + v, centre - u + v]
 
     def height(self, point: Any, face: Any) -> Any:
-        """How far points are in front of the planes of faces [m]; negative behind."""
-        import drjit as dr
-
+        """Heights of points above the planes of faces [m]; negative behind."""
         return dr.dot(point, gathered(self.normal, face)) - gathered(self.offset, face)
 
 
@@ -229,12 +219,10 @@ class ImageBeams:
         return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
 
     def light_cone(self, beam: Any, centre: Any, radius: Any, slack: Any) -> Any:
-        """Whether spheres reach into the cones of beams, on the lit side of their last planes.
+        """Test whether spheres reach into the cones of beams, on the lit side of their last planes.
 
         A cheap test before `light`: a cone is one dot product, a pyramid up to eight.
         """
-        import drjit as dr
-
         axis, cosine = gathered(self.axis, beam), gathered(self.cosine, beam)
         towards = centre - gathered(self.image, beam)
         along = dr.dot(axis, towards)
@@ -246,10 +234,7 @@ class ImageBeams:
         return (across * cosine - along * sine <= reach) & (before > -reach)
 
     def light(self, beam: Any, centre: Any, reach: Any) -> Any:
-        """Whether spheres reach into all pyramids of beams."""
-        import drjit as dr
-        import mitsuba as mi
-
+        """Test whether spheres reach into all pyramids of beams."""
         towards = centre - gathered(self.image, beam)
         lit = mi.Bool(True)
         for side in self.sides:
@@ -297,7 +282,7 @@ def next_beams(targets: Targets, beams: ImageBeams, scenery: Int64Array, known: 
 
 
 def scenery_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageBeams:
-    """Those of `next_beams` whose chains are of scenery alone."""
+    """Beams of `next_beams` whose chains are of scenery alone."""
     return longer_beams(targets, beams, _rows_of(beams.chain[: beams.first_by_body], known[:, :-1]), known)
 
 
@@ -309,8 +294,6 @@ def longer_beams(targets: Targets, beams: ImageBeams, parent: Int64Array, chain:
 
 def by_scenery(targets: Targets, beams: ImageBeams, scenery: Int64Array) -> tuple[Any, Any]:
     """Pairs of a beam by way of a body and a face of scenery that it lights, as `mitsuba.UInt`."""
-    import drjit as dr
-
     faces = indices(scenery)
     # Only beams by way of a body: which chains of scenery alone exist is known (`scenery_chains`).
     begin = beams.first_by_body
@@ -335,8 +318,6 @@ def by_scenery(targets: Targets, beams: ImageBeams, scenery: Int64Array) -> tupl
 
 def lit_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
     """Pairs of a beam and a face of a body whose sphere it lights, as `mitsuba.UInt`."""
-    import drjit as dr
-
     slack = targets.slack
     beam, body = near_bodies(targets, beams)
 
@@ -373,8 +354,6 @@ def reflected_beams(targets: Targets, chain: Int64Array, image: Any, before: Any
         image: Image of the source before that reflection.
         before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
     """
-    import drjit as dr
-
     if not len(chain):  # kernels of no lanes do not exist
         return ImageBeams(chain, np.zeros(0, np.bool_), None, (), None, None, None, None, None)
     last = indices(chain[:, -1])
@@ -420,9 +399,7 @@ def near_bodies(targets: Targets, beams: ImageBeams) -> tuple[Any, Any]:
 
 
 def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> Any:
-    """Whether rectangles may be lit: no side of the beam has all four corners beyond it."""
-    import drjit as dr
-
+    """Test whether rectangles may be lit: no side of the beam has all four corners beyond it."""
     corners, image = targets.corners(face), gathered(beams.image, beam)
     # Separating planes of a convex pyramid and a convex rectangle: conservative, as only the pyramid's are
     # tried.
@@ -434,17 +411,13 @@ def lights_corner(targets: Targets, beams: ImageBeams, beam: Any, face: Any) -> 
 
 
 def _some(corners: list[Any], normal: Any, offset: Any) -> Any:
-    """Whether one of the corners at least is beyond a plane."""
-    import drjit as dr
-
+    """Test whether one of the corners at least is beyond a plane."""
     a, b, c, d = (dr.dot(normal, corner) for corner in corners)
     return dr.maximum(dr.maximum(a, b), dr.maximum(c, d)) > offset
 
 
 def _sides(image: Any, corners: list[Any]) -> list[Any]:
     """Unit normals, inwards, of the sides of the pyramid from a point around corners in turn."""
-    import drjit as dr
-
     edges = [corner - image for corner in corners]
     middle = edges[0] + edges[2]
     sides = []
@@ -459,8 +432,6 @@ def _sides(image: Any, corners: list[Any]) -> list[Any]:
 
 def _cone(image: Any, corners: list[Any]) -> tuple[Any, Any]:
     """Axis of a cone from a point around corners, and the cosine of its half angle."""
-    import drjit as dr
-
     edges = [dr.normalize(corner - image) for corner in corners]
     axis = dr.normalize(edges[0] + edges[1] + edges[2] + edges[3])
     a, b, c, d = (dr.dot(edge, axis) for edge in edges)
@@ -473,3 +444,251 @@ def _rows_of(rows: Int64Array, wanted: Int64Array) -> Int64Array:
     """Index of the row that equals each wanted row."""
     known = {tuple(row): number for number, row in enumerate(rows.tolist())}
     return np.array([known[tuple(row)] for row in wanted.tolist()], np.int64)
+
+
+# Beams of one group that lanes test together: groups are filled up to a multiple of it, so that a lane finds
+# its beam by a division and not by a search.
+_BLOCK = 16
+
+
+@dataclass(frozen=True, eq=False)
+class SceneryViews:
+    """Faces of scenery that may reflect last before receivers."""
+
+    faces: Int64Array
+    """In ascending order, Shape ``[U]``."""
+    sights: Int64Array
+    """Pairs of these that see one another, by index into ``faces``, in both orders, sorted, ``[M, 2]``."""
+    receiver: Int64Array
+    """Receiver of each of W pairs of a receiver and a face that it may see, Shape ``[W]``."""
+    place: Int64Array
+    """Face of each, by index into ``faces``, Shape ``[W]``."""
+
+
+def receiver_beams(targets: Targets, receivers: Float64Array, faces: Int64Array) -> ImageBeams:
+    """The beam of what a receiver [m] sees in a face of scenery, of Shapes ``[W, 3]`` and ``[W]``."""
+    return reflected_beams(targets, faces[:, None], places(receivers), None)
+
+
+def ends_at(targets: Targets, beams: ImageBeams, receivers: Float64Array) -> tuple[Int64Array, Int64Array]:
+    """Beam and receiver of each pair where the beam lights the receiver; receivers [m] have the Shape
+    ``[R, 3]``."""
+    place = places(receivers)
+
+    def near(beam: Any, receiver: Any) -> Any:
+        return beams.light_cone(beam, gathered(place, receiver), 0.0, targets.slack)
+
+    def lit(beam: Any, receiver: Any) -> Any:
+        return beams.light(beam, gathered(place, receiver), targets.slack)
+
+    beam, receiver = filtered(lit, pairs(len(beams), len(receivers), near))
+    return numbers(beam), numbers(receiver)
+
+
+def ends_by_bodies(
+    targets: Targets, beams: ImageBeams, receivers: Float64Array
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
+
+    Args:
+        targets: Faces.
+        beams: Beams before the last reflection.
+        receivers: Positions [m], Shape ``[R, 3]``.
+    """
+    beam, face = lit_bodies(targets, beams)
+    place = places(receivers)
+
+    def crosses(way: Any, receiver: Any) -> Any:
+        image = gathered(beams.image, gathered(beam, way))
+        return _crosses(targets, image, gathered(face, way), gathered(place, receiver))
+
+    def lit(way: Any, receiver: Any) -> Any:
+        last, point = gathered(face, way), gathered(place, receiver)
+        # Instead of a beam through the last face, the receiver's image in it is held against the beam before.
+        image = point - 2.0 * targets.height(point, last) * gathered(targets.normal, last)
+        return beams.light(gathered(beam, way), image, targets.slack)
+
+    way, receiver = filtered(lit, pairs(dr.width(beam), len(receivers), crosses))
+    return numbers(gathered(beam, way)), numbers(gathered(face, way)), numbers(receiver)
+
+
+def ends_by_scenery(
+    targets: Targets, beams: ImageBeams, receivers: Float64Array, scenery: SceneryViews
+) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Beam by way of a body, face of scenery and receiver wherever the beam may light the receiver by a
+    reflection at the face.
+
+    What a receiver sees in a face is a beam, too: only bodies and faces that this one lights can reflect
+    before. So beams of the transmitter are grouped by their last body or face, and each view is tested
+    against the groups that it shows instead of against all beams.
+
+    Args:
+        targets: Faces.
+        beams: Beams before the last reflection.
+        receivers: Positions [m], Shape ``[R, 3]``.
+        scenery: Which faces the receivers see.
+    """
+
+    none = np.zeros(0, np.int64)
+    first = beams.first_by_body
+    if first == len(beams) or not len(scenery.receiver):
+        return none, none, none
+    views = receiver_beams(targets, receivers[scenery.receiver], scenery.faces[scenery.place])
+    view, body = (numbers(part) for part in near_bodies(targets, views))
+    seen, other = shown_scenery(targets, views, scenery)
+    view = np.concatenate([view, seen])
+    group = np.concatenate([body, targets.bodies + other])
+    last = beams.chain[first:, -1]
+    of_body = last >= targets.first_body
+    place_of = np.searchsorted(scenery.faces, last)
+    group_of = np.where(of_body, targets.body_of(last), targets.bodies + place_of)
+    # Beams group by group of what reflected them last: a body, or a face of scenery, after the bodies.
+    order = np.argsort(group_of, kind="stable")
+    sizes = np.bincount(group_of, minlength=targets.bodies + len(scenery.faces))
+    begin = np.cumsum(sizes) - sizes
+    own, block = ranges(np.zeros(len(group), np.int64), -(-sizes[group] // _BLOCK))
+    start = begin[group[own]] + block * _BLOCK
+    columns = [indices(column) for column in (view[own], start, (begin + sizes)[group[own]])]
+    by_group, place = indices(first + order), places(receivers[scenery.receiver])
+
+    def beam_of(block: Any, number: Any) -> tuple[Any, Any]:
+        there = gathered(columns[1], block) + number
+        within = there < gathered(columns[2], block)
+        # Index 0 can be gathered without reading beyond an array.
+        return gathered(by_group, dr.select(within, there, 0)), within
+
+    def near(block: Any, number: Any) -> Any:
+        beam, within = beam_of(block, number)
+        seen = gathered(columns[0], block)
+        within &= gathered(views.last, seen) != gathered(beams.last, beam)
+        return within & beams.light_cone(beam, gathered(views.image, seen), 0.0, targets.slack)
+
+    def lit(block: Any, number: Any) -> Any:
+        beam, _ = beam_of(block, number)
+        seen = gathered(columns[0], block)
+        image, point = gathered(beams.image, beam), gathered(place, seen)
+        crosses = _crosses(targets, image, gathered(views.last, seen), point)
+        return crosses & beams.light(beam, gathered(views.image, seen), targets.slack)
+
+    # Lanes beyond the end of a group look at the first beam of all, and `within` drops them.
+    found = filtered(lit, pairs(len(own), _BLOCK, near))
+    block, number = (numbers(part) for part in found)
+    seen = view[own[block]]
+    beam = first + order[start[block] + number]
+    return beam, scenery.faces[scenery.place[seen]], scenery.receiver[seen]
+
+
+def shown_scenery(
+    targets: Targets, views: ImageBeams, scenery: SceneryViews
+) -> tuple[Int64Array, Int64Array]:
+    """Faces of scenery that receivers see by a reflection in another one.
+
+    Args:
+        targets: Faces.
+        views: Beams of the receivers, one for each pair of ``scenery``.
+        scenery: Which faces the receivers see, and which faces see one another.
+
+    Returns:
+        View and face of each pair, by index into ``views`` and into ``scenery.faces``.
+    """
+    sizes = np.bincount(scenery.sights[:, 0], minlength=len(scenery.faces))
+    own, rows = ranges((np.cumsum(sizes) - sizes)[scenery.place], sizes[scenery.place])
+    other = scenery.sights[rows, 1]
+    if not len(own):
+        return own, other
+    view, face = indices(own), indices(scenery.faces[other])
+
+    def near(pair: Any) -> Any:
+        shown = gathered(face, pair)
+        centre, radius = gathered(targets.centre, shown), gathered(targets.radius, shown)
+        return views.light_cone(gathered(view, pair), centre, radius, targets.slack)
+
+    def lights(pair: Any) -> Any:
+        return lights_corner(targets, views, gathered(view, pair), gathered(face, pair))
+
+    kept = dr.compress(near(dr.arange(mi.UInt, dr.width(view))))
+    if dr.width(kept):
+        kept = gathered(kept, dr.compress(lights(kept)))
+    pair = numbers(kept)
+    pair = pair[pair < len(own)]
+    return own[pair], other[pair]
+
+
+def _crosses(targets: Targets, image: Any, face: Any, point: Any) -> Any:
+    """Test whether points see images in faces: from the side that reflects, and within the rectangle."""
+    there, here = targets.height(image, face), targets.height(point, face)
+    crosses = (there * here > 0.0) & ((here > 0.0) | gathered(targets.two_sided, face))
+    # The line from the point to the image meets the plane at the share here / (there + here) of its length.
+    beside = dr.fma(image - point, here / (there + here), point) - gathered(targets.centre, face)
+    for side in (gathered(targets.u, face), gathered(targets.v, face)):
+        square = dr.squared_norm(side)
+        crosses &= dr.abs(dr.dot(beside, side)) <= square + targets.slack * dr.sqrt(square)
+    return crosses
+
+
+@dataclass(frozen=True, eq=False)
+class ChainPairs:
+    """N pairs of a chain and a receiver."""
+
+    chain: Int64Array
+    """Faces, −1 past the last, Shape ``[N, D]``."""
+    receiver: Int64Array
+    """Shape ``[N]``."""
+
+    @classmethod
+    def joined(cls, parts: list[tuple[Int64Array, Int64Array]], depth: int) -> ChainPairs:
+        """All pairs of parts, whose chains may have any length up to ``depth``."""
+        chains = [np.full((0, depth), -1, np.int64)]
+        chains += [
+            np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1) for chain, _ in parts
+        ]
+        receivers = [np.zeros(0, np.int64), *(receiver for _, receiver in parts)]
+        return cls(np.concatenate(chains), np.concatenate(receivers))
+
+
+def chain_pairs(
+    targets: Targets,
+    scenery: Int64Array,
+    views: SceneryViews,
+    transmitter: Float64Array,
+    receivers: Float64Array,
+) -> ChainPairs:
+    """All pairs of a chain and a receiver that may be a path: without a reflection, by way of scenery alone,
+    and by way of bodies.
+
+    Args:
+        targets: Faces of scenery, then those of bodies, body after body.
+        scenery: Chains of scenery alone that waves from the transmitter go along, as faces, −1 past the
+            last, Shape ``[K, D]``; the beginnings of each chain are among them.
+        views: Faces of these chains that may reflect last, and who sees them.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
+    """
+    depth = scenery.shape[1]
+    # The chain without a reflection is a candidate for every receiver: the line of sight.
+    every = np.arange(len(receivers))
+    found = [(np.zeros((len(receivers), 0), np.int64), every)]
+    if not (depth and len(targets.faces) and len(receivers)):
+        return ChainPairs.joined(found, depth)
+    length = (scenery >= 0).sum(1)
+
+    def add(beams: ImageBeams) -> None:
+        if len(beams):
+            beam, receiver = ends_at(targets, beams, receivers)
+            found.append((beams.chain[beam], receiver))
+
+    beams = first_beams(targets, transmitter, scenery[length == 1, 0])
+    add(beams)
+    for n in range(2, depth):
+        if len(beams):
+            beams = next_beams(targets, beams, views.faces, scenery[length == n, :n])
+            add(beams)
+    if depth > 1 and len(beams):
+        # The last reflection needs no beams of its own: its faces are tested with the receivers at once.
+        add(scenery_beams(targets, beams, scenery[length == depth]))
+        for beam, face, receiver in (
+            ends_by_scenery(targets, beams, receivers, views),
+            ends_by_bodies(targets, beams, receivers),
+        ):
+            found.append((np.concatenate([beams.chain[beam], face[:, None]], axis=1), receiver))
+    return ChainPairs.joined(found, depth)

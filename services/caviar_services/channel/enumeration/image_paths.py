@@ -1,13 +1,16 @@
-"""Paths of reflections at chains of faces: points by the image method, in float64, visibility and
-transmission.
+"""Paths of reflections at chains of faces, over an edge or not: points by the image method, in float64,
+visibility and transmission.
 
 A slab that transmits does not bend a path. So a chain of reflections with an obstacle on a segment is a path
 nevertheless where everything that its segments cross lets waves through, and the crossings are not too many
 (`crossings`).
+
+Paths over an edge (`edge_paths`) have their point there by Keller's law.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,15 +18,16 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_services.channel.enumeration.beam_ends import ChainPairs
-from caviar_services.channel.enumeration.scene_faces import FaceRectangles
-from caviar_services.channel.propagation.fresnel import slab
-from caviar_services.channel.propagation.geometry import Rows
-from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.coplanar_faces import COPLANAR, COPLANAR_RELATIVE
-from caviar_services.channel.sionna.materials import DRAWN
+from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
+from caviar_services.channel.enumeration.image_beams import ChainPairs
+from caviar_services.channel.propagation.image_method import keller_point
+from caviar_services.channel.propagation.utd import beyond_edges, slab
+from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
-from caviar_space.planes import PlaneTable
+from caviar_space.materials import DRAWN
+from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
+from caviar_space.rectangles import FaceRectangles
+from caviar_space.vectors import Rows
 
 OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first face, whose points float32 rounds."""
@@ -127,7 +131,7 @@ def unhidden(
     transmitter: Float64Array,
     receivers: Float64Array,
 ) -> BoolArray:
-    """Which paths have no obstacle on their segments, Shape ``[P]``.
+    """Mask of paths without an obstacle on their segments, Shape ``[P]``.
 
     A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
     that does not stand in front of it: rays that end before would lose what grazes.
@@ -182,7 +186,7 @@ def unhidden(
 
 
 def in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
-    """Whether planes hide points of other planes that rays met right behind them.
+    """Test whether planes hide points of other planes that rays met right behind them.
 
     They do if both planes are parallel and farther apart than rounding.
 
@@ -326,7 +330,7 @@ class _Segments:
     def met(
         self, scene: SionnaScene, rows: Int64Array, triangle: Int64Array
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Where segments cross the planes of triangles: share of the segment, point [m], and unit normal
+        """Crossings of segments with planes of triangles: share of the segment, point [m], and unit normal
         towards the far side."""
         normal, origin = _plane(scene, triangle)
         first, line = self.first[rows], self.last[rows] - self.first[rows]
@@ -355,3 +359,197 @@ def _lets_through(scene: SionnaScene, triangle: Int64Array, direction: Float64Ar
         back, passed = slab(cosine, constants, media.thickness, SPEED_OF_LIGHT / wavelength)
         through |= (np.abs(passed) ** 2).sum(0) >= DRAWN * (np.abs(back) ** 2).sum(0)
     return through
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePaths(Rows):
+    """P paths of at most D interactions, one of which is a diffraction."""
+
+    chain: Int64Array
+    """Face at each reflection, −1 at the edge and past the last, Shape ``[P, D]``."""
+    bend: Int64Array
+    """Which interaction is at the edge, Shape ``[P]``."""
+    count: Int64Array
+    """Interactions, Shape ``[P]``."""
+    edge: Int64Array
+    """Among `EdgeTargets`, Shape ``[P]``."""
+    receiver: Int64Array
+    """Shape ``[P]``."""
+    points: Float64Array
+    """The receiver past the last [m], Shape ``[P, D, 3]``."""
+
+
+def edge_paths(
+    faces: FaceRectangles,
+    edges: EdgeTargets,
+    candidates: Sequence[EdgeChains],
+    transmitter: Float64Array,
+    receivers: Float64Array,
+    depth: int,
+) -> EdgePaths:
+    """Candidates that are paths: reflections lie in triangles of their faces, and both segments at the edge
+    run outside of its wedge.
+
+    Args:
+        faces: Faces of the chains.
+        edges: Edges of the chains.
+        candidates: From `edge_chains`.
+        transmitter: Position [m], Shape ``[3]``.
+        receivers: Positions [m], Shape ``[R, 3]``.
+        depth: Interactions of a path at most, D.
+
+    Returns:
+        Paths sorted by receiver, number of interactions, edge and surfaces. Of paths by way of faces that are
+        one surface, the first one.
+    """
+    parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
+    none = np.zeros(0, np.int64)
+    parts.append(EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3))))
+    found = EdgePaths.joined(parts)
+    # Surfaces instead of faces: coplanar faces that touch give the same path once each.
+    surfaces = np.full(found.chain.shape, -1)
+    surfaces[found.chain >= 0] = edges.surface_of_face[found.chain[found.chain >= 0]]
+    number = edges.number[found.edge]
+    keys = np.column_stack([found.receiver, found.count, number, found.bend, surfaces])
+    return found.take(np.unique(keys, axis=0, return_index=True)[1])
+
+
+def _with_points(
+    faces: FaceRectangles,
+    edges: EdgeTargets,
+    chains: EdgeChains,
+    transmitter: Float64Array,
+    receivers: Float64Array,
+    depth: int,
+) -> EdgePaths:
+    start = np.broadcast_to(transmitter, (len(chains.edge), 3))
+    ends = receivers[chains.receiver]
+    source, target = start, ends
+    for column in chains.before.T:
+        source = faces.mirrored(source, column)
+    for column in chains.behind.T:
+        target = faces.mirrored(target, column)
+    wedge = edges.ends[chains.edge]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
+        place = keller_point(source, target, wedge)
+        good = np.isfinite(place).all(1) & ~beyond_edges(place, wedge)
+    # Both rays at the edge have to run outside of the wedge, in front of one of its faces at least.
+    good &= edges.outside(source, chains.edge) & edges.outside(target, chains.edge)
+    rows = np.flatnonzero(good)
+    before, one = reflection_points(faces, chains.before[rows], start[rows], place[rows])
+    rows, before = rows[one], before[one]
+    behind, other = reflection_points(faces, chains.behind[rows], ends[rows], place[rows])
+    rows, before, behind = rows[other], before[other], behind[other]
+    # In the order of the path: reflections before, the edge, reflections after, which count from the
+    # receiver.
+    i, j = before.shape[1], behind.shape[1]
+    chain = np.full((len(rows), depth), -1)
+    chain[:, :i], chain[:, i + 1 : i + 1 + j] = chains.before[rows], chains.behind[rows, ::-1]
+    points = np.repeat(ends[rows][:, None], depth, axis=1)
+    points[:, :i], points[:, i], points[:, i + 1 : i + 1 + j] = before, place[rows], behind[:, ::-1]
+    return EdgePaths(
+        chain,
+        np.full(len(rows), i),
+        np.full(len(rows), i + j + 1),
+        chains.edge[rows],
+        chains.receiver[rows],
+        points,
+    )
+
+
+def unhidden_over_edges(
+    scene: SionnaScene,
+    look: Faces,
+    faces: FaceRectangles,
+    edges: EdgeTargets,
+    paths: EdgePaths,
+    transmitter: Float64Array,
+    receivers: Float64Array,
+) -> BoolArray:
+    """Mask of paths without an obstacle on their segments, Shape ``[P]``; the arguments are those of
+    `unhidden`.
+
+    Both faces of an edge are no obstacle to a segment that ends there: what a ray meets of them is rounding.
+    """
+    total, depth = paths.chain.shape
+    free = np.ones(total, np.bool_)
+    if not total:
+        return free
+    rows = np.arange(total)
+    start, end = np.broadcast_to(transmitter, (total, 1, 3)), receivers[paths.receiver][:, None]
+    corners = np.concatenate([start, paths.points, end], axis=1)
+    segments = []
+    for d in range(depth + 1):
+        lane = rows[paths.count >= d]
+        one, other = (
+            _Ends.of(scene, faces, edges, paths, lane, d),
+            _Ends.of(scene, faces, edges, paths, lane, d + 1),
+        )
+        before, after = corners[lane, d], corners[lane, d + 1]
+        # The last ray goes from the receiver, which is off every surface and needs no lift.
+        backward = paths.count[lane] == d if d else np.zeros(len(lane), np.bool_)
+        lifted = one.lifted(before, after), other.lifted(after, before)
+        first = np.where(backward[:, None], lifted[1], lifted[0])
+        # A ray ends on a face, but beside an edge: on it, rounding would put the end into one of both faces.
+        last = np.where(
+            backward[:, None],
+            np.where(one.bends[:, None], lifted[0], before),
+            np.where(other.bends[:, None], lifted[1], after),
+        )
+        wanted = np.where(backward[:, None], one.surfaces, other.surfaces)
+        plane = np.where(backward, one.plane, other.plane)
+        segments.append((lane, first, last, wanted, plane))
+    owner, first, last, wanted, plane = (np.concatenate(column) for column in zip(*segments, strict=True))
+    behind, met = look.nearest(first, last)
+    other = (behind < 0) & (met[:, None] != wanted).all(1)
+    hidden = other & (behind < -AT_END)
+    near = np.flatnonzero(other & ~hidden & (plane >= 0))
+    hidden[near] = in_front(scene.plane_table, met[near], plane[near], last[near])
+    free[owner[hidden]] = False
+    return free
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Face, edge or antenna at one end of each of N segments."""
+
+    normals: Float64Array
+    """Unit normals of faces, for edges between both faces, 0 at antennas, Shape ``[N, 3]``."""
+    bends: BoolArray
+    """Which of them are at an edge."""
+    plane: Int64Array
+    """Of a face, −1 elsewhere."""
+    surfaces: Int64Array
+    """Surfaces that a ray may meet there, −1 for none, Shape ``[N, 2]``."""
+
+    @classmethod
+    def of(
+        cls,
+        scene: SionnaScene,
+        faces: FaceRectangles,
+        edges: EdgeTargets,
+        paths: EdgePaths,
+        rows: Int64Array,
+        corner: int,
+    ) -> _Ends:
+        """Ends at a corner of paths by its index; 0 is the transmitter."""
+        count = len(rows)
+        inner = (paths.count[rows] >= corner) & (corner > 0)
+        d = min(max(corner - 1, 0), paths.chain.shape[1] - 1)
+        bends = inner & (paths.bend[rows] == d)
+        at_face = np.flatnonzero(inner & ~bends)
+        normals, surfaces = np.zeros((count, 3)), np.full((count, 2), -1)
+        plane = np.full(count, -1)
+        face = paths.chain[rows[at_face], d]
+        normals[at_face], plane[at_face] = faces.normal[face], faces.plane[face]
+        surfaces[at_face] = scene.joined.label[faces.plane[face]][:, None]
+        edge = paths.edge[rows[bends]]
+        normals[bends], surfaces[bends] = edges.outward[edge], edges.surfaces[edge]
+        return cls(normals, bends, plane, surfaces)
+
+    def lifted(self, points: Float64Array, towards: Float64Array) -> Float64Array:
+        """Points `OFF_SURFACE` off faces, on the side of ``towards``; off edges, away from the wedge."""
+        side = np.sign(np.einsum("nc,nc->n", towards - points, self.normals))
+        side = np.where(self.bends, 1.0, side)
+        off: Float64Array = points + OFF_SURFACE * side[:, None] * self.normals
+        return off

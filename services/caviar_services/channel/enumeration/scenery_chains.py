@@ -1,4 +1,7 @@
-"""Chains of planes of scenery that waves from a place go along: launched, or enumerated where faces are few.
+"""Faces of a scene, and chains of planes of scenery that waves from a place go along: launched, or enumerated
+where faces are few.
+
+Faces of scenery are made once, those of moving bodies as they stand in a frame.
 
 One launch misses what its rays pass by: of 84 chains of the street canyon it finds 77, whether with 1e5
 rays or with 1e7, and the others only where the rays point elsewhere. So several launches, each turned a
@@ -20,9 +23,10 @@ tracer. Files are put in place in one step, and one that is damaged is launched 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -33,19 +37,191 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
-from caviar_services.channel.enumeration.scene_faces import (
-    FaceRectangles,
-    SceneFaces,
-    seen_planes,
-    visible_pairs,
-)
-from caviar_services.channel.sionna.candidate_visibility import Faces
-from caviar_services.channel.sionna.candidates import chains_of
+from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import positions
+from caviar_space.meshes import Mesh
+from caviar_space.planes import two_sided_planes
+from caviar_space.rectangles import FaceRectangles, narrowest_sides
 from caviar_space.vectors import ranges
+
+
+class SceneFaces:
+    """Faces of a scene in the coordinates of its ray tracer.
+
+    Args:
+        scene: The scene; its bodies are where `SionnaScene.place` put them last.
+        inner: Whether waves may be inside of closed bodies, so that the inner sides of their faces reflect
+            too.
+    """
+
+    def __init__(self, scene: SionnaScene, inner: bool = False) -> None:
+        self._scene = scene
+        table = scene.plane_table
+        first = scene.first_moving_plane
+        triangles, sizes = table.triangles_of(np.arange(len(table.triangle)))
+        piece = scene.piece_of(triangles)
+        self._scenery = _faces_of(scene, np.arange(first))
+        self._row = np.full(first, -1)
+        self._row[self._scenery.plane] = np.arange(len(self._scenery))
+        body_of = piece[np.cumsum(sizes) - sizes] - scene.first_body_piece
+        # Number of the body that each moving plane is of.
+        self._body_of = body_of[first:]
+        self._two_sided = np.ones(len(self._body_of), np.bool_)
+        # Side of each moving plane's rectangle, the first of its triangles having the sides 0 to 2.
+        self._along = np.zeros(len(self._body_of), np.int64)
+        for asset, mesh in scene.unit_meshes.items():
+            numbers = scene.face_numbers(asset)
+            both, along = two_sided_planes(mesh, numbers), _sides_of(mesh, numbers)
+            for body in scene.bodies_of(asset):
+                self._two_sided[self._body_of == body] = both | inner
+                self._along[self._body_of == body] = along
+        self._standing: tuple[int, ...] | None = None
+        self._rows: tuple[Int64Array, Int64Array, Int64Array]
+
+    def scenery(self, planes: Int64Array) -> FaceRectangles:
+        """Faces of these planes of scenery, in ascending order; planes of no area are left out."""
+        rows = self._row[np.unique(planes)]
+        return self._scenery.take(rows[rows >= 0])
+
+    def bodies(self) -> tuple[FaceRectangles, Int64Array]:
+        """Faces of all standing bodies, body after body, and how many each of these has."""
+        # Which rows are needed follows from which bodies stand, and is kept while these are the same.
+        scene, standing = self._scene, self._scene.standing_bodies
+        if standing != self._standing:
+            planes = np.flatnonzero(np.isin(self._body_of, np.array(standing, np.int64)))
+            self._rows = (planes, *scene.plane_table.triangles_of(planes + scene.first_moving_plane))
+            self._standing = standing
+        planes, triangles, sizes = self._rows
+        normal = scene.plane_table.normal[planes + scene.first_moving_plane]
+        flat = np.einsum("fc,fc->f", normal, normal) > 0
+        if not flat.all():
+            kept = np.flatnonzero(flat)
+            triangles = triangles[ranges(np.cumsum(sizes)[kept] - sizes[kept], sizes[kept])[1]]
+            planes, sizes, normal = planes[kept], sizes[kept], normal[kept]
+        faces = FaceRectangles.of(
+            planes + scene.first_moving_plane,
+            scene.corners(triangles) - scene.centre,
+            sizes,
+            3 * (np.cumsum(sizes) - sizes) + self._along[planes],
+            normal,
+            self._two_sided[planes],
+        )
+        _, counts = np.unique(self._body_of[planes], return_counts=True)
+        return faces, counts
+
+
+def _faces_of(scene: SionnaScene, planes: Int64Array) -> FaceRectangles:
+    """Faces of planes of scenery."""
+    table = scene.plane_table
+    triangles, sizes = table.triangles_of(planes)
+    own = np.repeat(np.arange(len(planes)), sizes)
+    used = (table.normal[planes] != 0).any(1)[own]
+    corners = scene.corners(triangles[used]) - scene.centre
+    sizes = np.bincount(own[used], minlength=len(planes))
+    kept = np.flatnonzero(sizes)
+    # Scenery has faces of either sense, so their order of corners says nothing.
+    both = np.ones(len(kept), np.bool_)
+    sizes = sizes[kept]
+    along = narrowest_sides(corners, sizes)
+    return FaceRectangles.of(planes[kept], corners, sizes, along, table.normal[planes[kept]], both)
+
+
+def _sides_of(mesh: Mesh, numbers: Int32Array) -> Int64Array:
+    """`narrowest_sides` of the planes of a mesh, counted from the first triangle of each plane."""
+    order = np.argsort(numbers, kind="stable")
+    sizes = np.bincount(numbers)
+    return narrowest_sides(mesh.vertices[mesh.faces[order]], sizes) - 3 * (np.cumsum(sizes) - sizes)
+
+
+# [m] off its plane that a ray starts, so that it does not meet the plane.
+_OFF_PLANE = 1e-3
+
+# Rays that are cast together, so that memory is bounded.
+_PART = 1_000_000
+
+
+def visible_pairs(look: Faces, faces: FaceRectangles, rays: int, seed: int) -> Int64Array:
+    """Pairs of planes that see one another, found by rays in random directions from random points.
+
+    Args:
+        look: Casts the rays; no moving body should be in the scene.
+        faces: Faces of the planes.
+        rays: Rays from each face.
+        seed: Seed of points and directions.
+
+    Returns:
+        Both planes of each pair, in both orders, sorted, Shape ``[M, 2]``.
+    """
+    rng = np.random.default_rng(seed)
+    at_once = max(1, _PART // rays)
+    found = [np.zeros((0, 2), np.int64)]
+    for begin in range(0, len(faces), at_once):
+        some = np.arange(begin, min(begin + at_once, len(faces)))
+        face = np.repeat(some, rays)
+        start = _points(faces.take(some), rays, rng)
+        direction = rng.standard_normal((len(face), 3))
+        direction /= np.sqrt((direction**2).sum(1))[:, None]
+        # A ray leaves on the side of its plane that it points to.
+        off = np.sign((direction * faces.normal[face]).sum(1))[:, None] * faces.normal[face] * _OFF_PLANE
+        behind, plane = look.nearest(start + off, start + off + direction)
+        hit = np.isfinite(behind)
+        found.append(np.unique(np.column_stack([faces.plane[face], plane])[hit], axis=0))
+    pairs = np.concatenate(found)
+    pairs = pairs[np.isin(pairs[:, 1], faces.plane) & (pairs[:, 0] != pairs[:, 1])]
+    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+
+
+def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int) -> BoolArray:
+    """Planes that points see: those that rays in all directions meet first.
+
+    Args:
+        look: Casts the rays.
+        points: Positions [m], Shape ``[R, 3]``.
+        planes: Planes that are asked about, ascending, Shape ``[U]``.
+        rays: Rays from each point.
+
+    Returns:
+        Whether each point sees each plane, Shape ``[R, U]``.
+    """
+    seen = np.zeros((len(points), len(planes) + 1), np.bool_)
+    start = np.repeat(points, rays, axis=0)
+    behind, plane = look.nearest(start, start + np.tile(_directions(rays), (len(points), 1)))
+    place = np.searchsorted(planes, plane)
+    known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
+    seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
+    return seen[:, :-1]
+
+
+@lru_cache(maxsize=4)
+def _directions(rays: int) -> Float64Array:
+    """Unit vectors that are spread evenly, on a Fibonacci lattice, Shape ``[N, 3]``."""
+    number = np.arange(rays) + 0.5
+    z, turn = 1 - 2 * number / rays, np.pi * (1 + math.sqrt(5.0)) * number
+    flat = np.sqrt(1 - z**2)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+
+
+def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Float64Array:
+    """Random points of each face [m], uniform over its triangles, face after face."""
+    corners = faces.triangles
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0])
+    ends = np.cumsum(area)
+    last = np.cumsum(faces.sizes) - 1
+    begin, whole = ends[last] - np.add.reduceat(area, last + 1 - faces.sizes), ends[last]
+    drawn = begin[:, None] + rng.random((len(faces), count)) * (whole - begin)[:, None]
+    triangle = np.clip(np.searchsorted(ends, drawn), (last + 1 - faces.sizes)[:, None], last[:, None])
+    triangle = triangle.ravel()
+    weights = rng.random((len(triangle), 2))
+    weights = np.where((weights.sum(1) > 1)[:, None], 1 - weights, weights)
+    flat = corners[triangle, 0] + weights[:, :1] * one[triangle] + weights[:, 1:] * other[triangle]
+    face = np.repeat(np.arange(len(faces)), count)
+    points: Float64Array = faces.centre[face] + np.einsum("na,nac->nc", flat, faces.axes[face])
+    return points
+
 
 MOST_CHAINS = 20_000
 """Largest number of sequences that are enumerated."""
@@ -149,7 +325,8 @@ class ChainTree:
         return np.concatenate(found)
 
     def _in_front(self, image: Float64Array, last: Int64Array, target: Float64Array) -> BoolArray:
-        """Whether rectangles reach to the lit side of the planes of last faces, which images are behind."""
+        """Test whether rectangles reach to the lit side of the planes of last faces, which images are
+        behind."""
         away = np.where(self._faces.height(image, last) > 0, -1.0, 1.0)[:, None]
         height = np.einsum("nkc,nc->nk", target, self._faces.normal[last]) - self._faces.offset[last, None]
         in_front: BoolArray = (away * height > _IN_FRONT).any(1)
@@ -162,7 +339,7 @@ class ChainTree:
 
 
 def _beyond(apex: Float64Array, corners: Float64Array, target: Float64Array) -> BoolArray:
-    """Whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
+    """Test whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
     edges = corners - apex[:, None]
     normal = np.cross(edges, np.roll(edges, -1, axis=1))
     length = np.sqrt(np.einsum("nsc,nsc->ns", normal, normal))

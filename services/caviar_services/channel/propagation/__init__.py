@@ -1,2 +1,2 @@
-"""Fields along paths in float64: image method, diffraction (UTD), Doppler shifts and delays (`geometry`),
-atmosphere, antenna patterns."""
+"""Propagation in float64: image method, Fresnel coefficients, diffraction (UTD), atmosphere, foliage, people
+as screens, antenna patterns."""

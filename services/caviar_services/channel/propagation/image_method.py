@@ -206,7 +206,7 @@ def _traced_back(
 def _same(
     start: Float64Array, traced: Float64Array, found: Float64Array, end: Float64Array, types: UInt8Array
 ) -> BoolArray:
-    """Whether the points found are those of the traced path, except for rounding."""
+    """Test whether the points found are those of the traced path, except for rounding."""
     shift = np.where(types != 0, np.abs(found - traced).max(-1), 0.0).max(-1)
     length = path_lengths(start, traced, end, types)
     longer = np.abs(path_lengths(start, found, end, types) - length)

@@ -143,14 +143,15 @@ class Patterns:
             if mean > _TOLERANCE_DBI
         )
 
-    def of(self, array: AntennaArray) -> ElementPattern:
+    def element(self, array: AntennaArray) -> ElementPattern:
         """The pattern of an array's elements.
 
         Raises:
             AssetError: The pattern is from a file that is not among the assets of the run.
 
         Example:
-            >>> Patterns().of(AntennaArray(pattern="dipole")).amplitude(np.array([[1.0, 0.0, 0.0]])).round(3)
+            >>> dipole = Patterns().element(AntennaArray(pattern="dipole"))
+            >>> dipole.amplitude(np.array([[1.0, 0.0, 0.0]])).round(3)
             array([1.225])
         """
         if not array.pattern_file:

@@ -1,1 +1,28 @@
-"""Ray tracing with Sionna RT, Mitsuba and Dr.Jit: scene, launches, candidates, and the path solver."""
+"""Ray tracing with Sionna RT, Mitsuba and Dr.Jit: scene, launches, candidates, and the path solver.
+
+Mitsuba and Dr.Jit are `mi` and `dr` here, and imported when a name of theirs is first asked for: the base
+install has neither, and Dr.Jit takes its LLVM library as it is imported (`drjit_setup.activate_llvm`).
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+
+class _Library:
+    """A library that is imported at its first use."""
+
+    def __init__(self, name: str, keeps: bool) -> None:
+        self._name, self._keeps = name, keeps
+
+    def __getattr__(self, attribute: str) -> Any:
+        value = getattr(import_module(self._name), attribute)
+        if self._keeps:
+            setattr(self, attribute, value)
+        return value
+
+
+dr: Any = _Library("drjit", keeps=True)
+# Names of Mitsuba stand for other things after each change of its variant.
+mi: Any = _Library("mitsuba", keeps=False)

@@ -27,21 +27,19 @@ from caviar_services.channel.arrays.channel_matrices import Matrices
 from caviar_services.channel.arrays.mimo_rt import ElementTracer
 from caviar_services.channel.arrays.spherical import SphericalWaves
 from caviar_services.channel.base import Found, PathModel
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.propagation.attenuation import Attenuation
-from caviar_services.channel.propagation.clearance import with_near_pairs
-from caviar_services.channel.propagation.foliage import Foliage
-from caviar_services.channel.propagation.human_blockage import HumanBlockage
-from caviar_services.channel.sionna.materials import MaterialPolicy, ObjectMaterials, OutsideUse
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, with_near_pairs
+from caviar_services.channel.propagation.attenuation import Attenuation, Foliage, HumanBlockage
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.path_finder import COMPILE_GRACE_S, Launched, PathFinder
 from caviar_services.channel.sionna.path_solver import LANE_BYTES
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends, path_table, traced_surfaces
+from caviar_services.channel.sionna.path_table import Ends, Traced, path_table, traced_surfaces
 from caviar_services.channel.sionna.scene import SceneSettings, SionnaScene, scene_of
 from caviar_services.channel.sionna.settings import SionnaSettings, contributing, transmits
 from caviar_services.channel.sionna.tracking import FollowingState
 from caviar_services.checkpoint import restored, saved
 from caviar_services.drjit_setup import activate_llvm, choose_variant, limit_threads
 from caviar_services.service import Frame, Preparation, RunInfo, StepResult
+from caviar_space.materials import MaterialPolicy, ObjectMaterials, OutsideUse
 
 
 class SionnaChannel(PathModel[SionnaSettings]):
@@ -108,6 +106,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         """People as screens; None: they are bodies."""
         if settings.human_blockage is not None:
             self.blockage = HumanBlockage(settings.human_blockage, run.carriers)
+        self._losses: tuple[Attenuation, ...] = tuple(filter(None, (self.foliage, self.blockage)))
         # Names and classes of the last frame's objects, and which keys match none: both seldom change.
         self._known_unmatched: tuple[object, dict[str, int]] = (None, {})
         self._samples = settings.launched_samples()
@@ -140,16 +139,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
     def room(self) -> Mapping[str, int]:
         return self._room
 
-    @property
-    def _losses(self) -> tuple[Attenuation, ...]:
-        """What paths lose in beside what they meet."""
-        found: list[Attenuation] = []
-        if self.foliage is not None:
-            found.append(self.foliage)
-        if self.blockage is not None:
-            found.append(self.blockage)
-        return tuple(found)
-
     def enclosing(self, position: Float64Array) -> str:
         """See `ChannelModel.enclosing`; an antenna at a surface is on the side that it is traced from.
 
@@ -161,12 +150,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     @property
     def scene(self) -> SionnaScene:
-        """What waves meet; after `load_scene`."""
+        """Scene that waves meet; after `load_scene`."""
         return self._scene
 
     @property
     def launch_seed(self) -> int:
-        """Of all rays."""
+        """Seed of all rays."""
         return self._asked.seed
 
     # --- before the first frame ----------------------------------------------------------------------
@@ -239,7 +228,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 surface.name for surface in surfaces if transmits(surface, self._launched, frequencies)
             }
             notes += self._scene.closed_walls(through)
-        return (*notes, *self._finder.notes, *switched, *self._warm_up())
+        self.run.progress("compiling kernels", COMPILE_GRACE_S)
+        begin = time.monotonic()
+        self._finder.compile_kernels()
+        self.run.progress("kernels compiled", 0.0)
+        compiled = f"kernels compiled in {time.monotonic() - begin:.1f} s"
+        return (*notes, *self._finder.notes, *switched, compiled)
 
     def _make_finder(self, before: PathFinder | None = None) -> tuple[str, ...]:
         """Make what finds paths in the scene as it is; notes on what is switched off.
@@ -305,18 +299,8 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _activate(self) -> None:
         """The variant of Mitsuba is the process's, and others may have set theirs."""
-        import mitsuba as mi
-
         if mi.variant() != self._variant:
             mi.set_variant(self._variant)
-
-    def _warm_up(self) -> tuple[str, ...]:
-        """Compile every kernel that frames need; how long that took."""
-        self.run.progress("compiling kernels", COMPILE_GRACE_S)
-        begin = time.monotonic()
-        self._finder.compile_kernels()
-        self.run.progress("kernels compiled", 0.0)
-        return (f"kernels compiled in {time.monotonic() - begin:.1f} s",)
 
     # --- frames --------------------------------------------------------------------------------------
 
@@ -362,8 +346,6 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def release_memory(self) -> None:
         """Dr.Jit keeps freed buffers, some of each size that it has seen; sizes vary with the paths."""
-        import drjit as dr
-
         dr.flush_malloc_cache()
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
@@ -428,12 +410,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return split
 
     def _power(
-        self,
-        pair: Int64Array,
-        traced: Traced,
-        antennas: Ends,
-        pairs: int,
-        weight: Float64Array | float = 1.0,
+        self, pair: Int64Array, traced: Traced, antennas: Ends, pairs: int, weight: Float64Array | float = 1.0
     ) -> Float64Array:
         """Weighted power of paths between each pair, with what foliage and people leave of them."""
         transfer = traced.transfer
@@ -445,7 +422,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
         return np.bincount(pair, weights=power, minlength=pairs).astype(np.float64)
 
     def _matrices(self, launches: Sequence[Traced], table: PathTable, traced_from: Ends) -> Matrices | None:
-        """How the rung makes H; `PlaneWaves` where it has no way of its own."""
+        """Maker of the rung's H; `PlaneWaves` where it has no way of its own."""
         finder, memory = self._finder, int(self.settings.memory_gib * 2**30)
         if self.rung == "spherical" and table.traced is not None:
             surfaces = traced_surfaces(launches, table.traced, table.types, table.points, self._scene)
@@ -486,7 +463,7 @@ def _refuse_buried(scene: Scene, without_body: Sequence[str], foliage: Foliage |
     for device in scene.devices:
         if isinstance(device, AntennaDevice) and device.parent and device.position == (0.0, 0.0, 0.0):
             cls = scene.classes[scene.names.index(device.parent)]
-            is_foliage = foliage is not None and foliage.keys.of(device.parent, cls)
+            is_foliage = foliage is not None and foliage.keys.material_for(device.parent, cls)
             if cls not in without_body and not is_foliage:
                 raise PayloadError(
                     f"antenna {device.name!r} stands in the middle of the body of {device.parent!r}, where "

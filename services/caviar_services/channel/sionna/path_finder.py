@@ -1,4 +1,4 @@
-"""How the ray-traced channel finds the paths of a frame: by launches, by enumeration, or by both.
+"""Finder of the paths of a frame in the ray-traced channel: by launches, by enumeration, or by both.
 
 Reflections are launched in every frame, followed from frame to frame (`tracking`), or enumerated
 (`enumeration.enumerated_paths`); paths of other kinds are launched. Diffuse paths may have a launch of their
@@ -19,7 +19,7 @@ from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.arrays.element_visibility import outermost
+from caviar_services.channel.arrays.element_paths import outermost
 from caviar_services.channel.enumeration.enumerated_paths import EnumeratedTracer
 from caviar_services.channel.enumeration.scenery_chains import (
     ChainCache,
@@ -27,13 +27,12 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryChains,
     SceneryLaunch,
 )
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.sionna.candidate_visibility import Corners
+from caviar_services.channel.paths import Antenna, PathTable, path_ends
+from caviar_services.channel.sionna.candidates import Corners
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
-from caviar_services.channel.sionna.diffuse_paths import Element
 from caviar_services.channel.sionna.path_solver import Tracer
-from caviar_services.channel.sionna.path_table import Ends, Traced, path_ends
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions
+from caviar_services.channel.sionna.path_table import Ends, Traced
+from caviar_services.channel.sionna.ray_launcher import Element, LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.channel.sionna.tracking import Followed, Following, FollowingState
@@ -282,7 +281,7 @@ class PathFinder:
             targets = np.array([antenna.position for antenna in ends]).reshape(-1, 3)
             corners = self._corners(transmitter, ends) if elements else None
             pair = t * len(receivers) + others
-            for traced, missed in self._of(transmitter, targets, names, corners, with_missed):
+            for traced, missed in self._found(transmitter, targets, names, corners, with_missed):
                 found.append((pair[traced.receiver], traced))
                 if missed is not None:
                     self.missed.append((*found[-1], missed))
@@ -292,7 +291,7 @@ class PathFinder:
         longest = float(self.wavelengths.max())
         return Corners(outermost([transmitter], longest)[0], outermost(receivers, longest))
 
-    def _of(
+    def _found(
         self,
         transmitter: Antenna,
         targets: Float64Array,
@@ -315,7 +314,7 @@ class PathFinder:
             scenery = self._scenery.known_from(transmitter.name, source)
             found.append((self._enumerated.trace(source, targets, scenery, over_edges), None))
         if self.launches:
-            followed = None if self._following is None else self._following.of(transmitter.name)
+            followed = None if self._following is None else self._following.chains_from(transmitter.name)
             launched = tracer.trace(source, targets, at_once, followed, names, corners=corners)
             if self._enumerated is not None:
                 launched = self._enumerated.unknown(launched, found[0][0], scenery, over_edges)
@@ -338,5 +337,5 @@ class PathFinder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Of the last frame, for the report."""
+        """Counts of the last frame, for the report."""
         return {} if self._edge_range is None else {"no_edge_in_range": self._without_edge}

@@ -14,34 +14,35 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import (
-    BoolArray,
-    Float64Array,
-    Int64Array,
-)
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.topics import Interaction
-from caviar_services.channel.arrays.element_visibility import Look
+from caviar_services.channel.arrays.element_paths import Look
 from caviar_services.channel.propagation.image_method import image_points, refined_points
-from caviar_services.channel.sionna.candidate_visibility import Corners, Faces, Planes, at_corners, reflected
+from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.candidates import (
     MANY_RAYS,
     Candidates,
+    Corners,
+    Faces,
     Met,
     Offer,
+    Planes,
+    at_corners,
     met_by,
+    reflected,
     united,
 )
 from caviar_services.channel.sionna.diffracting_edges import edge_generator
-from caviar_services.channel.sionna.diffuse_paths import ChosenPoints, Element, Thinning
-from caviar_services.channel.sionna.path_table import (
-    Traced,
-    edge_numbers,
-    geometry,
-    joined,
-    nothing,
-    read,
+from caviar_services.channel.sionna.path_table import Traced, edge_numbers, geometry, joined, nothing, read
+from caviar_services.channel.sionna.ray_launcher import (
+    SCATTERED,
+    ChosenPoints,
+    Element,
+    Launch,
+    LaunchOptions,
+    PartedLauncher,
+    Thinning,
 )
-from caviar_services.channel.sionna.ray_launcher import SCATTERED, Launch, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.channel.sionna.tracking import Followed, FollowedOffer, TableState
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions, several
@@ -58,7 +59,7 @@ LANE_BYTES = 40
 
 @dataclass(frozen=True, eq=False)
 class _Last:
-    """What was traced last from a position."""
+    """Last trace from a position."""
 
     version: int
     """Of the scene."""
@@ -85,8 +86,6 @@ class Tracer:
     """
 
     def __init__(self, scene: SionnaScene, wavelengths: Sequence[float], options: LaunchOptions) -> None:
-        import drjit as dr
-        import mitsuba as mi
         from sionna.rt.antenna_pattern import antenna_pattern_registry
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
         from sionna.rt.path_solvers.image_method import ImageMethod
@@ -112,7 +111,7 @@ class Tracer:
         self._last.clear()
 
     def offers(self) -> tuple[tuple[bytes, TableState], ...]:
-        """What followed transmitters have on offer as long as nothing moves, and where they are."""
+        """Offers of followed transmitters, which hold as long as nothing moves, and their positions."""
         return tuple(
             (position, last.offer.state)
             for position, last in self._last.items()
@@ -155,7 +154,7 @@ class Tracer:
 
     @property
     def look(self) -> Look:
-        """What can be asked about the scene as it is, in world coordinates."""
+        """Questions that the scene as it is answers, in world coordinates."""
         table, centre = self._scene.plane_table, self._scene.centre
         return Look(
             nearest=lambda start, end: self._faces.nearest(start - centre, end - centre),
@@ -200,7 +199,9 @@ class Tracer:
         transmitter, receivers = transmitter - centre, receivers - centre
         corners = corners and corners.relative_to(centre)
         key = transmitter.tobytes() + (element.key if element else b"")
-        self._drop_outdated()
+        # Launches into the scene as it was match no frame any more.
+        version = self._scene.version
+        self._last = {key: last for key, last in self._last.items() if last.version == version}
         # What is found for the corners of arrays is of these arrays alone, and not kept.
         last = None if corners else self._last.get(key)
         if last is None:
@@ -221,13 +222,8 @@ class Tracer:
             del self._last[next(iter(self._last))]
         return traced
 
-    def _drop_outdated(self) -> None:
-        """Free the launches into the scene as it was: they match no frame any more."""
-        version = self._scene.version
-        self._last = {key: last for key, last in self._last.items() if last.version == version}
-
     def _launched(self, transmitter: Float64Array, element: Element | None) -> Offer:
-        """What a launch of all rays offers."""
+        """Offer of a launch of all rays."""
         source = positions(transmitter[None])
 
         def look(_: Int64Array, launch: Launch) -> Met:
@@ -290,8 +286,6 @@ class Tracer:
         receivers: Float64Array,
         corners: Corners | None,
     ) -> Traced:
-        import mitsuba as mi
-
         source, targets = positions(transmitter[None]), positions(receivers[several(len(receivers))])
         candidates, launch, lost = offer.candidates(targets, len(receivers))
         if not len(candidates.ray):
@@ -323,8 +317,6 @@ class Tracer:
 
     def _buffer(self, launch: Launch, candidates: Candidates) -> Any:
         """The solver's buffer with these candidates."""
-        import drjit as dr
-        import mitsuba as mi
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
         from sionna.rt.utils import WedgeGeometry
 
@@ -374,8 +366,6 @@ class Tracer:
         was met, and specular points are where the planes say. Mark paths that met other planes than
         those of their chain: they belong to another chain.
         """
-        import mitsuba as mi
-
         types, shapes, primitives, points = geometry(buffer)
         wanted = candidates.planes
         triangles = self._scene.triangle_numbers(shapes, primitives)
@@ -420,9 +410,6 @@ class Tracer:
 
     def _compute_fields(self, buffer: Any, source: Any, targets: Any) -> None:
         """Give the buffer the amplitudes of all carriers, in their order; valid is what any of them has."""
-        import drjit as dr
-        import mitsuba as mi
-
         # Isotropic patterns at both ends: arrays and orientations are applied afterwards.
         upright = positions(np.zeros((1, 3))), positions(np.zeros((dr.width(targets), 3)))
         geometric, carried = dr.copy(buffer.valid), mi.Bool(False)
@@ -453,7 +440,7 @@ class Tracer:
 
 
 def _first_of_equals(ends: Float64Array, points: Float64Array) -> BoolArray:
-    """Of paths with the same points to 1 mm, the first: planes of two objects may be one."""
+    """Mask of the first of paths with the same points to 1 mm: planes of two objects may be one."""
     places = np.round(np.concatenate([ends[:, None], points], axis=1).reshape(len(ends), -1), 3)
     first = np.zeros(len(ends), np.bool_)
     first[np.unique(places, axis=0, return_index=True)[1]] = True

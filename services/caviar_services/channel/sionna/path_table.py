@@ -11,9 +11,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Complex128Array, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.arrays.element_paths import Surfaces
-from caviar_services.channel.paths import Antenna, PathTable
-from caviar_services.channel.propagation.clearance import spread_anew, with_direct
-from caviar_services.channel.propagation.geometry import Rows
+from caviar_services.channel.paths import Antenna, PathTable, path_ends, spread_anew, with_direct
 from caviar_services.channel.propagation.image_method import distinct, path_lengths, refined_points
 from caviar_services.channel.propagation.patterns import spherical_basis
 from caviar_services.channel.propagation.utd import (
@@ -24,8 +22,10 @@ from caviar_services.channel.propagation.utd import (
     edge_fields,
     waves_beside,
 )
+from caviar_services.channel.sionna import dr
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.vectors import Rows
 
 # Below this horizontal part of a direction Sionna RT sets its azimuth to 0: its `EPSILON_FLOAT`.
 _POLE = 100 * 2.0**-24
@@ -100,7 +100,7 @@ def nothing(carriers: int, depth: int, lost: int) -> Traced:
 
 
 def joined(parts: Sequence[Traced], carriers: int, depth: int) -> Traced:
-    """All of these paths, part by part.
+    """Paths of all parts, part by part.
 
     Args:
         parts: Of one transmitter; none at all are no paths.
@@ -119,8 +119,6 @@ def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Ar
     Args:
         buffer: A `PathsBuffer` of Sionna RT.
     """
-    import drjit as dr
-
     depth = buffer.max_depth
     vertices = (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)
     # One evaluation for all: each `numpy()` alone would run a kernel.
@@ -134,13 +132,7 @@ def geometry(buffer: Any) -> tuple[UInt8Array, Int64Array, Int64Array, Float64Ar
     )
 
 
-def read(
-    buffer: Any,
-    carriers: int,
-    transmitter: Float64Array,
-    receivers: Float64Array,
-    lost: int,
-) -> Traced:
+def read(buffer: Any, carriers: int, transmitter: Float64Array, receivers: Float64Array, lost: int) -> Traced:
     """Read the paths of a solver's buffer.
 
     Args:
@@ -150,8 +142,6 @@ def read(
         receivers: As the ray tracer has them [m], Shape ``[R, 3]``.
         lost: How many candidates were lost.
     """
-    import drjit as dr
-
     dr.eval(buffer.a, buffer.valid)
     receiver = buffer.target_indices.numpy().astype(np.int64)
     types, shapes, primitives, points = geometry(buffer)
@@ -231,7 +221,7 @@ def path_table(
     antennas: Ends,
     traced_from: Ends,
 ) -> PathTable:
-    """What launches found between antennas.
+    """Table of all paths that launches found between antennas.
 
     Args:
         scene: Where they were.
@@ -333,11 +323,7 @@ def _diffract_anew(
 
 
 def _with_sights(
-    table: PathTable,
-    scene: SionnaScene,
-    sights: Mapping[int, Sight],
-    antennas: Ends,
-    traced_from: Ends,
+    table: PathTable, scene: SionnaScene, sights: Mapping[int, Sight], antennas: Ends, traced_from: Ends
 ) -> PathTable:
     """The table with those lines of sight that are lit, if nothing else is in their way, and no others."""
     dark = np.array([pair for pair, sight in sights.items() if not sight.lit], np.int64)
@@ -358,21 +344,6 @@ def _with_sights(
     start, end = path_ends(pairs, *antennas)
     distance = np.sqrt(((end - start) ** 2).sum(1))
     return with_direct(table, pairs, np.zeros(len(pairs), np.bool_), distance, np.array(scene.wavelengths))
-
-
-def path_ends(
-    pair: Int64Array, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]
-) -> tuple[Float64Array, Float64Array]:
-    """Positions [m] of TX and RX of paths, each of Shape ``[P, 3]``.
-
-    Args:
-        pair: Of each path, Shape ``[P]``.
-        transmitters, receivers: Antennas.
-    """
-    tx, rx = np.divmod(pair, max(len(receivers), 1))
-    start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 3)
-    end = np.array([antenna.position for antenna in receivers]).reshape(-1, 3)
-    return start[tx], end[rx]
 
 
 def traced_surfaces(

@@ -31,13 +31,34 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
-from caviar_services.channel.mesh_detail import DetailSettings
 from caviar_services.channel.paths import Turning
-from caviar_services.channel.propagation.fresnel import EPSILON_0, Media
-from caviar_services.channel.sionna.body_pool import BodyPool, own_materials
+from caviar_services.channel.propagation.utd import Media
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
-from caviar_services.channel.sionna.materials import (
+from caviar_services.channel.sionna.scene_loading import (
+    BodyPool,
+    ObjectMaterial,
+    Shape,
+    bounds,
+    by_material,
+    counting_centre,
+    file_pieces,
+    floats,
+    itu_materials,
+    mi_mesh,
+    new_scene,
+    object_materials,
+    own_materials,
+    set_materials,
+    with_detail,
+)
+from caviar_services.channel.sionna.triangle_numbering import (
+    NumberedTriangles,
+    closed_walls,
+    coinciding_materials,
+)
+from caviar_space.materials import (
     BODY_THICKNESS,
+    EPSILON_0,
     OBJECT_MATERIAL,
     Constants,
     ItuMaterial,
@@ -48,25 +69,8 @@ from caviar_services.channel.sionna.materials import (
     UsedSurfaces,
     itu_material,
 )
-from caviar_services.channel.sionna.scene_loading import (
-    ObjectMaterial,
-    Shape,
-    bounds,
-    by_material,
-    counting_centre,
-    file_pieces,
-    floats,
-    itu_materials,
-    mi_mesh,
-    near_middle,
-    new_scene,
-    object_materials,
-    set_materials,
-    with_detail,
-)
-from caviar_services.channel.sionna.scenery_geometry import closed_walls, coinciding_materials
-from caviar_services.channel.sionna.triangle_numbering import Body, NumberedTriangles
-from caviar_space.meshes import Mesh, placed, unit_box
+from caviar_space.mesh_detail import DetailSettings
+from caviar_space.meshes import Body, Mesh, coarse_centre, placed, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
@@ -84,7 +88,7 @@ _OTHER_SKIN = "choose another body_material"
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """What a scene is made with, beside its files; equal ones share a scene within `shared_scenes`."""
+    """Settings of a scene, beside its files; equal ones share a scene within `shared_scenes`."""
 
     frequencies_hz: tuple[float, ...]
     """Of the carriers. The scene is at the first one, unless it is tuned to another."""
@@ -134,13 +138,13 @@ class SionnaScene(NumberedTriangles):
         """Warnings for the user about the scenery."""
         self._scene = new_scene(piece.material for piece in pieces.values())
         self._objects, self._foliage = settings.objects, settings.foliage
-        leaves = [name for name in pieces if self._foliage.of(name)]
+        leaves = [name for name in pieces if self._foliage.material_for(name)]
         self.foliage_meshes = {name: pieces.pop(name).mesh for name in leaves}
         """Pieces of scenery that are foliage, by name; no shape has them."""
         self._scenery = frozenset(pieces)
         made = object_materials(self._objects, settings.frequencies_hz, settings.materials)
         made = self._made = self._with_materials_of_meshes(made, set(own.values()))
-        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.of(name))}
+        changed = {name: made[m].radio for name in self._scenery if (m := self._objects.material_for(name))}
         full = by_material(pieces, changed)
         key = f"{settings.materials.key}.detail"
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
@@ -254,7 +258,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
-        """Of the carriers [m]."""
+        """Wavelengths of the carriers [m]."""
         return tuple(SPEED_OF_LIGHT / frequency for frequency, _ in self._carriers)
 
     def tune(self, carrier: int) -> None:
@@ -269,7 +273,7 @@ class SionnaScene(NumberedTriangles):
         self._scene.frequency = frequency
 
     def used_surfaces(self) -> UsedSurfaces:
-        """What waves can meet, at rest and moving."""
+        """Surfaces that waves can meet, at rest and moving."""
         constants, slabs = self._surface_materials
         # Bodies that stand for nothing count: which objects will come is not known.
         used = [(i, shape) for i, shape in enumerate(self._shapes) if shape.id != _NOTHING]
@@ -297,7 +301,7 @@ class SionnaScene(NumberedTriangles):
 
     @cached_property
     def _surface_materials(self) -> tuple[Float64Array, Float64Array]:
-        """Of each shape, permittivity and conductivity [S/m] on each carrier, Shape ``[2, C, S]``, and
+        """Permittivity and conductivity [S/m] of each shape on each carrier, Shape ``[2, C, S]``, and
         thickness [m] and scattering coefficient, Shape ``[2, S]``."""
         constants = []
         # The ray tracer has the constants of one carrier at a time; here are those of all, once for the run.
@@ -312,7 +316,7 @@ class SionnaScene(NumberedTriangles):
         return np.moveaxis(np.array(constants), -1, 0), np.array(slabs).T
 
     def media(self, shapes: Int64Array) -> Media:
-        """What process-local shapes are made of; anything for no shape.
+        """Materials of process-local shapes; anything for no shape.
 
         Args:
             shapes: Of any Shape.
@@ -323,7 +327,7 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def unit_meshes(self) -> Mapping[str, Mesh]:
-        """Of the kinds of bodies that there are (`body_kind`)."""
+        """Unit meshes of the kinds of bodies that there are (`body_kind`)."""
         return self._pool.unit_meshes
 
     @property
@@ -414,7 +418,7 @@ class SionnaScene(NumberedTriangles):
         return [
             i
             for i, cls in enumerate(scene.classes)
-            if cls not in without_body and not self._foliage.of(scene.names[i], cls)
+            if cls not in without_body and not self._foliage.material_for(scene.names[i], cls)
         ]
 
     def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:
@@ -429,9 +433,13 @@ class SionnaScene(NumberedTriangles):
         clash = self._scenery & index.keys()
         if clash:
             raise PayloadError(f"object {min(clash)!r} has the name of a piece of scenery; rename one")
-        # Without scenery nothing else says where the world is.
+        # Without scenery nothing else says where the world is, and far from the origin float32 is coarse.
         if not self.has_scenery and solid:
-            self._count_from_objects(scene.position[solid])
+            positions = scene.position[solid]
+            centre = coarse_centre((positions.min(0) + positions.max(0)) / 2)
+            if (centre != self.centre).any():
+                self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
+                self.count_from(centre)
         # A new assignment each frame: the product follows from this frame alone, also after a restart.
         objects = ((scene.names[i], kind) for i, kind in kinds.items())
         taken = self._pool.assign(objects)
@@ -440,7 +448,7 @@ class SionnaScene(NumberedTriangles):
         turning = None
         if scene.angular_velocity is not None and scene.angular_velocity.any():
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
-        vertices, meshes = self.moving_vertices, self._pool.meshes
+        vertices, meshes = self._vertices.copy(), self._pool.meshes
         begin = len(vertices) - sum(len(meshes[asset].vertices) for asset, _ in self._bodies)
         for number, body in enumerate(self._bodies, start=self.first_body_piece):
             mesh = meshes[body[0]]
@@ -459,24 +467,18 @@ class SionnaScene(NumberedTriangles):
         before = self._vertices.copy() if len(self._moving) > 1 else None
         if self.move(vertices):
             params = self._scene.mi_scene_params
-            for shape, rows in self._moving_rows():
-                if before is None or not np.array_equal(before[rows], vertices[rows]):
-                    params[f"{shape.id}.vertex_positions"] = floats(vertices[rows] - self.centre)
+            end = 0
+            for shape in self._moving:
+                begin, end = end, end + sum(len(mesh.vertices) for mesh in shape.meshes)
+                if before is None or not np.array_equal(before[begin:end], vertices[begin:end]):
+                    params[f"{shape.id}.vertex_positions"] = floats(vertices[begin:end] - self.centre)
             params.update()
         self._standing, self.turning = frozenset(standing), turning
         return tuple(names), velocity
 
-    def _count_from_objects(self, positions: Float64Array) -> None:
-        """Let the ray tracer count from the middle of the objects [m], Shape ``[N, 3]``: nothing else says
-        where a world without scenery is, and far from the origin its float32 is coarse."""
-        centre = near_middle(positions.min(0), positions.max(0))
-        if (centre != self.centre).any():
-            self.low, self.high = self.low + (centre - self.centre), self.high + (centre - self.centre)
-            self.count_from(centre)
-
     @property
     def has_scenery(self) -> bool:
-        """Whether anything stands still; `low` and `high` are its corners."""
+        """True if anything stands still; `low` and `high` are its corners."""
         return bool(self._scenery)
 
     def enclosing(self, position: Float64Array) -> int:
@@ -510,14 +512,6 @@ class SionnaScene(NumberedTriangles):
         """A mesh as a point, which no ray hits."""
         return Mesh(np.tile(self._middle, (len(mesh.vertices), 1)), mesh.faces)
 
-    def _moving_rows(self) -> Iterator[tuple[Shape, slice]]:
-        """The shapes that may move, and which of all moving vertices are theirs."""
-        begin = 0
-        for shape in self._moving:
-            end = begin + sum(len(mesh.vertices) for mesh in shape.meshes)
-            yield shape, slice(begin, end)
-            begin = end
-
     def _replace_shapes(self, centre: Float64Array) -> Int64Array:
         """Put the shapes in place of what was there. Returns their process-local numbers."""
         from sionna.rt import SceneObject
@@ -544,7 +538,7 @@ class SionnaScene(NumberedTriangles):
 
 
 def _material_name(shape: Shape) -> str:
-    """Of a shape, as a scenario has it."""
+    """Name of a shape's material, as a scenario has it."""
     name: str = shape.material.name
     return _SKIN_NAME if shape.id == _SKIN else name.removeprefix(OBJECT_MATERIAL)
 

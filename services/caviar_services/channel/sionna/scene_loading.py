@@ -1,15 +1,19 @@
-"""Scenery in Sionna RT: loaded, given its materials, joined to a shape a material, with the detail asked for.
+"""Scenery and bodies for Sionna RT: loaded, given their materials, joined to a shape a material, with the
+detail asked for.
 
 Meshes and descriptions are read by our own readers: Mitsuba takes triangles only, keeps float32, and its
 errors name neither the user's file nor a shape.
+
+Bodies stand for moving objects, by mesh and material (`BodyPool`); more are made when objects or meshes come.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -17,12 +21,14 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
+from caviar_protocol.assets import is_mesh_name, material_of
 from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
-from caviar_protocol.space.ply import read_ply
-from caviar_services.channel.mesh_detail import DetailEffect, DetailSettings, detailed
-from caviar_services.channel.sionna.materials import (
+from caviar_protocol.topics import Scene
+from caviar_services.channel.sionna import mi
+from caviar_services.drjit_setup import aligned_columns
+from caviar_space.materials import (
     BODY_THICKNESS,
     OBJECT_MATERIAL,
     Constants,
@@ -30,10 +36,11 @@ from caviar_services.channel.sionna.materials import (
     MaterialPolicy,
     MaterialSettings,
     ObjectMaterials,
+    body_kind,
     itu_material,
 )
-from caviar_services.drjit_setup import aligned_columns
-from caviar_space.meshes import Mesh, unit_box
+from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
+from caviar_space.meshes import Body, Mesh, assign_bodies, coarse_centre, object_meshes, shown_asset
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
 
 
@@ -90,8 +97,6 @@ def file_pieces(description: Path | None) -> tuple[dict[str, Piece], tuple[str, 
 
 def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
     """The ray tracer's material of a shape, of which those that are ``made`` are each made once."""
-    import mitsuba as mi
-
     if shape.radio is None:
         named = f"material {shape.material!r} of type {shape.material_type!r}"
         raise AssetError(
@@ -111,26 +116,6 @@ def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
     return made[name]
 
 
-def unit_mesh(asset: str, assets: Mapping[str, Path]) -> Mesh:
-    """Load the unit mesh of an asset; that of an empty one is the box.
-
-    Args:
-        asset: Name of the file.
-        assets: Files of the run by name.
-
-    Raises:
-        AssetError: There is no such file, or it is no mesh.
-    """
-    if not asset:
-        return unit_box()
-    path = assets.get(asset)
-    if path is None:
-        known = ", ".join(sorted(name for name in assets if name.startswith("objects/"))) or "none"
-        raise AssetError(f"there is no mesh {asset!r} among the assets; object meshes: {known}")
-    vertices, faces = read_ply(path, f"mesh {asset!r}")
-    return Mesh(vertices, faces.astype(np.int32))
-
-
 def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
     """Make the mesh that the ray tracer has for a shape.
 
@@ -138,8 +123,6 @@ def mi_mesh(shape: Shape, centre: Float64Array) -> Any:
         shape: In world coordinates.
         centre: What the ray tracer counts from [m], Shape ``[3]``.
     """
-    import mitsuba as mi
-
     counts = np.array([len(mesh.vertices) for mesh in shape.meshes])
     # Faces of each piece refer to its own vertices.
     before = np.cumsum(counts) - counts
@@ -162,8 +145,6 @@ def floats(vertices: Float64Array) -> Any:
     Args:
         vertices: [m], Shape ``[V, 3]``.
     """
-    import mitsuba as mi
-
     (column,) = aligned_columns(vertices.reshape(1, -1))
     return mi.Float(column)
 
@@ -238,7 +219,7 @@ def object_materials(
 
     made = {}
     for name in objects.names:
-        change, key = policy.of(name), Place("object_materials").at(objects.key_of(name)).key
+        change, key = policy.changes_of(name), Place("object_materials").at(objects.key_of(name)).key
         remedy = f"choose another material, give {policy.key}.materials.{name} constants of its own"
         itu: tuple[ItuMaterial, ...] = ()
         if not change.is_electric:
@@ -281,7 +262,7 @@ def set_materials(
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
             material.relative_permittivity, material.conductivity = itu.constants
-        _checked_change(material, name, policy.of(name), policy)
+        _checked_change(material, name, policy.changes_of(name), policy)
     scene.frequency = frequency_hz
 
 
@@ -302,13 +283,13 @@ def itu_materials(
     for name, material in scene.radio_materials.items():
         itu = _itu_of(name, material, frequency_hz, policy)
         if itu is not None:
-            found.append((material, itu, policy.of(name).applied(itu.constants)))
+            found.append((material, itu, policy.changes_of(name).applied(itu.constants)))
     return found
 
 
 def _itu_of(name: str, material: Any, frequency_hz: float, policy: MaterialPolicy) -> ItuMaterial | None:
     """The ITU material that a material of the scene is; None for others, and for those that nothing needs."""
-    if not hasattr(material, "itu_type") or policy.of(name).is_electric or not material.is_used:
+    if not hasattr(material, "itu_type") or policy.changes_of(name).is_electric or not material.is_used:
         return None
     return itu_material(name, material.itu_type, frequency_hz, policy)
 
@@ -371,10 +352,7 @@ def with_detail(
     pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
     kept, effect = detailed(pieces, detail)
     if pieces and not kept:
-        raise ScenarioError(
-            f"{detail} leaves out all of the scenery; leave out less",
-            key=key,
-        )
+        raise ScenarioError(f"{detail} leaves out all of the scenery; leave out less", key=key)
     left = dict(kept)
     return [
         Shape(shape.id, shape.material, names, [left[name] for name in names])
@@ -383,21 +361,8 @@ def with_detail(
     ], effect
 
 
-# [m]; the centre is a multiple of it, so that a scene about the origin stays as it is.
-_CENTRE_STEP = 128.0
-
 # [m]; float32 has a step of 8 mm at this distance: what is farther from the centre is traced too coarsely.
 _FARTHEST = 1e5
-
-
-def near_middle(low: Float64Array, high: Float64Array) -> Float64Array:
-    """Multiples of `_CENTRE_STEP` next to the middle of a box [m], Shape ``[3]``; no negative zeros.
-
-    Args:
-        low, high: Corners [m], Shape ``[3]`` each.
-    """
-    middle: Float64Array = np.round((low + high) / (2 * _CENTRE_STEP)) * _CENTRE_STEP + 0.0
-    return middle
 
 
 def bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
@@ -432,13 +397,14 @@ def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
     low, high = _boxes(shapes)
     # The usual scene: its middle, so that products stay what they are.
     if not len(low) or (high.max(0) - low.min(0)).max() <= 2 * _FARTHEST:
-        return near_middle(*bounds(shapes)), ""
+        lowest, highest = bounds(shapes)
+        return coarse_centre((lowest + highest) / 2), ""
     middles = (low + high) / 2
     near = np.array([((low >= m - _FARTHEST) & (high <= m + _FARTHEST)).all(1) for m in middles])
     # Where two places have as many pieces, that which is nearer to the origin counts.
     most = np.lexsort((np.abs(middles).max(1), -near.sum(1)))[0]
     kept = near[most] | (np.arange(len(near)) == most)
-    centre = near_middle(low[kept].min(0), high[kept].max(0))
+    centre = coarse_centre((low[kept].min(0) + high[kept].max(0)) / 2)
     reach = np.maximum(np.abs(low - centre), np.abs(high - centre)).max(1)
     far, step = int(reach.argmax()), np.spacing(np.float32(reach.max()))
     pieces = [piece for shape in shapes for piece in zip(shape.names, shape.meshes, strict=True)]
@@ -452,3 +418,203 @@ def counting_centre(shapes: Sequence[Shape]) -> tuple[Float64Array, str]:
 
 def _place(corner: Float64Array) -> str:
     return f"({', '.join(f'{c:g}' for c in corner)}) m"
+
+
+def own_materials(assets: Mapping[str, Path]) -> dict[str, str]:
+    """Find the materials that meshes of objects name in their files, by asset.
+
+    Args:
+        assets: Files of the run by name.
+    """
+    named = {name: material_of(file) for name, file in assets.items() if name.startswith("objects/")}
+    return {name: material for name, material in named.items() if material}
+
+
+@dataclass(frozen=True)
+class _LaterMeshes:
+    """Meshes that came while the run goes on, and the bodies that were made since its beginning."""
+
+    meshes: Mapping[str, Mesh] = field(default_factory=dict)
+    """By asset."""
+    materials: Mapping[str, str] = field(default_factory=dict)
+    """By asset: of those that name one."""
+    room: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """Bodies by mesh and material; those of the box are for objects whose mesh is not there."""
+    changed: bool = False
+    """Whether bodies have to be made for them."""
+
+
+@dataclass(frozen=True)
+class _Bodies:
+    """The bodies that there are, by their kinds (`body_kind`)."""
+
+    counts: dict[str, int]
+    meshes: dict[str, Mesh]
+    of_material: dict[str, list[Body]]
+    """By material; an empty one is that of all bodies without one of their own."""
+
+
+class BodyPool:
+    """The bodies that objects of a scene may have.
+
+    Args:
+        assets: Files of the run by name; the meshes of objects among them.
+        pool: How many bodies of each asset there are at first; an empty asset is the box, 0 forbids any.
+        keys: Key of the scenario that says how many, by asset, for errors.
+        objects: Materials of objects that differ from the others.
+        own: Materials that meshes name in their files, by asset (`own_materials`).
+        materials: Names of all materials that bodies may have: there are bodies for each.
+
+    Raises:
+        AssetError: A file is no mesh.
+    """
+
+    def __init__(
+        self,
+        assets: Mapping[str, Path],
+        pool: Mapping[str, int],
+        keys: Mapping[str, str],
+        objects: ObjectMaterials,
+        own: Mapping[str, str],
+        materials: Collection[str],
+    ) -> None:
+        self._objects = objects
+        self._own_materials = own
+        self._later = _LaterMeshes()
+        units = object_meshes(assets)
+        # Each material of bodies is a shape of its own, with a pool of its own.
+        kinds = {(asset, m): body_kind(asset, m) for m in ("", *materials) for asset in sorted(pool)}
+        self._keys = {kind: keys.get(asset, "") for (asset, _), kind in kinds.items()}
+        self._first = _Bodies(
+            {kind: pool[asset] for (asset, _), kind in kinds.items()},
+            {kind: units[asset] for (asset, _), kind in kinds.items()},
+            {
+                m: [
+                    (kind, slot)
+                    for (asset, of), kind in kinds.items()
+                    if of == m
+                    for slot in range(pool[asset])
+                ]
+                for m in ("", *materials)
+            },
+        )
+        self._now = self._first
+
+    @property
+    def of_material(self) -> Mapping[str, list[Body]]:
+        """Bodies by material; an empty one is that of all bodies without one of their own."""
+        return self._now.of_material
+
+    @property
+    def bodies(self) -> list[Body]:
+        """All bodies, material by material."""
+        return [body for of in self._now.of_material.values() for body in of]
+
+    @property
+    def meshes(self) -> Mapping[str, Mesh]:
+        """Unit mesh of each kind of body, those of which there is none included."""
+        return self._now.meshes
+
+    @property
+    def unit_meshes(self) -> Mapping[str, Mesh]:
+        """Unit meshes of the kinds of bodies that there are."""
+        return {kind: mesh for kind, mesh in self._now.meshes.items() if self._now.counts[kind]}
+
+    def named_materials(self) -> set[str]:
+        """Materials that meshes name, those that came later too."""
+        return {*self._own_materials.values(), *self._later.materials.values()}
+
+    def use_meshes(self, meshes: Mapping[str, Path]) -> None:
+        """Take meshes that objects may have from the next frame on, beside those of the beginning.
+
+        Args:
+            meshes: Files by asset name; those of an earlier call that are not here are gone.
+
+        Raises:
+            AssetError: A file is no mesh.
+        """
+        self._later = _LaterMeshes(
+            meshes=object_meshes(meshes),
+            materials=own_materials(meshes),
+            changed=True,
+        )
+
+    def make_room(self, scene: Scene, solid: Sequence[int]) -> bool:
+        """Make bodies where a frame has more objects of a kind than there are bodies.
+
+        A mesh of the beginning whose pool is 0 gets none: `assign` refuses its objects.
+
+        Args:
+            scene: The scene of a frame.
+            solid: Its objects that waves meet, by their index.
+
+        Returns:
+            Whether there are other bodies than before.
+        """
+        later, asset_of = self._later, scene.assets
+        body_of = {i: self._body_of(scene, i) for i in solid}
+        needed = Counter(body_of.values())
+        # Bodies that a mesh came for are made whatever the pools are; boxes stand in where it is not there.
+        came = {body for i, body in body_of.items() if is_mesh_name(asset_of[i])}
+        for key in [k for k in needed if k not in came and not self._first.counts.get(body_kind(*k))]:
+            del needed[key]
+        short = any(n > self._now.counts.get(body_kind(*key), 0) for key, n in needed.items())
+        if not later.changed and not short:
+            return False
+        # In powers of two: objects that come one by one seldom make bodies anew.
+        room = {} if later.changed else dict(later.room)
+        for key, n in needed.items():
+            room[key] = max(room.get(key, 0), 1 << (n - 1).bit_length())
+        self._later = replace(later, room=room, changed=False)
+        self._now = self._with_room(room)
+        return True
+
+    def _with_room(self, room: Mapping[tuple[str, str], int]) -> _Bodies:
+        """The bodies of the beginning, and those made since, which come last of their material."""
+        first, later = self._first, self._later.meshes
+        counts, meshes = dict(first.counts), dict(first.meshes)
+        of_material = {m: [*bodies] for m, bodies in first.of_material.items()}
+        for (asset, material), count in sorted(room.items()):
+            kind = body_kind(asset, material)
+            before = counts.get(kind, 0)
+            counts[kind] = max(before, count)
+            meshes[kind] = later[asset] if asset in later else first.meshes[asset]
+            more = [(kind, slot) for slot in range(before, counts[kind])]
+            of_material[material] = of_material.get(material, []) + more
+        return _Bodies(counts, meshes, of_material)
+
+    @property
+    def awaits_meshes(self) -> bool:
+        """True if meshes came for which bodies are not made yet."""
+        return self._later.changed
+
+    def kind(self, scene: Scene, i: int) -> str:
+        """Kind of the bodies that may stand for an object.
+
+        Args:
+            scene: The scene of a frame.
+            i: Index of the object.
+        """
+        return body_kind(*self._body_of(scene, i))
+
+    def _body_of(self, scene: Scene, i: int) -> tuple[str, str]:
+        """Mesh and material of the body of an object of a scene; the box for a mesh that is not there."""
+        asset = scene.assets[i]
+        if asset not in self._later.meshes:
+            asset = shown_asset(asset, self._first.meshes)
+        own = self._later.materials.get(asset) or self._own_materials.get(asset, "")
+        return asset, self._objects.material_for(scene.names[i], scene.classes[i]) or own
+
+    def assign(self, objects: Iterable[tuple[str, str]]) -> dict[str, Body]:
+        """Choose a body for each object, as `assign_bodies` does.
+
+        Args:
+            objects: Name and kind of each.
+
+        Returns:
+            By name.
+
+        Raises:
+            PayloadError: There are too few bodies of a kind.
+        """
+        return assign_bodies(objects, self._now.counts, self._keys)

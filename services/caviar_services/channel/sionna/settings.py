@@ -22,11 +22,14 @@ from caviar_protocol.errors import suggestion
 from caviar_protocol.messages import WARNING
 from caviar_protocol.scenario.conversion import Place
 from caviar_services.channel.base import ChannelSettings
-from caviar_services.channel.mesh_detail import DetailSettings
-from caviar_services.channel.propagation.foliage import FoliageSettings
-from caviar_services.channel.propagation.fresnel import slab
-from caviar_services.channel.propagation.human_blockage import HumanBlockageSettings, check_screens
-from caviar_services.channel.sionna.materials import (
+from caviar_services.channel.propagation.attenuation import (
+    FoliageSettings,
+    HumanBlockageSettings,
+    check_screens,
+)
+from caviar_services.channel.propagation.utd import slab
+from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
+from caviar_space.materials import (
     DRAWN,
     OTHER_MATERIALS,
     MaterialSettings,
@@ -34,7 +37,7 @@ from caviar_services.channel.sionna.materials import (
     SurfaceMaterial,
     UsedSurfaces,
 )
-from caviar_services.channel.sionna.ray_launcher import LaunchOptions, rays_within
+from caviar_space.mesh_detail import DetailSettings
 from caviar_space.mitsuba_xml import ITU_MATERIALS
 
 # Half of the smallest float32 above 0.
@@ -56,7 +59,7 @@ BodyCount = Annotated[int, quantity("1", "bodies of one mesh for moving objects,
 
 
 class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
-    """What is modelled, and how finely.
+    """Settings of the channel ``sionna-rt``: what is modelled, and how finely.
 
     Example:
         >>> SionnaSettings(max_depth=2, ray_spacing_deg=1.0).launched_samples()
@@ -204,7 +207,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
             )
 
     def enumerates(self, moving: bool) -> bool:
-        """Whether reflected paths are enumerated.
+        """Test whether reflected paths are enumerated.
 
         Args:
             moving: Whether objects move in the run.
@@ -262,7 +265,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         return round(4 * math.pi / math.radians(self.ray_spacing_deg) ** 2)
 
     def launch_options(self, seed: int) -> LaunchOptions:
-        """What a launch traces in each frame.
+        """Options of a launch in each frame.
 
         Args:
             seed: Of the rays, where there is no ``launch_seed``.
@@ -280,7 +283,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
         )
 
     def pool_sizes(self, assets: Iterable[str], place: Place) -> dict[str, int]:
-        """How many bodies there are of each mesh, by asset: those of the run, and the box, ``""``.
+        """Number of bodies of each mesh, by asset: those of the run, and the box, ``""``.
 
         Args:
             assets: Names of the run's files.
@@ -349,7 +352,7 @@ def contributing(
 
 
 def transmits(material: SurfaceMaterial, options: LaunchOptions, frequencies_hz: Sequence[float]) -> bool:
-    """Whether a ray can be sent through a surface on any carrier at any incidence.
+    """Test whether a ray can be sent through a surface on any carrier at any incidence.
 
     Args:
         material: Of the surface.

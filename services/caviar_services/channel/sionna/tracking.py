@@ -18,16 +18,8 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt64Array
 from caviar_protocol.codec import decode_payload, encode_payload
 from caviar_protocol.topics import Scene
-from caviar_services.channel.propagation.geometry import Rows
-from caviar_services.channel.sionna.candidates import (
-    MANY_RAYS,
-    Candidates,
-    Chains,
-    Met,
-    Offer,
-    chains_of,
-)
-from caviar_services.channel.sionna.diffuse_paths import scattered_of
+from caviar_services.channel.sionna import mi
+from caviar_services.channel.sionna.candidates import MANY_RAYS, Candidates, Chains, Met, Offer, chains_of
 from caviar_services.channel.sionna.ray_launcher import (
     REFLECTED,
     REFRACTED,
@@ -35,10 +27,12 @@ from caviar_services.channel.sionna.ray_launcher import (
     Launch,
     LaunchOptions,
     PartedLauncher,
+    scattered_of,
 )
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.checkpoint import Packed
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, positions
+from caviar_space.vectors import Rows
 
 # [m] A transmitter that has moved farther since the frame before is looked for anew.
 _JUMP = 20.0
@@ -225,7 +219,7 @@ class FollowedOffer(Offer):
     def again(
         cls, state: TableState, transmitter: Float64Array, scene: SionnaScene, options: LaunchOptions
     ) -> FollowedOffer:
-        """What was on offer from a position when the scene was as it is now.
+        """Offer from a position when the scene was as it is now.
 
         Args:
             state: The chains.
@@ -236,7 +230,7 @@ class FollowedOffer(Offer):
 
     @property
     def state(self) -> TableState:
-        """What is on offer."""
+        """Chains on offer."""
         return TableState.of(self._table)
 
     def __init__(self, table: _Table, scene: SionnaScene, source: Any, options: LaunchOptions) -> None:
@@ -259,8 +253,6 @@ class FollowedOffer(Offer):
 
     def _launch_of(self, chains: Int64Array) -> Launch:
         """Rays that met what these of the chains on offer meet."""
-        import mitsuba as mi
-
         if not len(self._table.depth):
             return Launch((), None)
         table = self._table.take(chains)
@@ -284,7 +276,7 @@ class FollowedOffer(Offer):
 
 
 def _on_object(launch: Launch, scene: SionnaScene, rays: int) -> BoolArray:
-    """Which of so many rays met a moving object, in any pass."""
+    """Mask of so many rays that met a moving object, in any pass."""
     met = np.zeros(rays, np.bool_)
     for bounce in launch.bounces:
         on_body = (bounce.kind.numpy() != 0) & scene.is_body(bounce.shape.numpy())
@@ -313,7 +305,7 @@ def _planes(table: _Table, scene: SionnaScene) -> Int64Array:
 
 
 def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
-    """What tells chains apart, as one number each: the kinds of their interactions and reflecting planes."""
+    """Keys that tell chains apart, one number each: the kinds of their interactions and reflecting planes."""
     keys = np.zeros(len(table.depth), np.uint64)
     for kind, plane in zip(table.kind.T, _planes(table, scene).T, strict=True):
         keys ^= (kind + 16 * (plane + 1)).astype(np.uint64)
@@ -325,7 +317,7 @@ def _keys(table: _Table, scene: SionnaScene) -> UInt64Array:
 
 
 class FollowingState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is followed; nothing where each frame stands on its own."""
+    """State of all that is followed; empty where each frame stands on its own."""
 
     followed: dict[str, FollowedState] = {}
     """By transmitter."""
@@ -355,7 +347,7 @@ class Following:
         self._followed.clear()
         self._placed = None
 
-    def of(self, transmitter: str) -> Followed:
+    def chains_from(self, transmitter: str) -> Followed:
         """The chains of a transmitter.
 
         Args:

@@ -1,34 +1,181 @@
-"""Which triangle of the ray tracer's shapes is whose: numbers, pieces and planes of triangles, in float64.
+"""Numbers, pieces and planes of the triangles of the ray tracer's shapes, in float64.
 
 A shape holds many pieces of scenery or many bodies. Ray tracers tell a shape and a triangle within it; here
 triangles are numbered through all shapes, in the order of the shapes, and each belongs to a piece and lies
 in a plane of it.
+
+Coplanar faces of bodies that touch or overlap one another or scenery are one surface (`CoplanarFaces`).
+
+The geometry of scenery may give other fields than its author expects, which is warned of once, before the
+run. Of faces of two materials in one plane (`coinciding_materials`) waves meet one. Of a closed thin wall
+(`closed_walls`) the ray tracer takes each face as a slab of its material's thickness, so that a wave crosses
+such a wall twice.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
-from caviar_services.channel.propagation.clearance import Surfaces
-from caviar_services.channel.sionna.coplanar_faces import CoplanarFaces, JoinedFaces
+from caviar_protocol.messages import WARNING
 from caviar_services.channel.sionna.scene_loading import Shape
-from caviar_space.meshes import Mesh
+from caviar_space.meshes import Body, Mesh
+from caviar_space.obstacles import Surfaces
 from caviar_space.planes import (
+    CoplanarFaces,
+    JoinedFaces,
     PlaneTable,
+    is_closed,
     plane_numbers,
     plane_numbers_of,
     shared_planes,
     two_sided_planes,
 )
+from caviar_space.vectors import cross
 
-Body = tuple[str, int]
-"""Asset and slot of a body in the pool."""
+# [m]; what overlaps, or stands out, by less does not.
+_NEAR = 1e-3
+
+# Faces of a closed wall are no farther apart than this many thicknesses of its material.
+_THICKNESSES = 2.0
+
+
+def coinciding_materials(shapes: Sequence[Shape], plane: Int64Array) -> tuple[str, ...]:
+    """Warn of pieces of different materials that overlap in one plane, where waves can meet them.
+
+    A floor of a house on the ground, and the common wall of two houses, are inside: no wave comes there.
+
+    Args:
+        shapes: The scenery, one shape a material.
+        plane: Number of the plane of each triangle, Shape ``[F]``.
+    """
+    pieces = [(name, shape) for shape in shapes for name in shape.names]
+    meshes = [mesh for shape in shapes for mesh in shape.meshes]
+    if len(shapes) < 2:
+        return ()
+    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    piece = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])[piece]
+    begin = np.flatnonzero(np.diff(piece, prepend=-1))
+    order = np.lexsort((material, plane))
+    starts = np.flatnonzero(np.diff(plane[order], prepend=-1))
+    found: set[tuple[int, int]] = set()
+    for rows in np.split(order, starts[1:]):
+        if material[rows[0]] == material[rows[-1]]:
+            continue
+        a, b, c = np.moveaxis(triangles[rows], 1, 0)
+        normals = cross(b - a, c - a)
+        largest = int(np.einsum("fx,fx->f", normals, normals).argmax())
+        length = float(np.linalg.norm(normals[largest]))
+        if not length:
+            continue
+        normal = normals[largest] / length
+        height = (triangles - a[largest]) @ normal
+        sides: tuple[float, ...] = (1.0, -1.0)
+        if abs(normal[2]) > _LYING:  # grounds and roofs are met from above
+            sides = (1.0,) if normal[2] > 0 else (-1.0,)
+        for side in sides:
+            # What stands out of the plane on a side covers it there.
+            covered = np.maximum.reduceat((side * height).max(1), begin) > _NEAR
+            free = rows[~covered[piece[rows]]]
+            flat = np.delete(triangles[free], int(np.abs(normal).argmax()), axis=2)
+            for row, corners in zip(free.tolist(), flat, strict=True):
+                others = free[material[free] > material[row]]
+                over = others[_overlaps(corners, flat[material[free] > material[row]])]
+                found.update((int(piece[row]), int(other)) for other in np.unique(piece[over]))
+    if not found:
+        return ()
+    (one, of_one), (other, of_other) = (pieces[number] for number in min(found))
+    more = f", as do {len(found) - 1} more pairs" if len(found) > 1 else ""
+    note = (
+        f"{WARNING}{one!r} of material {of_one.material.name!r} and {other!r} of {of_other.material.name!r} "
+        f"overlap in one plane{more}: waves meet {one!r} alone there; leave one out, or move it a millimetre "
+        "to the side that it is to be met from"
+    )
+    return (note,)
+
+
+def _overlaps(triangle: Float64Array, others: Float64Array) -> BoolArray:
+    """Test whether triangles overlap one by more than `_NEAR`: none of their edges parts them (the separating
+    axis theorem). Shapes ``[3, 2]`` and ``[N, 3, 2]`` [m]."""
+    both = np.concatenate([np.broadcast_to(triangle, others.shape), others], axis=1)
+    edges = np.concatenate([np.roll(part, -1, axis=1) - part for part in np.split(both, 2, axis=1)], axis=1)
+    axes = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
+    axes /= np.maximum(np.linalg.norm(axes, axis=-1, keepdims=True), 1e-300)
+    at = np.einsum("nax,ncx->nac", axes, both)
+    depth = np.minimum(at[..., :3].max(-1), at[..., 3:].max(-1)) - np.maximum(
+        at[..., :3].min(-1), at[..., 3:].min(-1)
+    )
+    overlap: BoolArray = (depth > _NEAR).all(1)
+    return overlap
+
+
+def closed_walls(shapes: Sequence[Shape], face: Int64Array, transparent: Collection[str]) -> tuple[str, ...]:
+    """Warn of closed meshes two faces of which are the two sides of one wall.
+
+    Args:
+        shapes: The scenery, one shape a material.
+        face: Number of the flat face of each triangle, counted through all pieces, Shape ``[F]``.
+        transparent: Ids of the shapes that waves go through.
+    """
+    found, begin = [], 0
+    for shape in shapes:
+        thickness = float(shape.material.thickness[0])
+        for name, mesh in zip(shape.names, shape.meshes, strict=True):
+            own = face[begin : begin + len(mesh.faces)]
+            begin += len(mesh.faces)
+            apart = 0.0
+            if shape.id in transparent:
+                apart = _wall(mesh, own - own.min(), _THICKNESSES * thickness)
+            if apart:
+                found.append((name, shape.material.name, apart, thickness))
+    if not found:
+        return ()
+    name, material, apart, thickness = found[0]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    note = (
+        f"{WARNING}{name!r}{more} is a closed wall, {apart:.3g} m between its faces: each face is a slab of "
+        f"{thickness:g} m of {material!r}, so that waves cross two slabs; make it one open sheet"
+    )
+    return (note,)
+
+
+def _wall(mesh: Mesh, number: Int64Array, most: float) -> float:
+    """Distance [m] of the nearest two faces of a closed mesh, at most ``most``, between which it is solid; 0
+    where there are none."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(0), 1, 0)
+    areas = cross(b - a, c - a)
+    count = int(number.max(initial=-1)) + 1
+    normal = np.stack([np.bincount(number, axis, count) for axis in areas.T], axis=-1)
+    size = np.linalg.norm(normal, axis=1)
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    for corner in (a, b, c):
+        np.minimum.at(low, number, corner)
+        np.maximum.at(high, number, corner)
+    first = np.zeros(count, np.int64)
+    first[number[::-1]] = np.arange(len(number))[::-1]
+    # A closed mesh whose normals lead inwards has a volume below 0.
+    outwards = np.sign(np.einsum("fx,fx->", a, areas))
+    flat = np.flatnonzero(size > 0)
+    normal = outwards * normal[flat] / size[flat, None]
+    leading = np.take_along_axis(normal, np.abs(normal).argmax(1)[:, None], 1)[:, 0]
+    line = np.round(normal * np.sign(leading)[:, None], 3) + 0.0
+    offset = np.einsum("nx,nx->n", a[first[flat]], normal * np.sign(leading)[:, None])
+    order = np.lexsort((offset, *line.T))
+    here, there = order[:-1], order[1:]
+    distance = offset[there] - offset[here]
+    wall = (line[here] == line[there]).all(1) & (leading[here] < 0) & (leading[there] > 0)
+    wall &= (distance > 0) & (distance <= most)
+    reach = distance[:, None] + _NEAR
+    low, high = low[flat], high[flat]
+    wall &= ((low[here] < high[there] + reach) & (low[there] < high[here] + reach)).all(1)
+    return float(distance[wall].min()) if wall.any() and is_closed(mesh) else 0.0
+
 
 SurfaceNames = tuple[tuple[str, int], ...]
 """Objects, and planes of each, that surfaces of several objects are known by."""
@@ -67,26 +214,24 @@ class NumberedTriangles:
         self._number_shapes(shapes, ids, moving)
         corners = np.array([len(mesh.vertices) for mesh in meshes])
         before = self._first_vertices = np.cumsum(corners) - corners
-        self._corners = np.concatenate([mesh.vertices for mesh in meshes])
-        self._faces = np.concatenate([mesh.faces + b for mesh, b in zip(meshes, before, strict=True)])
+        self.vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        """All vertices as they stand [m], Shape ``[V, 3]``."""
+        faces = [mesh.faces + begin for mesh, begin in zip(meshes, before, strict=True)]
+        self.triangle_vertices = np.concatenate(faces)
+        """Vertices of each triangle, Shape ``[F, 3]``."""
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
         # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
-        self._relative = self._corners - centre
+        self._relative = self.vertices - centre
         self.joined: JoinedFaces
         """Which faces are one surface."""
         material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])
         self._number_planes(meshes, material, unit_meshes)
         last = [mesh for shape in shapes[-moving:] for mesh in shape.meshes]
-        self._vertices = self._corners[len(self._corners) - sum(len(mesh.vertices) for mesh in last) :]
-        self._first_moving = len(self._faces) - sum(len(mesh.faces) for mesh in last)
-        self.surfaces = Surfaces(self._corners[self._faces], self._points_outside)
+        self._vertices = self.vertices[len(self.vertices) - sum(len(mesh.vertices) for mesh in last) :]
+        self._first_moving = len(self.triangle_vertices) - sum(len(mesh.faces) for mesh in last)
+        self.surfaces = Surfaces(self.vertices[self.triangle_vertices], self._points_outside)
         """All triangles, in world coordinates."""
-
-    @property
-    def moving_vertices(self) -> Float64Array:
-        """Vertices of the shapes that may move [m], Shape ``[V, 3]``; a copy."""
-        return self._vertices.copy()
 
     def count_from(self, centre: Float64Array) -> None:
         """Move everything to stand about another centre as it stood about the last.
@@ -94,10 +239,10 @@ class NumberedTriangles:
         Args:
             centre: [m], Shape ``[3]``.
         """
-        self._corners += centre - self.centre
+        self.vertices += centre - self.centre
         self.centre = centre
         self.version += 1
-        self.surfaces.move(np.arange(len(self._faces)), self._corners[self._faces])
+        self.surfaces.move(np.arange(len(self.triangle_vertices)), self.vertices[self.triangle_vertices])
 
     def move(self, vertices: Float64Array) -> bool:
         """Move the bodies.
@@ -113,25 +258,21 @@ class NumberedTriangles:
             return False
         self._vertices[:] = vertices
         self.version += 1
-        first = len(self._corners) - len(vertices)
+        first = len(self.vertices) - len(vertices)
         self._relative[first:][changed] = vertices[changed] - self.centre
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
-        moved = changed[self._faces[self._first_moving :] - first].any(1)
+        moved = changed[self.triangle_vertices[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
         # Boxes of joined surfaces are around all of their planes: they are made anew.
         joined = np.array([group[0] for group in self.joined.groups], np.int64)
         self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
-        self._join()
-        self.surfaces.move(triangles, self._corners[self._faces[triangles]])
-        return True
-
-    def _join(self) -> None:
-        """Find the faces that are one surface now."""
-        before, now = self.joined, self._coplanar.find()
-        self.joined = now
-        self.plane_table.join(now.groups)
-        if before.groups or now.groups:
+        # Find the faces that are one surface now.
+        before, self.joined = self.joined, self._coplanar.find()
+        self.plane_table.join(self.joined.groups)
+        if before.groups or self.joined.groups:
             self.surface_of = self.joined.label[self.plane_of]
+        self.surfaces.move(triangles, self.vertices[self.triangle_vertices[triangles]])
+        return True
 
     def surface_names(self, triangles: Int64Array, names: Sequence[str]) -> tuple[Int32Array, SurfaceNames]:
         """Name surfaces so that paths by way of them are known in other frames.
@@ -163,16 +304,6 @@ class NumberedTriangles:
             numbers[its] = -len(known)
         return numbers, tuple(known)
 
-    @property
-    def vertices(self) -> Float64Array:
-        """All vertices as they stand [m], Shape ``[V, 3]``."""
-        return self._corners
-
-    @property
-    def triangle_vertices(self) -> Int32Array:
-        """Vertices of each triangle, Shape ``[F, 3]``."""
-        return self._faces
-
     def begin_of(self, piece: int) -> tuple[int, int]:
         """Numbers of the first vertex and the first triangle of a piece.
 
@@ -182,21 +313,16 @@ class NumberedTriangles:
         return int(self._first_vertices[piece]), int(self._first_triangles[piece])
 
     @property
-    def first_moving_plane(self) -> int:
-        """Number of the first plane of a body; those of scenery come before."""
-        return int(self._moving_plane)
-
-    @property
     def first_body_piece(self) -> int:
         """Number of the piece that is the first body; those of scenery come before."""
         return len(self.names) - len(self._bodies)
 
     @property
     def scenery_digest(self) -> bytes:
-        """Of all triangles at rest and of their planes."""
+        """Digest of all triangles at rest and of their planes."""
         digest = hashlib.blake2b(digest_size=20)
-        faces = self._faces[: self._first_moving]
-        still = self._corners[: len(self._corners) - len(self._vertices)]
+        faces = self.triangle_vertices[: self._first_moving]
+        still = self.vertices[: len(self.vertices) - len(self._vertices)]
         for part in (still - self.centre, faces, self.plane_of[: self._first_moving]):
             digest.update(np.ascontiguousarray(part).tobytes())
         return digest.digest()
@@ -216,7 +342,7 @@ class NumberedTriangles:
             asset: It has one body at least.
         """
         piece = self.first_body_piece + int(self.bodies_of(asset)[0])
-        ends = np.append(self._first_triangles, len(self._faces))
+        ends = np.append(self._first_triangles, len(self.triangle_vertices))
         return self._face_of[ends[piece] : ends[piece + 1]]
 
     def piece_of(self, triangles: Int64Array) -> Int64Array:
@@ -286,7 +412,7 @@ class NumberedTriangles:
         """
         number = self._offsets[self._where(shapes)] + primitives
         # The number of no shape is beyond all others and must not lead out of the table.
-        clipped: Int64Array = np.clip(number, 0, len(self._faces) - 1)
+        clipped: Int64Array = np.clip(number, 0, len(self.triangle_vertices) - 1)
         return clipped
 
     def corners(self, triangles: Int64Array) -> Float64Array:
@@ -295,7 +421,7 @@ class NumberedTriangles:
         Args:
             triangles: Numbers, of any Shape.
         """
-        corners: Float64Array = self._corners[self._faces[triangles]]
+        corners: Float64Array = self.vertices[self.triangle_vertices[triangles]]
         return corners
 
     def shapes_of(self, triangles: Int64Array) -> tuple[Int64Array, Int64Array]:
@@ -336,7 +462,7 @@ class NumberedTriangles:
         return np.where(moved[piece] >= 0, start, -1)
 
     def is_body(self, shapes: NDArray[np.uint32]) -> BoolArray:
-        """Whether shapes are of moving bodies.
+        """Test whether shapes are of moving bodies.
 
         Args:
             shapes: Process-local shapes, of any Shape.
@@ -382,7 +508,7 @@ class NumberedTriangles:
         counts = np.array([int(number.max(initial=-1)) + 1 for number in numbers], np.int64)
         before = np.cumsum(counts) - counts
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
-        faces = self._faces.astype(np.int64)
+        faces = self.triangle_vertices.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
         apart.update(self._relative)
         self.part_of = parts.astype(np.int64)
@@ -390,13 +516,14 @@ class NumberedTriangles:
         shared = shared_planes(apart, np.repeat(material[:still], counts[:still]))
         self.plane_of = shared[parts]
         """Infinite plane of each triangle, numbered through all objects."""
-        self._moving_plane = len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum())
+        self.first_moving_plane = int(len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum()))
+        """Number of the first plane of a body; those of scenery come before."""
         self.plane_table = PlaneTable(self.plane_of, faces)
         self.plane_table.update(self._relative)
         two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
         sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
         self._coplanar = CoplanarFaces(
-            self.plane_table, int(self._moving_plane), counts[still:], np.concatenate(sides)
+            self.plane_table, self.first_moving_plane, counts[still:], np.concatenate(sides)
         )
         self.joined = self._coplanar.none
         self.surface_of = self.plane_of
@@ -404,17 +531,17 @@ class NumberedTriangles:
         that are one surface with it."""
 
     def _points_outside(self, triangle: int, normal: Float64Array) -> bool:
-        """Whether a triangle's normal points away from its piece, or up from one that lies.
+        """Test whether a triangle's normal points away from its piece, or up from one that lies.
 
         Scenery has faces of either sense, so their order of corners says nothing.
         """
-        piece = int(np.searchsorted(self._first_triangles, triangle, side="right")) - 1
+        piece = int(self.piece_of(np.array(triangle)))
         if triangle < self._first_moving and abs(normal[2]) > _LYING:
             return bool(normal[2] > 0)
-        ends = [*self._first_triangles.tolist(), len(self._faces)]
-        corners = self._corners[self._faces[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
+        ends = [*self._first_triangles.tolist(), len(self.triangle_vertices)]
+        corners = self.vertices[self.triangle_vertices[ends[piece] : ends[piece + 1]]].reshape(-1, 3)
         middle = (corners.min(0) + corners.max(0)) / 2
-        return bool((self._corners[self._faces[triangle, 0]] - middle) @ normal >= 0)
+        return bool((self.vertices[self.triangle_vertices[triangle, 0]] - middle) @ normal >= 0)
 
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)

@@ -13,9 +13,8 @@ import numpy as np
 
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
-from caviar_services.channel.base import ChannelSettings, Found, PathModel
-from caviar_services.channel.batch import SameChannels
-from caviar_services.channel.paths import Antenna, PathTable
+from caviar_services.channel.base import ChannelSettings, Found, PathModel, SameChannels
+from caviar_services.channel.paths import Antenna, PathTable, path_ends
 
 
 class FreeSpaceSettings(ChannelSettings, frozen=True, kw_only=True):
@@ -35,13 +34,11 @@ class FreeSpaceChannel(PathModel[FreeSpaceSettings]):
 
     def batch(self) -> SameChannels:
         """Make the channels of many episodes at once, which are the same in all of them."""
-        return SameChannels(self, self.run.name)
+        return SameChannels(self)
 
     def paths(self, scene: Scene, transmitters: Sequence[Antenna], receivers: Sequence[Antenna]) -> Found:
-        start = np.array([antenna.position for antenna in transmitters]).reshape(-1, 1, 3)
-        end = np.array([antenna.position for antenna in receivers]).reshape(1, -1, 3)
-        line = (end - start).reshape(-1, 3)
-        distance = np.sqrt((line**2).sum(-1))
+        start, end = path_ends(np.arange(len(transmitters) * len(receivers)), transmitters, receivers)
+        distance = np.sqrt(((end - start) ** 2).sum(-1))
         wavelength = SPEED_OF_LIGHT / np.array([carrier.frequency_hz for carrier in self.run.carriers])
         far = np.flatnonzero(distance >= wavelength.max())
         spreading = wavelength[:, None] / (4 * np.pi * distance[far])

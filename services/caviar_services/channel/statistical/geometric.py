@@ -25,6 +25,8 @@ this scale. ``path-loss``: times λ/(4πd) and the two element patterns, and ``n
 without line of sight.
 
 Waves have no polarization: arrays of dual polarization, and of several panels, are refused.
+
+`GeometricBatch` makes the channels of many episodes at once, with the formulas of the service as arrays.
 """
 
 from __future__ import annotations
@@ -49,8 +51,9 @@ from caviar_protocol.arrays import (
 from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, dot
-from caviar_protocol.space.scene import device_pose
+from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, Pose, dot, unrotated
+from caviar_protocol.space.scene import antennas, device_pose
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Channel, ChannelMatrix, ChannelOptions, Scene
 from caviar_services.channel.arrays.channel_matrices import (
     Bins,
@@ -59,10 +62,15 @@ from caviar_services.channel.arrays.channel_matrices import (
     superposed,
     wideband_parts,
 )
-from caviar_services.channel.base import ChannelModel, Modelled
+from caviar_services.channel.base import (
+    BatchChannels,
+    ChannelBatch,
+    ChannelModel,
+    MemberSeed,
+    Modelled,
+    SceneAt,
+)
 from caviar_services.channel.propagation.atmosphere import amplitude_factor
-from caviar_services.channel.propagation.clearance import Boxes
-from caviar_services.channel.statistical.batch import GeometricBatch
 from caviar_services.channel.statistical.waves import (
     BLOCK,
     Components,
@@ -80,6 +88,7 @@ from caviar_services.channel.statistical.waves import (
     velocity,
 )
 from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_space.obstacles import Boxes
 
 KEPT = 4096
 """Pairs whose draws are kept at most."""
@@ -239,7 +248,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
     @property
     def draws_last(self) -> bool:
-        """Whether draws last an episode, whose only block has one row."""
+        """True if draws last an episode, whose only block has one row."""
         return self.settings.redraw == "episode"
 
     def draws(self, seed: int, seed_episode: int, pair: tuple[str, str], block: int) -> Draws:
@@ -284,14 +293,25 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
     # --- the product -----------------------------------------------------------------------------------
 
     def _channel(self, ends: _Ends, waves: Waves, sight: Sight) -> Channel:
-        constant = self._constant(tuple(sight.free), tuple(sight.near), ends)
+        key = tuple(sight.free), tuple(sight.near), len(ends.rx)
+        constant = self._constants.get(key)
+        if constant is None:
+            if len(self._constants) >= KEPT_CONSTANTS:
+                self._constants.clear()
+            shape = len(ends.tx), len(ends.rx)
+            constant = self._constants[key] = _Constant.of(key[0], key[1], self._ids, shape)
         a = np.array(waves.amplitude, np.complex128)
         pairs = [
             PairWaves(line.tx, line.rx, line.tx_pose, line.rx_pose, mine)
             for line, mine in zip(sight.lines, constant.rows, strict=True)
         ]
         if self.has_path_gain:
-            a *= self._path_gain(waves, pairs)
+            patterns = np.ones(len(waves.tau))
+            for pair in pairs:
+                patterns[pair.mine] = self.pattern_gain(
+                    pair.tx.array, pair.departures(waves), pair.rx.array, pair.arrivals(waves)
+                )
+            a *= self.path_gain(np.array(waves.length), patterns, np.array(waves.tau))
         # One array, cut up: making an array costs more than its numbers.
         both, count = waves.departure + waves.arrival, len(waves.tau)
         seen = [x for wave in both for x in angles(wave)]
@@ -320,25 +340,6 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
             taps=wideband.taps,
         )
 
-    def _constant(self, free: tuple[bool, ...], near: tuple[bool, ...], ends: _Ends) -> _Constant:
-        key = free, near, len(ends.rx)
-        known = self._constants.get(key)
-        if known is None:
-            if len(self._constants) >= KEPT_CONSTANTS:
-                self._constants.clear()
-            shape = len(ends.tx), len(ends.rx)
-            known = self._constants[key] = _Constant.of(free, near, self._ids, shape)
-        return known
-
-    def _path_gain(self, waves: Waves, pairs: Sequence[PairWaves]) -> Float64Array:
-        """Path gain of all waves, Shape ``[C, P]``."""
-        patterns = np.ones(len(waves.tau))
-        for pair in pairs:
-            patterns[pair.mine] = self.pattern_gain(
-                pair.tx.array, pair.departures(waves), pair.rx.array, pair.arrivals(waves)
-            )
-        return self.path_gain(np.array(waves.length), patterns, np.array(waves.tau))
-
     def pattern_gain(
         self, tx: AntennaArray, departures: Float64Array, rx: AntennaArray, arrivals: Float64Array
     ) -> Float64Array:
@@ -353,8 +354,8 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
         Returns:
             Shape ``[...]``.
         """
-        sent = self.patterns.of(tx).amplitude(departures.reshape(-1, 3))
-        sent *= self.patterns.of(rx).amplitude(arrivals.reshape(-1, 3))
+        sent = self.patterns.element(tx).amplitude(departures.reshape(-1, 3))
+        sent *= self.patterns.element(rx).amplitude(arrivals.reshape(-1, 3))
         return sent.reshape(departures.shape[:-1])
 
     def path_gain(self, length: Float64Array, patterns: Float64Array, tau: Float64Array) -> Float64Array:
@@ -421,7 +422,7 @@ class GeometricChannel(ChannelModel[GeometricSettings]):
 
 
 class _Drawn(NamedTuple):
-    """Of a pair, for a block of frames."""
+    """Draws of a pair, for a block of frames."""
 
     draws: Draws
     tables: dict[bool, Float64Array]
@@ -438,7 +439,7 @@ class _Ends(NamedTuple):
 
     @classmethod
     def of(cls, transmitters: Sequence[AntennaDevice], receivers: Sequence[AntennaDevice]) -> _Ends:
-        """Of some antennas. Raises `PayloadError` for arrays that waves have no polarization for."""
+        """Ends of some antennas. Raises `PayloadError` for arrays that waves have no polarization for."""
         for device in (*transmitters, *receivers):
             if not device.array.is_uniform:
                 raise PayloadError(f"device {device.name!r} {_NOT_UNIFORM}")
@@ -470,7 +471,8 @@ class _Constant(NamedTuple):
         ids: Mapping[bool, Sequence[int]],
         shape: tuple[int, int],
     ) -> _Constant:
-        """Of pairs by whether their lines are free, and their ends too near to each other for a path."""
+        """Constants of pairs by whether their lines are free, and their ends too near to each other for a
+        path."""
         of_pairs = [[] if close else ids[los] for los, close in zip(free, near, strict=True)]
         offsets = [0, *accumulate(map(len, of_pairs))]
         paths = offsets[-1]
@@ -490,3 +492,108 @@ class _Constant(NamedTuple):
 
 def _id(kind: str) -> int:
     return int.from_bytes(hashlib.blake2b(kind.encode(), digest_size=8).digest(), "little")
+
+
+class GeometricBatch(ChannelBatch):
+    """Channels of M members, of which each draws what the service draws for its seed.
+
+    Args:
+        model: Prepared, with the settings and patterns of the run.
+    """
+
+    def __init__(self, model: GeometricChannel) -> None:
+        self._model = model
+        self._members: Sequence[MemberSeed] = ()
+        self._block = -1
+        self._draws: dict[tuple[str, str], Draws] = {}
+
+    def begin(self, members: Sequence[MemberSeed]) -> None:
+        self._members, self._block = tuple(members), -1
+
+    def reach(self, number: int) -> int:
+        _, row = self._model.block_of(number)
+        return BLOCK if self._model.draws_last else BLOCK - row
+
+    def width(self, members: int) -> int:
+        return members * self._model.settings.components
+
+    def channels(self, frames: Sequence[SceneAt]) -> BatchChannels:
+        first = frames[0].scene
+        transmitters, receivers = antennas(first, "tx"), antennas(first, "rx")
+        sights = [self._model.sight(at.scene, transmitters, receivers) for at in frames]
+        near = np.array([sight.near for sight in sights], np.bool_)
+        free = np.array([sight.free for sight in sights], np.bool_)
+        h, has_path = [], []
+        for pair in range(len(transmitters) * len(receivers)):
+            lines = [sight.lines[pair] for sight in sights]
+            amplitude, matrices = self._pair(lines, frames[0].number, free[:, pair])
+            apart = ~near[:, pair]
+            h.append(matrices if apart.all() else np.where(apart[:, None, None, None], matrices, 0.0))
+            has_path.append(amplitude.any(axis=-1) & apart[:, None])
+        return BatchChannels(h, np.stack(has_path, axis=2), free)
+
+    def _pair(
+        self, lines: Sequence[Line], number: int, free: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    ) -> tuple[Complex128Array, Complex128Array]:
+        """Amplitudes, Shape ``[M, K, C, L]``, and H of a pair, Shape ``[M, K, C, Nr, Nt]``."""
+        model, tx, rx = self._model, lines[0].tx, lines[0].rx
+        made = model.components(self._drawn(tx.name, rx.name, number, len(lines)), free)
+        phase = np.array([line.phase for line in lines])[..., None]
+        parts = times((made.amplitude[..., 0], made.amplitude[..., 1]), (phase[:, :, 0], phase[:, :, 1]))
+        amplitude = np.empty(parts[0].shape, np.complex128)
+        amplitude.real, amplitude.imag = parts
+        turn = np.moveaxis(made.turn, -1, 0)
+        outwards, inwards = ([getattr(line, end) for line in lines] for end in ("outwards", "inwards"))
+        departures = _local(outwards, turn[:4], [line.tx_pose for line in lines])
+        arrivals: Float64Array | None = None
+        if rx.array.size > 1 or model.has_path_gain:
+            arrivals = _local(inwards, turn[4:], [line.rx_pose for line in lines])
+        if model.has_path_gain and arrivals is not None:
+            patterns = model.pattern_gain(tx.array, departures, rx.array, arrivals)
+            # Of two devices at one place there is no gain, and no path.
+            length = np.array([line.length or 1.0 for line in lines])[:, None]
+            tau = np.array([line.delay for line in lines])[:, None] + made.excess
+            amplitude *= model.path_gain(length, patterns, tau)
+        transmit = steering_vector(tx.array, departures)
+        receive = None
+        if rx.array.size > 1 and arrivals is not None:
+            receive = steering_vector(rx.array, arrivals)
+        return amplitude, superposed_waves(amplitude, transmit, receive)
+
+    def _drawn(self, tx: str, rx: str, number: int, count: int) -> Draws:
+        """Draws of all members in some frames of a block, Shape ``[M, K]`` in place of ``[F]``."""
+        model = self._model
+        block, row = model.block_of(number)
+        if block != self._block:
+            self._draws.clear()
+            self._block = block
+        drawn = self._draws.get((tx, rx))
+        if drawn is None:
+            members = [model.draws(*member, (tx, rx), block) for member in self._members]
+            drawn = Draws(*[np.stack(field) for field in zip(*members, strict=True)])
+            self._draws[tx, rx] = drawn
+        # Draws that last an episode are one row, which is that of every frame.
+        rows = slice(None) if model.draws_last else slice(row, row + count)
+        return Draws(
+            gain=drawn.gain[:, rows],
+            excess=drawn.excess[:, rows],
+            excess_free=drawn.excess_free[:, rows],
+            deviation=drawn.deviation[:, rows],
+        )
+
+
+def _local(lines: Sequence[Sequence[float]], turn: Float64Array, poses: Sequence[Pose]) -> Float64Array:
+    """Directions of waves in the axes of a device.
+
+    Args:
+        lines: Of each frame, as `turned` takes them.
+        turn: Deviations, Shape ``[4, M, K, L]``.
+        poses: Of the device in each frame.
+
+    Returns:
+        Unit vectors, Shape ``[M, K, L, 3]``.
+    """
+    of_line = np.array(lines).T[..., None]
+    orientation = np.array([pose.orientation for pose in poses]).T[..., None]
+    vectors = turned(tuple(of_line), tuple(turn))
+    return np.stack(unrotated(tuple(orientation), vectors), axis=-1)

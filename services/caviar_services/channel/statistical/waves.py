@@ -1,7 +1,7 @@
 """Multipath of the channel ``geometric``: its formulas, and its settings.
 
 The service computes one frame as plain numbers: a pair has a handful of waves, and an array of three costs as
-much as ten numbers. Many episodes are computed as arrays (`caviar_services.channel.statistical.batch`). Both
+much as ten numbers. Many episodes are computed as arrays (`geometric`). Both
 use the formulas of this module, which take either, and agree bit by bit: what is done frame by frame is sums
 and products alone, in one order. Sines and exponentials are those of the draws, taken for a block of frames
 at once, and those of the straight line, which are numbers in both.

@@ -10,10 +10,15 @@ from caviar_protocol.seeding import generator
 from caviar_protocol.space.coordinates import Pose, Vector
 from caviar_protocol.topics.scene import LEFT_GEOFENCE_PREFIX
 from caviar_services.world.base import ObjectState
-from caviar_services.world.quadrotor.contacts import Contact, ball_contact, box_contact, scenery_contact
+from caviar_services.world.quadrotor.control import COLLIDED, ENERGY, Order, QuadrotorState
 from caviar_services.world.quadrotor.flyer import SLICE_NS, Quadrotor
-from caviar_services.world.quadrotor.state import COLLIDED, ENERGY, Order, QuadrotorState
-from caviar_services.world.quadrotor.wind import NOISES
+from caviar_services.world.quadrotor.surroundings import (
+    NOISES,
+    Contact,
+    ball_contact,
+    box_contact,
+    scenery_contact,
+)
 from caviar_space.obstacles import Obstacles
 
 # Scripted objects are looked up at these instants [ns], and move in straight lines between them.

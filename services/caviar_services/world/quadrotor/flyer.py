@@ -16,17 +16,27 @@ from itertools import accumulate, pairwise
 from caviar_protocol.space.coordinates import Vector, euler_from_quaternion, quaternion_from_euler
 from caviar_services.world.flight_dynamics import LIMITED_SPEED, STOPPED_BY_GEOFENCE, Limits
 from caviar_services.world.quadrotor.airframe import Airframe, Body, Plant, Rotors
-from caviar_services.world.quadrotor.contacts import GROUND, SCENERY, Contact, OnCollision, answered
-from caviar_services.world.quadrotor.control import Attitude, Autopilot, Controller, braking_speed
-from caviar_services.world.quadrotor.state import (
+from caviar_services.world.quadrotor.control import (
     BATTERY_EMPTY,
     BATTERY_LOW,
     HOVER,
+    Attitude,
+    Autopilot,
     Battery,
+    Controller,
     Order,
     QuadrotorState,
+    braking_speed,
 )
-from caviar_services.world.quadrotor.wind import Gusts, Wind
+from caviar_services.world.quadrotor.surroundings import (
+    GROUND,
+    SCENERY,
+    Contact,
+    Gusts,
+    OnCollision,
+    Wind,
+    answered,
+)
 
 SLICE_NS = 10_000_000
 """[ns]"""

@@ -1,1 +1,0 @@
-"""Earlier name of `caviar_broker.http`."""
