@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +15,17 @@ from caviar_formats.parquet import CONVENTIONS, Parquet, column_list, user_table
 from caviar_protocol.digest import file_digest
 
 _TYPES = {"bool": "sc:Boolean", "string": "sc:Text", "double": "sc:Float", "float": "sc:Float"}
-_CONTEXT = {
+# Of Croissant 1.0, by the terms that are used here.
+_TERMS = ("column", "extract", "field", "fileObject", "includes", "recordSet", "repeated", "source")
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
     "@vocab": "https://schema.org/",
     "sc": "https://schema.org/",
     "cr": "http://mlcommons.org/croissant/",
     "dct": "http://purl.org/dc/terms/",
     "conformsTo": "dct:conformsTo",
-    "recordSet": "cr:recordSet",
-    "field": "cr:field",
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "source": "cr:source",
-    "fileSet": "cr:fileSet",
-    "fileObject": "cr:fileObject",
-    "includes": "cr:includes",
-    "extract": "cr:extract",
-    "column": "cr:column",
-    "repeated": "cr:repeated",
-}
+} | {term: f"cr:{term}" for term in _TERMS}
 
 
 class HuggingFace(Parquet):
@@ -38,7 +33,7 @@ class HuggingFace(Parquet):
 
     def readme(self, users: Users) -> str:
         configs = "".join(
-            f"- config_name: {table}\n  data_files: {table}/*.parquet\n" for table in ("users", "scenes")
+            f"- config_name: {table}\n  data_files: {table}.parquet\n" for table in ("users", "scenes")
         )
         return f"""---
 configs:
@@ -60,46 +55,46 @@ users = load_dataset("PATH OF THIS FOLDER", "users", split="train")
 """
 
     def finish(self, users: Users, folder: Path) -> None:
-        tables = {table: sorted((folder / table).glob("*.parquet")) for table in ("users", "scenes")}
-        described: dict[str, Any] = {
+        records = []
+        for table in ("users", "scenes"):
+            schema = _joined(folder / table, folder / f"{table}.parquet")
+            records.append(_record_set(table, schema))
+        described = {
             "@context": _CONTEXT,
             "@type": "sc:Dataset",
             "conformsTo": "http://mlcommons.org/croissant/1.0",
             "name": users.dataset.name,
             "description": f"{len(users.dataset)} episodes of CAVIAR",
-            "distribution": [
-                part for table, files in tables.items() for part in _distribution(folder, table, files)
-            ],
-            "recordSet": [
-                _record_set(table, parquet.read_schema(files[0])) for table, files in tables.items()
-            ],
+            "distribution": [_file_object(file) for file in sorted(folder.glob("*.parquet"))],
+            "recordSet": records,
         }
         (folder / "croissant.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
 
 
-def _distribution(folder: Path, table: str, files: list[Path]) -> list[dict[str, Any]]:
-    """Files of a table, each with its digest, and the set of them."""
-    objects: list[dict[str, Any]] = [
-        {
-            "@type": "cr:FileObject",
-            "@id": str(file.relative_to(folder)),
-            "name": str(file.relative_to(folder)),
-            "contentUrl": str(file.relative_to(folder)),
-            "contentSize": f"{file.stat().st_size} B",
-            "encodingFormat": "application/x-parquet",
-            "sha256": file_digest(file),
-        }
-        for file in files
-    ]
-    together = {
-        "@type": "cr:FileSet",
-        "@id": f"{table}-files",
-        "name": f"{table}-files",
-        "containedIn": [{"@id": entry["@id"]} for entry in objects],
+def _joined(parts: Path, file: Path) -> pa.Schema:
+    """Join the parts of a table into one file, of which Croissant has the digest, and remove them.
+
+    Columns of numbers whose sizes differ from part to part say so in their metadata.
+    """
+    files = sorted(parts.glob("*.parquet"))
+    schema = pa.unify_schemas([parquet.read_schema(part) for part in files])
+    with parquet.ParquetWriter(file, schema, compression="zstd") as writer:
+        for part in files:
+            writer.write_table(parquet.read_table(part).cast(schema))
+    shutil.rmtree(parts)
+    return schema
+
+
+def _file_object(file: Path) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileObject",
+        "@id": file.name,
+        "name": file.name,
+        "contentUrl": file.name,
+        "contentSize": f"{file.stat().st_size} B",
         "encodingFormat": "application/x-parquet",
-        "includes": f"{table}/*.parquet",
+        "sha256": file_digest(file),
     }
-    return [*objects, together]
 
 
 def _record_set(table: str, schema: pa.Schema) -> dict[str, Any]:
@@ -108,16 +103,13 @@ def _record_set(table: str, schema: pa.Schema) -> dict[str, Any]:
     for column in schema:
         description, unit = (column.metadata[key].decode() for key in (b"description", b"unit"))
         is_list = pa.types.is_large_list(column.type)
-        kind = str(column.type.value_type if is_list else column.type)
-        fields.append(
-            {
-                "@type": "cr:Field",
-                "@id": f"{table}/{column.name}",
-                "name": f"{table}/{column.name}",
-                "description": f"{description} [{unit}]",
-                "dataType": _TYPES.get(kind, "sc:Integer"),
-                **({"repeated": True} if is_list else {}),
-                "source": {"fileSet": {"@id": f"{table}-files"}, "extract": {"column": column.name}},
-            }
-        )
+        field = {
+            "@type": "cr:Field",
+            "@id": f"{table}/{column.name}",
+            "name": f"{table}/{column.name}",
+            "description": f"{description} [{unit}]",
+            "dataType": _TYPES.get(str(column.type.value_type if is_list else column.type), "sc:Integer"),
+            "source": {"fileObject": {"@id": f"{table}.parquet"}, "extract": {"column": column.name}},
+        }
+        fields.append(field | ({"repeated": True} if is_list else {}))
     return {"@type": "cr:RecordSet", "@id": table, "name": table, "field": fields}
