@@ -39,6 +39,8 @@ GROUPS = {
 }  # fmt: skip
 """Panel, place and help of groups that are imported when one of their commands is typed."""
 
+_OWN_PANELS = {"caviar_labs": LABORATORIES, "caviar_formats": DATASETS}
+
 FORMER = {
     "generate": "dataset generate", "look": "dataset look", "verify": "dataset verify",
     "tables": "dataset tables", "train": "policy train", "evaluate": "policy evaluate",
@@ -119,7 +121,7 @@ def added_command(name: str) -> Any:
     points = added().get(name)
     if points is None:
         return None
-    panel = LABORATORIES if _is_own(points[0]) else PLUG_INS
+    panel = _OWN_PANELS.get(points[0].module.partition(".")[0], PLUG_INS)
     sources = " and ".join(f"{p.value} of {p.dist.name} {p.dist.version}" for p in points if p.dist)
     if len(points) > 1:
         return _refusing(name, panel, f"{name} is {sources}; uninstall one of them")
