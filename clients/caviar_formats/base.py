@@ -94,6 +94,7 @@ class Format(ABC):
 
 FORMATS: Mapping[str, str] = {
     "huggingface": "caviar_formats.huggingface:HuggingFace",
+    "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
     "parquet": "caviar_formats.parquet:Parquet",
     "sionna": "caviar_formats.sionna:Sionna",
