@@ -119,6 +119,9 @@ class Itu(Format):
         rays, order = self._rays(users, vehicles["yaw"])
         valid = users["valid"] & (_within(vehicles, self._grid) if self._grid else True)
         rays[~valid] = np.nan
+        interactions = {}
+        if self.flavour == "full":
+            interactions = _interactions(users, order, self._slots, valid)
         with self._shard(folder, "rows", number, "csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows(_rows(users, vehicles, receivers, valid, rays))
         for episode in np.unique(users["episode"]).tolist():
@@ -128,9 +131,8 @@ class Itu(Format):
                 raw / f"ray_tracing_data_{self._set}_carrier{self._ghz}GHz" / RAYS_FILE.format(episode)
             )
             _write_hdf5(rays_file, {"allEpisodeData": self._filled(at, rays[mine], np.nan)})
-            if self.flavour == "full":
-                found = _interactions(users[mine], order[mine], self._slots, valid[mine])
-                arrays = {name: self._filled(at, values, -1) for name, values in found.items()}
+            if interactions:
+                arrays = {name: self._filled(at, rows[mine], -1) for name, rows in interactions.items()}
                 _write_hdf5(rays_file.with_name(f"{rays_file.stem}_interactions.hdf5"), arrays)
             if grid is not None:
                 cells = self._filled(at, grid[mine], 0)
