@@ -3,35 +3,50 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import ClassVar
 
 import msgspec
+import numpy as np
 
-from caviar_clients.datasets.user_rows import Users
+from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_clients.files import writing
-from caviar_protocol.errors import RunError, suggestion
+from caviar_protocol.errors import RecordingError, RunError, suggestion
 from caviar_protocol.files import replace_file
 from caviar_protocol.plugins import plugin_class, plugins
 
 FORMAT_PLUGINS = "caviar.formats"
 """Group of entry points, each a subclass of `Format`, named as the format is."""
 
-EPISODES = 64
-"""Episodes of a part."""
+SCENES = 64
+"""Scenes of a part: its memory is that of an export of any size."""
 
 STATE = ".export.json"
 """File in a folder that is being written: which export it is, and how many of its parts are there."""
 
 
-class Format(ABC):
+@dataclass(frozen=True)
+class Part:
+    """Part of an export: some consecutive scenes."""
+
+    number: int
+    """From 0."""
+    users: Users
+    """Of these scenes."""
+    scenes: Columns
+    """Rows of the catalogue's table of scenes."""
+
+
+class Format:
     """A format of datasets.
 
-    An export is written in parts of some episodes each, in the memory of one part. A part that a kill cut off
-    is written again, so that `write` replaces what is there.
+    An export is written in parts of some scenes each, in the memory of one part. A part that a kill cut off
+    is written again, so that `write` replaces what is there. A format reads columns of the catalogue and
+    recorded arrays (`Users`, `TopicArrays`); it decodes nothing of the wire.
 
     Args:
         flavour: One of `flavours`; empty: the first.
@@ -42,6 +57,10 @@ class Format(ABC):
 
     flavours: ClassVar[Mapping[str, str]] = {}
     """Variants of the format by name, with what each is; the first is the default."""
+    needs: ClassVar[Sequence[str]] = ()
+    """Recorded arrays without which there is no export: ``channel.a``."""
+    whole_episodes: ClassVar[bool] = False
+    """Whether no part ends within an episode, whose scenes share a file."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -51,7 +70,7 @@ class Format(ABC):
             raise RunError(f"--flavour {flavour!r}: {known}")
         self.flavour = flavour or next(iter(self.flavours), "")
 
-    def begin(self, users: Users) -> None:  # noqa: B027 - most formats need no look
+    def begin(self, users: Users) -> None:
         """Look at the whole before its first part, also where an export is continued.
 
         Args:
@@ -62,20 +81,19 @@ class Format(ABC):
             RunError: The format cannot hold what the dataset has; names it.
         """
 
-    @abstractmethod
-    def write(self, users: Users, folder: Path, number: int) -> None:
-        """Write the files of some episodes.
+    def write(self, part: Part, folder: Path) -> None:
+        """Write the files of some scenes.
 
         Args:
-            users: Of these episodes; ``users.dataset`` has the episodes alone.
+            part: The scenes.
             folder: Of the export.
-            number: Of the part, from 0.
 
         Raises:
             RecordingError, RunError: As of `begin`.
         """
+        raise RunError(f"datasets are imported from {type(self).__name__}, not exported to it")
 
-    def finish(self, users: Users, folder: Path) -> None:  # noqa: B027 - parts are all there is to most
+    def finish(self, users: Users, folder: Path) -> None:
         """Write what only the whole says, once all parts are there.
 
         Args:
@@ -83,44 +101,43 @@ class Format(ABC):
             folder: Of the export, with the files of all parts.
         """
 
-    @abstractmethod
     def readme(self, users: Users) -> str:
         """Describe the files, with shapes, units, conventions, and how they are opened, in Markdown.
 
         Args:
             users: All users of the export.
         """
+        return f"# {users.dataset.name}\n\n{type(self).__doc__ or ''}"
 
 
 FORMATS: Mapping[str, str] = {
-    "huggingface": "caviar_formats.huggingface:HuggingFace",
+    "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
     "parquet": "caviar_formats.parquet:Parquet",
-    "sionna": "caviar_formats.sionna:Sionna",
+    "sionna": "caviar_formats.npz:Sionna",
 }
 """Places of the formats that come with this distribution, by name."""
 
 
-def find_format(name: str, flavour: str = "") -> Format:
+def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     """Find a format by its name.
 
     Args:
         name: Of `FORMATS` or of a plug-in.
         flavour: Of the format; empty: its first.
+        option: That has the name, for an error.
 
     Raises:
         RunError: There is no such format, or it has no such flavour; names those there are.
         DeclarationError: A plug-in cannot be loaded, or is no `Format`.
     """
-    if place := FORMATS.get(name):
-        found: type[Format] = resolve_name(place)
-        return found(flavour)
-    cls = plugin_class(FORMAT_PLUGINS, name, Format)  # type: ignore[type-abstract]  # compared, never made
+    place = FORMATS.get(name)
+    cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
     if cls is None:
-        known = [*FORMATS, *plugins(FORMAT_PLUGINS)]
-        raise RunError(f"--to {name!r} is no format; {suggestion(name, known)}")
-    return cls(flavour)
+        raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
+    found: Format = cls(flavour)
+    return found
 
 
 class _State(msgspec.Struct):
@@ -141,7 +158,7 @@ def export_users(
         users: Of a dataset, in its order.
         to: The format.
         out: Folder that is made; it may be there, and empty.
-        on_part: Called with the episodes that are written, and with all of them.
+        on_part: Called with the scenes that are written, and with all of them.
 
     Raises:
         RunError: The folder holds something, ``OUT.part`` is of another export, there is nothing to export,
@@ -150,25 +167,48 @@ def export_users(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there and not empty; choose another folder with --out")
-    dataset = users.dataset
     if not len(users):
-        raise RunError(f"{dataset.location} has no such users to export")
+        raise RunError(f"{users.dataset.location} has no such users to export; record scene and channel")
+    if lacking := [name for name in to.needs if name not in users.recorded()]:
+        users.check_names(lacking)
+        topics = ", ".join(sorted({f'"{name.partition(".")[0]}"' for name in to.needs}))
+        raise RecordingError(
+            f"{users.dataset.location} was recorded without {lacking[0]}: write {topics} into `record` below "
+            "[run] of the scenario, and generate it again"
+        )
     to.begin(users)
-    parts = [dataset.episodes[at : at + EPISODES] for at in range(0, len(dataset), EPISODES)]
+    parts = _parts(users, to.whole_episodes)
     folder = out.with_name(f"{out.name}.part")
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         state = _continued(folder, _identity(users, to))
-        for number, episodes in enumerate(parts):
-            if number >= state.done:
-                to.write(users.of(dataset.select(episodes)), folder, number)
-                state.done = number + 1
+        scenes = 0
+        for part in parts:
+            if part.number >= state.done:
+                to.write(part, folder)
+                state.done = part.number + 1
                 replace_file(folder / STATE, msgspec.json.encode(state), durable=False)
-            on_part(sum(map(len, parts[: number + 1])), len(dataset))
+            scenes += len(part.scenes)
+            on_part(scenes, len(users.dataset.table("scenes")))
         to.finish(users, folder)
         (folder / "README.md").write_text(_readme(users, to), encoding="utf-8")
         (folder / STATE).unlink()
         folder.replace(out)
+
+
+def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:
+    """Cut users into those of `SCENES` scenes each; both are sorted by episode and scene."""
+    scenes = users.dataset.table("scenes")
+    numbers = np.stack([scenes["episode"], scenes["scene"]], axis=1)
+    of_user = np.stack([users["episode"], users["scene"]], axis=1)
+    place = {key: at for at, key in enumerate(map(tuple, numbers.tolist()))}
+    at = np.array([place[key] for key in map(tuple, of_user.tolist())])
+    starts = np.arange(0, len(scenes), SCENES)
+    if whole_episodes:
+        starts = np.unique(np.searchsorted(scenes["episode"], scenes["episode"][starts]))
+    for number, (start, stop) in enumerate(pairwise([*starts.tolist(), len(scenes)])):
+        in_part = np.flatnonzero((at >= start) & (at < stop))
+        yield Part(number, users[in_part], scenes.where(np.arange(start, stop)))
 
 
 def _identity(users: Users, to: Format) -> str:
@@ -185,7 +225,8 @@ def _continued(folder: Path, export: str) -> _State:
     if not file.exists():
         if any(folder.iterdir()):
             raise RunError(f"{folder} is in the way, and no export that was cut off; remove it")
-        return _State(export)
+        # From the first part on: a kill during that one leaves an export that can be continued.
+        replace_file(file, msgspec.json.encode(_State(export)), durable=False)
     state = msgspec.json.decode(file.read_bytes(), type=_State)
     if state.export != export:
         raise RunError(

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from caviar_clients.datasets.user_rows import Columns, Users
-from caviar_formats.base import Format, markdown_table
+from caviar_formats.base import Format, Part, markdown_table
 from caviar_formats.itu_training import INPUTS, TRAINING, join_arrays, picture_inputs
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from caviar_protocol.errors import RunError
@@ -51,6 +51,8 @@ class Itu(Format):
         "full": "with phases, interactions and the SQLite database of rays",
         "baseline": "`raw_data` as of compat, and beside it `baseline_data`, which is ready for training",
     }
+    needs = ("channel.a", "channel.interactions")
+    whole_episodes = True
     loses = (
         "Transmit power, Doppler shifts, velocities; element patterns by themselves (the power of a ray has "
         "them); roll and pitch of receivers; points of LIDARs; the weakest of more than 100 rays."
@@ -111,7 +113,8 @@ class Itu(Format):
 
     # --- a part ------------------------------------------------------------------------------------------
 
-    def write(self, users: Users, folder: Path, number: int) -> None:
+    def write(self, part: Part, folder: Path) -> None:
+        users, number = part.users, part.number
         raw = self._raw(folder)
         (folder / SHARDS).mkdir(exist_ok=True)
         vehicles, receivers = _vehicles(users), _numbers(users)

@@ -30,7 +30,7 @@ ENTRY_POINT_GROUP = "caviar.commands"
 
 GROUPS = {
     "dataset": (
-        DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables, export."
+        DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."
     ),
     "policy": (
         POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."

@@ -140,6 +140,20 @@ class Users:
             if not _lacks(recording, topic, name)
         }
 
+    def readable(self) -> dict[str, str]:
+        """Recorded arrays, as of `recorded`, of which each user has one row: no sensors of which it has none
+        or several."""
+        found = self.recorded()
+        ends = zip(self["object_class"], self["rx"], strict=True)
+        kinds = np.array([f"{cls}/{rx.rpartition('/')[2]}" for cls, rx in ends])
+        some = self[np.sort(np.unique(kinds, return_index=True)[1])]
+        for topic in {name.partition(".")[0] for name in found}.intersection(SENSORS):
+            try:
+                some._recorded([next(name for name in found if name.startswith(f"{topic}."))])
+            except RecordingError:
+                found = {name: text for name, text in found.items() if not name.startswith(f"{topic}.")}
+        return found
+
     def __getitem__(self, name: str | slice | Sequence[int] | NDArray[Any]) -> Any:
         """A column, a recorded array, or with a slice, a mask or positions these users only.
 
@@ -161,14 +175,6 @@ class Users:
         except IndexError as error:
             raise IndexError(f"users[{_shown(name)}]: {error}; {has}, as a slice, list or mask") from None
         return Users(self._dataset, self._table.where(rows))
-
-    def of(self, dataset: Dataset) -> Users:
-        """Take the users of some of these episodes.
-
-        Args:
-            dataset: The episodes, as `Dataset.select` gives them.
-        """
-        return Users(dataset, self._table.where(np.isin(self._table["episode"], dataset.episodes)))
 
     def read(self, names: Sequence[str]) -> Columns:
         """Read several columns and recorded arrays at once, each scene once.
