@@ -15,8 +15,9 @@ import numpy as np
 
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_clients.files import writing
-from caviar_protocol.errors import RecordingError, RunError, suggestion
+from caviar_protocol.errors import RecordingError, RunError, SetupError, suggestion
 from caviar_protocol.files import replace_file
+from caviar_protocol.host import install_command
 from caviar_protocol.plugins import plugin_class, plugins
 
 FORMAT_PLUGINS = "caviar.formats"
@@ -131,9 +132,13 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     Raises:
         RunError: There is no such format, or it has no such flavour; names those there are.
         DeclarationError: A plug-in cannot be loaded, or is no `Format`.
+        SetupError: A package that it needs is not installed; the text has the command.
     """
     place = FORMATS.get(name)
-    cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
+    try:
+        cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
+    except ImportError as error:
+        raise SetupError(f"{option} {name} needs {error.name}: {install_command('formats')}") from error
     if cls is None:
         raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
     found: Format = cls(flavour)
