@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class Npz(Format):
         self._names = users.readable()
 
     def write(self, part: Part, folder: Path) -> None:
-        columns = part.users.read([*USER_COLUMNS, *self._names])
+        columns: dict[str, Any] = dict(part.users.read([*USER_COLUMNS, *self._names]))
         np.savez(folder / f"users-{part.number:05d}.npz", **columns)
 
     def readme(self, users: Users) -> str:
@@ -82,6 +83,7 @@ Paths that a user lacks have `a` = 0 and `tau` = 0. Elements of an array are num
 
 ```python
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sionna.phy.channel import CIRDataset

@@ -111,7 +111,7 @@ class ImpulseResponses:
 
     def _responses(self, users: Users, devices: Any, angles: Float64Array) -> Complex128Array:
         """Phases of the elements of one end, Shape ``[N, P, elements]``, by angles in world axes."""
-        turns = np.stack([rotation_matrix(q) for q in _orientations(users, devices)])
+        turns = np.stack([rotation_matrix(q.tolist()) for q in _orientations(users, devices)])
         local = np.einsum("uji,upj->upi", turns, unit_vectors(np.nan_to_num(angles)))
         return steering_vector(self._arrays[str(devices[0])], local)
 
