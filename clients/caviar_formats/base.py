@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import ClassVar
@@ -14,8 +15,9 @@ import numpy as np
 
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_clients.files import writing
-from caviar_protocol.errors import RecordingError, RunError, suggestion
+from caviar_protocol.errors import RecordingError, RunError, SetupError, suggestion
 from caviar_protocol.files import replace_file
+from caviar_protocol.host import install_command
 from caviar_protocol.plugins import plugin_class, plugins
 
 FORMAT_PLUGINS = "caviar.formats"
@@ -58,6 +60,8 @@ class Format:
     """Variants of the format by name, with what each is; the first is the default."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
+    whole_episodes: ClassVar[bool] = False
+    """Whether no part ends within an episode, whose scenes share a file."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -109,6 +113,7 @@ class Format:
 
 FORMATS: Mapping[str, str] = {
     "huggingface": "caviar_formats.parquet:HuggingFace",
+    "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
     "parquet": "caviar_formats.parquet:Parquet",
     "sionna": "caviar_formats.npz:Sionna",
@@ -127,9 +132,13 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     Raises:
         RunError: There is no such format, or it has no such flavour; names those there are.
         DeclarationError: A plug-in cannot be loaded, or is no `Format`.
+        SetupError: A package that it needs is not installed; the text has the command.
     """
     place = FORMATS.get(name)
-    cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
+    try:
+        cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
+    except ImportError as error:
+        raise SetupError(f"{option} {name} needs {error.name}: {install_command('formats')}") from error
     if cls is None:
         raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
     found: Format = cls(flavour)
@@ -173,7 +182,7 @@ def export_users(
             "[run] of the scenario, and generate it again"
         )
     to.begin(users)
-    parts = _parts(users)
+    parts = _parts(users, to.whole_episodes)
     folder = out.with_name(f"{out.name}.part")
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -192,16 +201,19 @@ def export_users(
         folder.replace(out)
 
 
-def _parts(users: Users) -> Iterator[Part]:
+def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:
     """Cut users into those of `SCENES` scenes each; both are sorted by episode and scene."""
     scenes = users.dataset.table("scenes")
     numbers = np.stack([scenes["episode"], scenes["scene"]], axis=1)
     of_user = np.stack([users["episode"], users["scene"]], axis=1)
     place = {key: at for at, key in enumerate(map(tuple, numbers.tolist()))}
     at = np.array([place[key] for key in map(tuple, of_user.tolist())])
-    for number, start in enumerate(range(0, len(scenes), SCENES)):
-        in_part = np.flatnonzero((at >= start) & (at < start + SCENES))
-        yield Part(number, users[in_part], scenes.where(np.arange(start, min(start + SCENES, len(scenes)))))
+    starts = np.arange(0, len(scenes), SCENES)
+    if whole_episodes:
+        starts = np.unique(np.searchsorted(scenes["episode"], scenes["episode"][starts]))
+    for number, (start, stop) in enumerate(pairwise([*starts.tolist(), len(scenes)])):
+        in_part = np.flatnonzero((at >= start) & (at < stop))
+        yield Part(number, users[in_part], scenes.where(np.arange(start, stop)))
 
 
 def _identity(users: Users, to: Format) -> str:

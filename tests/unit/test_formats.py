@@ -28,14 +28,14 @@ EPISODES, SCENES = 2, 3
 FREQUENCY_HZ = 28e9
 
 
-def generated(out: Path, scenario: str | Path) -> Dataset:
+def generated(out: Path, scenario: str | Path, episodes: int = EPISODES, scenes: int = SCENES) -> Dataset:
     """Generate a dataset in this process."""
     directory = DatasetDirectory(out)
-    plan = plan_dataset(load_scenario(str(scenario)), episodes=EPISODES, scenes=SCENES)
+    plan = plan_dataset(load_scenario(str(scenario)), episodes=episodes, scenes=scenes)
     with writing_dataset(directory):
         catalogue = Catalogue(directory.catalogue, writable=True)
-        catalogue.plan(plan.settings(), EPISODES)
-        for number in range(EPISODES):
+        catalogue.plan(plan.settings(), episodes)
+        for number in range(episodes):
             result = play_episode(EpisodeTask(plan.scenario, number, str(out)))
             assert result.rows is not None, result.error
             catalogue.add(result.rows, result.measured)

@@ -32,6 +32,7 @@ GROUPS = {
     "dataset": (
         DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."
     ),
+    "scene": (RUN, "caviar_clients.cli.scene:app", "Scenes of other programs: import, picture."),
     "policy": (
         POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."
     ),
