@@ -43,7 +43,7 @@ count = 0
 for package in {PACKAGES!r}:
     root = importlib.import_module(package)
     for module in pkgutil.walk_packages(root.__path__, package + "."):
-        if ".testing" in module.name or module.name.endswith("__main__"):
+        if module.name.endswith("__main__") or module.name.split(".")[1:2] == ["testing"]:
             continue  # the conformance tests are for pytest; __main__ runs
         importlib.import_module(module.name)
         count += 1
