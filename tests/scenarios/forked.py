@@ -1,7 +1,8 @@
 """Programs of `python -m MODULE` as forks of a process that has imported what they need.
 
-Tests start some hundred services and gateways; to start Python and to import takes most of their time. A
-fork is a process of its own, with its own sockets and signals, and a child of the process of the tests.
+Tests start some thousand brokers, services and gateways; to start Python and to import takes most of their
+time. A fork is a process of its own, with its own sockets and signals, and a child of the process that asks
+for it: the tests', or that of ``caviar run`` for the broker and services of its run.
 
 ``python forked.py MODULE …`` imports the modules and forks for each order on its standard input, a socket.
 """
@@ -10,15 +11,19 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import fcntl
 import functools
 import gc
 import importlib
+import itertools
 import json
 import os
 import runpy
 import socket
 import subprocess
 import sys
+import threading
+import types
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +31,19 @@ _NAME, _SUBREAPER = 15, 36
 """``PR_SET_NAME`` and ``PR_SET_CHILD_SUBREAPER`` of prctl(2): orphans below a process become its children."""
 _LARGEST = 1 << 20
 """[byte] of an order: environments are the largest part."""
+_OF_A_RUN = "caviar_clients.cli.launch"
+"""Module that starts the broker and the services of a run."""
+MARK = "CAVIAR_TEST_RUN"
+"""Environment variable by which the processes of a command are found (`scenarios_support.marked`)."""
 
 
 class Forked(subprocess.Popen[Any]):
-    """`subprocess.Popen` of ``[python, "-m", MODULE, …]``, with a fork in place of a new interpreter.
+    """`subprocess.Popen` of ``[python, …, "-m", MODULE, …]``, with a fork in place of a new interpreter.
 
     Args:
-        command: Whose first word is not looked at.
+        command: Whose interpreter is not looked at.
         preload: Modules that a process imports beforehand that is shared by all with the same ones.
-        more: Pipes, text and environment, as for `subprocess.Popen`.
+        more: Pipes, text, environment, session and descriptors, as for `subprocess.Popen`.
     """
 
     def __init__(self, command: list[str], preload: tuple[str, ...], **more: Any) -> None:
@@ -42,34 +51,33 @@ class Forked(subprocess.Popen[Any]):
         super().__init__(command, **more)
 
     def _execute_child(self, args: Any, *given: Any) -> None:
-        cwd, env = given[4:6]
-        in_read, in_write, out_read, out_write, error_read, error_write = given[9:15]
+        passed, cwd, env, session = sorted(given[3]), *given[4:6], given[20]
+        in_read, _, _, out_write, _, error_write = given[9:15]
         order = {
-            "argv": [str(word) for word in args[2:]],
+            "options": args[1 : args.index("-m")],
+            "argv": [str(word) for word in args[args.index("-m") + 1 :]],
             "cwd": str(cwd or Path.cwd()),
             "env": dict(os.environ if env is None else env),
+            "session": session,
+            "passed": passed,
         }
         inner = [fd if fd != -1 else number for number, fd in enumerate((in_read, out_write, error_write))]
         prctl = ctypes.CDLL(None).prctl
         nursery = _nursery(self._preload)
         prctl(_SUBREAPER, 1, 0, 0, 0)
         try:
-            socket.send_fds(nursery, [json.dumps(order).encode()], inner)
+            socket.send_fds(nursery, [json.dumps(order).encode()], [*inner, *passed])
             self.pid = int(nursery.recv(64))
         finally:
             prctl(_SUBREAPER, 0, 0, 0, 0)
         self._child_created = True
-        for ours, theirs in ((in_write, in_read), (out_read, out_write), (error_read, error_write)):
-            if ours != -1:
-                os.close(theirs)
+        self._close_pipe_fds(*given[9:15])
 
 
 @functools.cache
 def _nursery(preload: tuple[str, ...]) -> socket.socket:
     """Socket of a process that forks; it ends with the socket."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    for end in (ours, theirs):
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _LARGEST)
+    ours, theirs = _sockets()
     process = subprocess.Popen(
         [sys.executable, __file__, *preload],
         stdin=theirs,
@@ -86,12 +94,55 @@ def _nursery(preload: tuple[str, ...]) -> socket.socket:
     return ours
 
 
+def _sockets() -> tuple[socket.socket, socket.socket]:
+    """Two connected ends, each of which takes the largest order."""
+    ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    for end in ends:
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _LARGEST)
+    return ends
+
+
+def _fork_processes_of_runs() -> None:
+    """Fork the broker and the services of this command's runs, too.
+
+    They have to be its children. So this process, before it has threads, forks the one that they come from.
+    """
+    ours, theirs = _sockets()
+    if os.fork() == 0:
+        os.setsid()  # Ctrl-C of a terminal, which a test sends to a group, is not for it
+        ours.close()
+        null = os.open(os.devnull, os.O_RDWR)
+        for target in range(3):
+            os.dup2(null, target)
+        ctypes.CDLL(None).prctl(_NAME, b"nursery", 0, 0, 0)
+        _attend(theirs)
+        sys.exit()  # of this process and of its forks, and not what the command does
+    theirs.close()
+    global _nursery
+    _nursery = lambda preload: ours  # noqa: E731
+    importlib.import_module(_OF_A_RUN).subprocess = forking()
+
+
+def forking(preload: tuple[str, ...] = ()) -> types.SimpleNamespace:
+    """Module `subprocess` with forks in place of processes: what a test gives the launcher."""
+
+    def start(command: list[str], **more: Any) -> subprocess.Popen[Any]:
+        return Forked(command, preload, **more)
+
+    return types.SimpleNamespace(**vars(subprocess) | {"Popen": start})
+
+
 def _become(order: dict[str, Any], fds: list[int]) -> None:
     """Run the program of an order as the interpreter would."""
     ctypes.CDLL(None).prctl(_NAME, b"forked", 0, 0, 0)
-    for target, fd in enumerate(fds):
+    if order["session"]:
+        os.setsid()
+    targets = [0, 1, 2, *order["passed"]]
+    fds = [fcntl.fcntl(fd, fcntl.F_DUPFD, targets[-1] + 1) for fd in fds]
+    for target, fd in zip(targets, fds, strict=True):
         os.dup2(fd, target)
-    os.closerange(3, 1 << 12)
+    for below, above in itertools.pairwise([*targets, 1 << 12]):
+        os.closerange(below + 1, above)
     before = set(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
     os.chdir(order["cwd"])
     os.environ.clear()
@@ -99,7 +150,24 @@ def _become(order: dict[str, Any], fds: list[int]) -> None:
     wanted = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     sys.path[1:1] = [folder for folder in wanted if folder not in before]
     module, *sys.argv[1:] = order["argv"]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    if mark := os.environ.get(MARK):
+        # Linux shows the environment and the words with which a program was executed, which a fork was not.
+        os.memfd_create(f"{MARK}={mark} {' '.join(order['argv'])}"[:200])
+    if module == "caviar_clients" and _OF_A_RUN in sys.modules:
+        _fork_processes_of_runs()
+    if "-P" in order["options"]:
+        del sys.path[0]
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if end.code is not None and not isinstance(end.code, int):
+            raise  # a message is printed, and the status is 1
+        # To free what the process before it has loaded takes longer than most programs.
+        threading._shutdown()
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(end.code or 0)
 
 
 def main() -> None:
@@ -111,8 +179,13 @@ def main() -> None:
         importlib.import_module(module)
     gc.collect()
     gc.freeze()
+    _attend(orders)
+
+
+def _attend(orders: socket.socket) -> None:
+    """Fork for each order; a fork returns when its program has."""
     while True:
-        text, fds, *_ = socket.recv_fds(orders, _LARGEST, 3)
+        text, fds, *_ = socket.recv_fds(orders, _LARGEST, 16)
         if not text:
             return
         read_end, write_end = os.pipe()

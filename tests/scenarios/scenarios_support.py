@@ -16,12 +16,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from forked import Forked
+from forked import MARK, Forked
 
 ROOT = Path(__file__).parents[2]
 SCENARIOS = ROOT / "deploy" / "caviar_scenarios"
 HERE = Path(__file__).parent
-MARK = "CAVIAR_TEST_RUN"
 PATIENCE = 4
 PRELOAD = (
     "caviar_clients.cli.main",
@@ -29,8 +28,22 @@ PRELOAD = (
     "caviar_clients.cli.launch",
     "caviar_clients.cli.recordings",
     "caviar_clients.session.embedded",
+    "caviar_broker.launch",
+    "caviar_services.runner",
+    "caviar_services.agent.baselines",
+    "caviar_services.channel.statistical.free_space",
+    "caviar_broker.policies",
+    "caviar_services.link.beam_scores",
+    "caviar_services.link.beams",
+    "caviar_services.recorder.mcap",
+    "caviar_services.world.trajectory",
+    "lz4.frame",
+    "mcap.writer",
+    "numpy.ma",
+    "pydantic.main",
+    "pydantic.type_adapter",
 )
-"""What the command imports in most runs."""
+"""What the command, the broker and the services import in most runs."""
 
 
 @dataclass
@@ -149,11 +162,17 @@ def marked(mark: str) -> list[str]:
         if not folder.name.isdigit() or int(folder.name) == os.getpid():
             continue
         try:
-            alive = f"{MARK}={mark}".encode() in (folder / "environ").read_bytes()
-            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            if (folder / "comm").read_text() == "forked\n":
+                links = (str(link.readlink()) for link in (folder / "fd").iterdir())
+                stated = (link.partition(f"memfd:{MARK}={mark} ")[2] for link in links)
+                command = next(filter(None, stated), "")
+            elif f"{MARK}={mark}".encode() in (folder / "environ").read_bytes():
+                command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            else:
+                continue
         except OSError:
             continue
-        if alive:
+        if command:
             found.append(f"{folder.name} {command}")
     return found
 

@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 from broker_harness import MS, plan, playing
+from forked import Forked
+from scenarios_support import PRELOAD
 
 from caviar_broker.control.launcher import MAX_PENDING, Outbox, Reporter
 from caviar_broker.core.events import FrameFinished, Notice
@@ -194,7 +196,7 @@ def broker(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A broker process under control of this test."""
     command = [sys.executable, "-m", "caviar_broker", str(SMOKE), "--bind", "tcp://127.0.0.1:0"]
     command += ["--directory", str(tmp_path / "run"), "--control"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as process:
+    with Forked(command, PRELOAD, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as process:
         try:
             assert process.stdout is not None
             assert json.loads(process.stdout.readline())["event"] == "listening"

@@ -15,6 +15,8 @@ from typing import Any
 
 import msgspec
 import pytest
+from forked import Forked, forking
+from scenarios_support import PRELOAD
 
 from caviar_clients.cli import launch
 from caviar_clients.cli.launch import TAIL, Child, Launcher
@@ -27,6 +29,12 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "caviar_scenarios" / "smoke.toml"
+
+
+@pytest.fixture(autouse=True)
+def _forks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Broker and services are forks of a process that has imported them."""
+    monkeypatch.setattr(launch, "subprocess", forking(PRELOAD))
 
 
 def launcher(tmp_path: Path, frames: int = 10, extra: str = "", **values: Any) -> Launcher:
@@ -105,7 +113,7 @@ def test_the_folder_of_a_run_that_was_killed_goes_with_the_next_run(
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     command = [sys.executable, "-m", "caviar_clients", "run", str(SMOKE), "--frames", "1000000"]
-    killed = subprocess.Popen([*command, "--out", str(tmp_path / "runs")], stdout=subprocess.DEVNULL)
+    killed = Forked([*command, "--out", str(tmp_path / "runs")], PRELOAD, stdout=subprocess.DEVNULL)
     until = time.monotonic() + 20.0
     while not [*tmp_path.glob("runs/*/recording-*.mcap")]:
         assert time.monotonic() < until

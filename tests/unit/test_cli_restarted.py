@@ -11,6 +11,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from forked import Forked
+from scenarios_support import PRELOAD
 
 from caviar_clients.cli.remote import RunInProgress
 from caviar_protocol.host import VARIABLE, SignOfLife
@@ -63,8 +65,9 @@ def test_a_run_that_has_written_nothing_yet_is_not_resumed(tmp_path: Path) -> No
 
 def started(out: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "caviar_clients", "broker", str(SMOKE), "--restarted"]
-    return subprocess.Popen(
+    return Forked(
         [*command, "--out", str(out), "--bind", "tcp://127.0.0.1:0"],
+        PRELOAD,
         stdout=subprocess.PIPE,
         text=True,
         env=ENVIRONMENT,
@@ -100,7 +103,7 @@ def test_a_service_that_waits_for_its_broker_ends_with_status_0_when_told_to(tmp
     command = [sys.executable, "-m", "caviar_services", "agent", "--use", "agent:los-beam"]
     command += ["--broker", "tcp://127.0.0.1:9", "--connect-timeout", "60"]
     for options, status in ((["--restarted"], 0), ([], TERMINATED)):
-        with subprocess.Popen([*command, *options], env=ENVIRONMENT) as process:
+        with Forked([*command, *options], PRELOAD, env=ENVIRONMENT) as process:
             handled = Path(f"/proc/{process.pid}/status")
             until = time.monotonic() + 20
             while not int(handled.read_text().split("SigCgt:")[1].split()[0], 16) >> (signal.SIGTERM - 1) & 1:

@@ -185,20 +185,6 @@ def tables_command(
         print_line(console, file)
 
 
-@app.command("export")
-def export_command(
-    dataset: DatasetLocation,
-    to: Annotated[str, typer.Option(help="format, of an installed package")],
-    out: Annotated[Path, typer.Option(help="folder that is made")],
-) -> None:
-    """Write a dataset in the format of another program."""
-    from caviar_clients.datasets.formats import export_dataset, format_of
-    from caviar_clients.datasets.reader import Dataset
-
-    export_dataset(Dataset(dataset), format_of(to), out)
-    print_line(Console(), out)
-
-
 @app.command("look")
 def look_command(
     dataset: DatasetLocation,

@@ -1,0 +1,167 @@
+"""Impulse responses between antenna elements: the paths of each user, with the phases of both arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.recording import Recording
+from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
+from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
+from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_protocol.topics.scene import AntennaArray
+
+if TYPE_CHECKING:
+    from caviar_clients.datasets.user_rows import Users
+
+
+class ImpulseResponses:
+    """Impulse responses of users, as the ``cir_generator`` of Sionna's ``CIRDataset`` gives them.
+
+    Calling it yields for each user, in their order, ``(a, tau)``:
+
+    - ``a``, complex, Shape ``[1, Nr, 1, Nt, P, S]``: gain of each path between elements, with the phase of
+      the carrier, in each time step: H(Δf, Δt) = Σ a·exp(−j2πΔf·τ) is ``channel.hf`` but for the Doppler
+      shift of Δf, ν·Δf/f;
+    - ``tau``, float, Shape ``[1, 1, P]``: delay [s].
+
+    Paths that a user lacks are zeros: P is the same for all users, as that of the one that has most.
+
+    Args:
+        users: Of one shape of arrays, with ``channel`` and ``scene`` recorded.
+        time_steps: S.
+        sampling_frequency: [Hz] of the time steps, the first of which is the scene's instant.
+        paths: P; None: as many as the user with most has.
+
+    Raises:
+        RecordingError: Arrays differ between users, or have several polarizations or panels, whose paths have
+            amplitudes of their own that are not recorded.
+
+    Example:
+        >>> import caviar
+        >>> cir = caviar.dataset("data/s008").cir()  # doctest: +SKIP
+        >>> cir.shape  # doctest: +SKIP
+        {'num_rx': 1, 'num_rx_ant': 8, 'num_tx': 1, 'num_tx_ant': 64, 'num_paths': 43, 'num_time_steps': 1}
+    """
+
+    def __init__(
+        self, users: Users, time_steps: int = 1, sampling_frequency: float = 1.0, paths: int | None = None
+    ) -> None:
+        if time_steps < 1 or sampling_frequency <= 0.0:
+            raise ValueError(
+                f"time_steps {time_steps}, sampling_frequency {sampling_frequency}: both above 0"
+            )
+        self._users = users
+        self._times = np.arange(time_steps) / sampling_frequency
+        self._arrays = _arrays_of(users)
+        transmit, receive = (
+            _only({self._arrays[str(name)] for name in users[end]}, end, users) for end in ("tx", "rx")
+        )
+        self.shape: Mapping[str, int] = {
+            "num_rx": 1,
+            "num_rx_ant": receive.size,
+            "num_tx": 1,
+            "num_tx_ant": transmit.size,
+            "num_paths": int(users["paths"].max(initial=0)) if paths is None else paths,
+            "num_time_steps": time_steps,
+        }
+        """Sizes of ``a``, by the names of the arguments of ``CIRDataset``."""
+
+    def __len__(self) -> int:
+        """Number of users."""
+        return len(self._users)
+
+    def __call__(self) -> Iterator[tuple[Complex128Array, Float64Array]]:
+        for part in self._users.parts(256):
+            a, tau = self.block(part)
+            yield from zip(a[:, None, :, None], tau[:, None, None], strict=True)
+
+    def block(self, users: Users) -> tuple[Complex128Array, Float64Array]:
+        """Compute the responses of some of the users.
+
+        Args:
+            users: Of those that this was made of.
+
+        Returns:
+            ``a``, Shape ``[N, Nr, Nt, P, S]``, and ``tau`` [s], Shape ``[N, P]``.
+
+        Raises:
+            RecordingError: The channel is one in which arrays see spherical waves, or was not recorded.
+        """
+        names = ("a", "tau", "aod", "aoa", "doppler")
+        rows = users.read(["tx", "rx", *(f"channel.{name}" for name in names)])
+        found, paths = np.nan_to_num(rows["channel.a"]), self.shape["num_paths"]
+        transmit, receive = (
+            self._responses(users, rows[end], rows[angles])
+            for end, angles in (("tx", "channel.aod"), ("rx", "channel.aoa"))
+        )
+        shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
+        a = np.einsum("up,upm,upn,ups->umnps", found, receive, transmit, shifts, optimize=True)
+        missing = paths - found.shape[1]
+        return (
+            np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)]),
+            np.pad(np.nan_to_num(rows["channel.tau"]), [(0, 0), (0, missing)]),
+        )
+
+    def _responses(self, users: Users, devices: Any, angles: Float64Array) -> Complex128Array:
+        """Phases of the elements of one end, Shape ``[N, P, elements]``, by angles in world axes."""
+        turns = np.stack([rotation_matrix(q.tolist()) for q in _orientations(users, devices)])
+        local = np.einsum("uji,upj->upi", turns, unit_vectors(np.nan_to_num(angles)))
+        return steering_vector(self._arrays[str(devices[0])], local)
+
+
+def _orientations(users: Users, devices: Sequence[str]) -> Iterator[Float64Array]:
+    """Orientation of the device of each user in its scene, (w, x, y, z)."""
+    scenes: dict[tuple[int, int], Mapping[str, Float64Array]] = {}
+    for at in zip(users["episode"].tolist(), users["scene"].tolist(), devices, strict=True):
+        episode, scene, device = at
+        if (episode, scene) not in scenes:
+            recording = users.dataset.episode(episode)
+            poses = recording["scene"].select(episode=episode, frames=[scene]).devices
+            scenes[episode, scene] = dict(zip(poses.keys, poses.orientation[0], strict=True))
+        yield scenes[episode, scene][str(device)]
+
+
+def _arrays_of(users: Users) -> dict[str, AntennaArray]:
+    """Array of each device of these users, by the scenario of the dataset."""
+    specs = msgspec.convert(users.dataset.settings["scenario"].get("devices", ()), tuple[DeviceSpec, ...])
+    names = {str(name) for end in ("tx", "rx") for name in np.unique(users[end])}
+    return {name: spec.array or AntennaArray() for name in names for spec in specs if is_made_by(spec, name)}
+
+
+def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:
+    """The array that all users have at one end; one whose elements differ by their places alone."""
+    place = users.dataset.location
+    if len(arrays) != 1:
+        raise RecordingError(
+            f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
+            f"users[users[{end!r}] == NAME]"
+        )
+    (array,) = arrays
+    if len(array.polarizations) > 1 or array.panels:
+        raise RecordingError(
+            f"{place}: the arrays at {end} have several polarizations or panels, for which paths are not "
+            "recorded; use channel.hf or channel.h"
+        )
+    return array
+
+
+def check_plane_waves(recording: Recording) -> None:
+    """Check that arrays see plane waves, so that paths between reference points say all.
+
+    Raises:
+        RecordingError: They do not; names frame and rung.
+    """
+    channel = recording["channel"]
+    for frame, rung in zip(channel.frame, channel.rung, strict=True):
+        if rung and rung not in PLANE_WAVES:
+            raise RecordingError(
+                f"{recording.path}, frame {frame}: the channel is {rung}, in which each pair of elements has "
+                "paths of its own; use channel.hf or channel.h"
+            )
