@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import msgspec
 import numpy as np
@@ -19,6 +19,9 @@ from caviar_protocol.errors import RecordingError, RunError, SetupError, suggest
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_protocol.plugins import plugin_class, plugins
+
+if TYPE_CHECKING:
+    from caviar_formats.imports import Source
 
 FORMAT_PLUGINS = "caviar.formats"
 """Group of entry points, each a subclass of `Format`, named as the format is."""
@@ -60,7 +63,7 @@ class Format:
     """Variants of the format by name, with what each is; the first is the default."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
-    whole_episodes: ClassVar[bool] = False
+    whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
@@ -110,8 +113,20 @@ class Format:
         """
         return f"# {users.dataset.name}\n\n{type(self).__doc__ or ''}"
 
+    def read(self, path: Path) -> Source:
+        """Open files of the format, of which `import_dataset` makes a dataset.
+
+        Args:
+            path: File or folder.
+
+        Raises:
+            RunError: They are damaged, or none of the format; names file and place. So does their iterator.
+        """
+        raise RunError(f"datasets are exported to {type(self).__name__}, not imported from it")
+
 
 FORMATS: Mapping[str, str] = {
+    "deepmimo": "caviar_formats.deepmimo:DeepMimo",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
