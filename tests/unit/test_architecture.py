@@ -27,7 +27,7 @@ PACKAGES = (
 )
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
-    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb",
+    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "PIL", "pyproj",
 )  # fmt: skip
 
 IMPORT_EVERYTHING = f"""

@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
+from caviar_clients.datasets.plan import PRESETS, apply_preset
 from caviar_protocol.errors import AssetError
 from caviar_protocol.scenario import load_scenario
 from caviar_space.imported_scenes import Georeference, write_scene
@@ -80,7 +81,7 @@ POINTS = "".join(
     f"end_<location>\nis_transmitter {tx}\nis_receiver {rx}\nend_<points>\n"
     for name, rows, tx, rx in (
         ("Tx", ["746 560 4"], "yes", "no"),
-        ("Rx", ["777 455 3", "702 435 3"], "no", "yes"),
+        ("Rx", [f"777 {455 + 10 * number} 3" for number in range(10)], "no", "yes"),
     )
 )
 FILE = (
@@ -159,10 +160,14 @@ def test_a_project_becomes_scenery_with_its_materials_and_scenarios(project: Pat
     assert mobile.carriers[0].frequency_hz == 60e9
     assert [(d.name, d.position_m) for d in mobile.devices if d.role == "tx"] == [("tx", (746.0, 560.0, 4.0))]
     assert next(d for d in mobile.devices if d.role == "rx").yaw_deg == -90.0
-    assert [d.position_m for d in fixed.devices if d.role == "rx"] == [
-        (777.0, 455.0, 3.0),
-        (702.0, 435.0, 3.0),
-    ]
+    standing = [d.position_m for d in fixed.devices if d.role == "rx"]
+    assert standing == [(777.0, 455.0 + 10 * number, 3.0) for number in range(10)]
+    for preset in PRESETS.values():  # each takes one of the two
+        made = apply_preset(preset, {"mobile": mobile, "fixed": fixed}[preset.receivers])
+        receivers = [d for d in made.devices if d.role == "rx"]
+        assert sum(d.count for d in receivers) == 10
+        # Along a vehicle that turns, and north–south where the heading is kept.
+        assert {d.yaw_deg for d in receivers if d.on} <= {-90.0 if preset.arrays_turn else 0.0}
     with pytest.raises(AssetError, match="is there already"):
         run(str(project), "--out", str(out))
 

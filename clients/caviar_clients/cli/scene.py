@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from importlib import resources
@@ -19,6 +20,7 @@ from caviar_protocol.errors import AssetError
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import ImportedScene
+    from caviar_space.mitsuba_xml import SceneryShape
 
 app = typer.Typer()
 TEMPLATE = "new/imported.toml"
@@ -71,6 +73,78 @@ def import_command(
             )
 
 
+@app.command("picture")
+def picture_command(
+    scenario: Annotated[Path, typer.Argument(help="scenario with traffic by SUMO, by name or file")],
+    out: Annotated[Path, typer.Option(help="PNG that is written")] = Path("scene.png"),
+    frames: Annotated[int, typer.Option(min=1, help="frames of traffic, of which the last is drawn")] = 100,
+) -> None:
+    """Draw a scene from above: materials, lanes and traffic; count vehicles below roofs over all frames."""
+    from caviar_clients.plots.map import MapData, draw_site
+    from caviar_clients.plots.rays import covered_objects, footprints, lanes_of
+    from caviar_clients.session.prepared import prepare
+    from caviar_clients.session.scenes import simulated_scenes
+    from caviar_protocol.scenario import load_scenario
+    from caviar_protocol.scenario.rules import with_overrides
+    from caviar_space.materials import ObjectMaterials
+    from caviar_space.mitsuba_xml import find_scenery, read_scenery
+
+    found = simulated_scenes(scenario, prepare(with_overrides(load_scenario(scenario), frames=frames)))
+    description = find_scenery(found.assets)
+    channel = next((spec.settings for spec in found.services.values() if spec.role == "channel"), {})
+    foliage = ObjectMaterials({key: key for key in channel.get("foliage", {})})
+    by_label: dict[str, list[SceneryShape]] = {}
+    for shape in read_scenery(description).shapes if description else ():
+        what = "foliage" if foliage.material_for(shape.name) else _material_label(shape)
+        by_label.setdefault(what, []).append(shape)
+    drawn = {
+        label: footprints((shape.file, shape.to_world) for shape in shapes)
+        for label, shapes in by_label.items()
+    }
+    traffic = next(
+        (s.settings for s in found.services.values() if s.role == "world" and "net" in s.settings), {}
+    )
+    lanes = (
+        lanes_of(Path(traffic["net"]), traffic.get("offset_m", (0, 0, 0)), traffic.get("yaw_deg", 0.0))
+        if traffic
+        else []
+    )
+    last = found.instants[-1].scene
+    draw_site(
+        MapData(last, None, None, None, None, None, f"{found.name}, frame {frames - 1}"), drawn, lanes, out
+    )
+    names: set[str] = set()
+    seen, below = 0, dict[str, int]()
+    for instant in found.instants:
+        for name, count in covered_objects(
+            instant.scene, [d for label, d in drawn.items() if label != "foliage"]
+        ):
+            names.add(name)
+            seen += 1
+            if count:
+                below[name] = below.get(name, 0) + 1
+    console = Console()
+    print_line(console, f"{out}: {len(drawn)} materials, {len(lanes)} lanes, {len(last.names)} objects")
+    print_line(
+        console,
+        f"{len(names)} objects in {len(found.instants)} frames, {seen} positions: "
+        f"{sum(below.values())} below a roof{': ' + ', '.join(sorted(below)[:5]) if below else ''}",
+    )
+
+
+def _material_label(shape: SceneryShape) -> str:
+    """Name of a material with its constants for radio waves."""
+    given = dict(re.findall(r'name="(\w+)" value="([^"]+)"', shape.radio.xml)) if shape.radio else {}
+    known = {
+        "relative_permittivity": "ε {}",
+        "conductivity": "σ {} S/m",
+        "thickness": "{} m",
+        "type": "ITU {}",
+    }
+    said = ", ".join(text.format(given[key]) for key, text in known.items() if key in given)
+    return f"{shape.material or 'no material'} ({said})" if said else shape.material
+
+
 def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) -> dict[str, bytes]:
     """Content of the scenarios ``mobile.toml`` and ``fixed.toml``, and of SUMO's files, by path.
 
@@ -99,8 +173,7 @@ def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) 
     foliage = ""
     if any(piece.kind == "foliage" for piece in scene.pieces.values()):
         if scene.without_foliage_loss:
-            rates = ", ".join(f'"{carrier}" = 0.0' for carrier in carriers)
-            values = f'attenuation_db_per_m = {{ {rates} }}\nsource = "FoliageModel None of the study"\n'
+            values = 'attenuation_db_per_m = { "*" = 0.0 }\nsource = "FoliageModel None of the study"\n'
         else:
             values = (
                 '# attenuation_db_per_m = { … }, source = "…": see the Foliage section of topics/channel\n'
