@@ -40,3 +40,26 @@ def export_command(
         task = bar.add_task(f"{to}: scenes", total=None)
         export_users(users, form, out, lambda done, of: bar.update(task, completed=done, total=of))
     print_line(console, out)
+
+
+def import_command(
+    source: Annotated[Path, typer.Argument(metavar="FILE|DIR", help="files of another program")],
+    form: Annotated[
+        str,
+        typer.Option("--from", metavar="NAME", help="deepmimo, itu, p2m, or that of an installed package"),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the dataset, which is made")],
+    flavour: Annotated[str, typer.Option(help="variant of the format")] = "",
+) -> None:
+    """Make a dataset of the files of another program."""
+    from caviar_formats.base import find_format
+    from caviar_formats.imports import import_dataset
+
+    console = Console()
+    with progress_bar(console, "{task.completed}", transient=True) as bar:
+        task = bar.add_task(f"{form}: episodes", total=None)
+        found = find_format(form, flavour, "--from").read(source)
+        import_dataset(found, out, lambda done: bar.update(task, completed=done))
+    for text in filter(None, (found.lacks, found.assumed)):
+        print_line(console, text)
+    print_line(console, out)

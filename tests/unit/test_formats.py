@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,18 @@ import pytest
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.impulse_responses import placed_antennas
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.verification.verify import verify
 from caviar_formats.base import FORMATS, Format, export_users, find_format
+from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import RunError
-from caviar_protocol.scenario import load_scenario
+from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.topics import AntennaArray, AntennaDevice
 
 pytestmark = pytest.mark.slow
 
@@ -98,6 +104,7 @@ role = "tx"
 position_m = [3.0, -40.0, 12.0]
 yaw_deg = 70.0
 pitch_deg = 10.0
+roll_deg = 20.0
 array = { rows = 2, columns = 4 }
 
 [[devices]]
@@ -235,3 +242,193 @@ def test_a_run_is_exported_like_a_dataset(data: Dataset, tmp_path: Path) -> None
 def test_an_unknown_format_names_those_there_are() -> None:
     with pytest.raises(RunError, match="did you mean 'parquet'"):
         find_format("parkuet")
+
+
+DEVICES = (
+    AntennaDevice(
+        name="bs", role="tx", position=(0.0, 0.0, 10.0), orientation=(0.8, 0.1, -0.3, 0.51),
+        array=AntennaArray(rows=2, columns=4),
+    ),
+    AntennaDevice(name="u", role="rx", position=(30.0, 5.0, 1.5), array=AntennaArray(columns=3)),
+)  # fmt: skip
+
+
+def imported_scenes(gain: float = 1e-5) -> Iterator[ImportedScene]:
+    """Two episodes of two scenes, of three paths each, that belong to no scene in particular."""
+    for number in range(4):
+        draw = np.random.default_rng(number)
+        paths = Paths(
+            tx="bs", rx="u", los=number % 2 == 0, a=gain * (draw.normal(size=(1, 3)) + 1j),
+            tau=np.array([1.2e-7, 1.1e-7, 1.5e-7]), aod=draw.uniform(0.5, 2.0, (3, 2)),
+            aoa=draw.uniform(0.5, 2.0, (3, 2)), interactions=np.array([[1, 0], [0, 0], [2, 1]], np.uint8),
+        )  # fmt: skip
+        yield ImportedScene(episode=number // 2, scene=number % 2, devices=DEVICES, paths=[paths])
+
+
+def source_of(place: Path, scenes: Iterable[ImportedScene]) -> Source:
+    carriers = (Carrier(name="mm", frequency_hz=FREQUENCY_HZ),)
+    return Source(path=place, scenes=scenes, carriers=carriers, scenes_of_episode=2, lacks="no sensors")
+
+
+def test_an_imported_dataset_is_one_that_everything_takes(tmp_path: Path) -> None:
+    data = Dataset(import_dataset(source_of(tmp_path / "files", imported_scenes()), tmp_path / "data"))
+    assert list(verify(data.directory.path)) == []
+    users, right = data.users(), [scene.paths[0] for scene in imported_scenes()]
+    assert users["los"].tolist() == [paths.los for paths in right]
+    for at, paths in enumerate(right):
+        assert np.allclose(users["channel.tau"][at], paths.tau[[1, 0, 2]])
+        assert np.allclose(users["channel.a"][at], paths.a[0, [1, 0, 2]])
+        a, _ = users[at : at + 1].cir().block(users[at : at + 1])
+        assert nmse_db(a[0, ..., 0].sum(-1), users["channel.h"][at]) < -200
+    assert (users["tx_beam"] >= 0).all()
+    assert "channel" in data.episode(0).topics
+    assert "camera" not in data.episode(0).topics
+    assert data.episode(0).metadata.notes == ("no sensors",)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "said"),
+    [
+        (lambda: iter(()), "no scene"),
+        (lambda: islice(imported_scenes(), 3), r"episode 1 has scenes \[0\], and not 0 to 1"),
+        (lambda: imported_scenes(float("nan")), "episode 0: .*channel"),
+    ],
+)
+def test_an_import_that_fails_leaves_nothing(scenes: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=said):
+        import_dataset(source_of(tmp_path / "files", scenes()), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- DeepMIMO -----------------------------------------------------------------------------------------------
+
+
+def described_channels(folder: Path, shapes: Any, quaternions: Any) -> Any:
+    """H by the description of DeepMIMO 4 alone, in our order of elements, Shape ``[N, Nr, Nt]``."""
+    end = "_t000_tx000_r001.npz"
+    files = {file.name.removesuffix(end): np.load(file) for file in folder.glob(f"*{end}")}
+    table = {name: file[name] for name, file in files.items() if name != "user"}
+    gain = np.nan_to_num(10 ** (table["power"] / 20) * np.exp(1j * np.radians(table["phase"])))
+    out = []
+    for user, amplitudes in enumerate(gain):
+        responses = []
+        for name, (columns, rows), q in zip(
+            ("aoa", "aod"), shapes, (quaternions[0][user], quaternions[1][user]), strict=True
+        ):
+            theta, phi = np.nan_to_num(np.radians([table[f"{name}_el"][user], table[f"{name}_az"][user]]))
+            w, x, y, z = q
+            axes = np.array([
+                [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+                [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+            ])  # fmt: skip
+            along = axes @ [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+            places = [(c, rows - 1 - r) for c in range(columns) for r in range(rows)]
+            responses.append(np.exp(1j * np.pi * np.array(places) @ along))
+        out.append((responses[0] * amplitudes) @ responses[1].T)
+    return np.array(out)
+
+
+def test_a_reader_by_the_description_of_deepmimo_finds_h(data: Dataset, tmp_path: Path) -> None:
+    users, folder = data.users(), exported(data, "deepmimo", tmp_path) / "data"
+    poses = [[a.orientation for a in placed_antennas(users, end)] for end in ("rx", "tx")]
+    assert nmse_db(described_channels(folder, ((3, 1), (4, 2)), poses), users["channel.h"]) < -100
+    with np.load(folder / "inter_t000_tx000_r001.npz") as file:
+        assert (file["inter"][:, 0] == 0).tolist() == users["los"].tolist()
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_itself_finds_h(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    dm = pytest.importorskip("deepmimo")
+    users, out = data.users(), exported(data, "deepmimo", tmp_path, flavour)
+    dm.config("scenarios_folder", str(out))
+    loaded = (
+        [dm.load("data")] if flavour == "static" else [s for e in range(2) for s in dm.load(f"data_e{e:06d}")]
+    )
+    row = 0
+    for scene in loaded:
+        here = users[row : row + scene.n_ue]
+        row += scene.n_ue
+        turns = [[euler_deg(a.orientation) for a in placed_antennas(here, end)] for end in ("tx", "rx")]
+        parameters = dm.ChannelParameters(
+            bs_antenna={"shape": [4, 2], "rotation": turns[0][0]},
+            ue_antenna={"shape": [3, 1], "rotation": np.array(turns[1])},
+            ofdm={"subcarriers": 512, "bandwidth": 512e6, "selected_subcarriers": np.arange(4)},
+        )
+        h = np.asarray(scene.compute_channels(parameters)) * np.sqrt(512)
+        right = here["channel.hf"][:, 0, 4:].transpose(0, 2, 3, 1)
+        order = [(i % 4) * 2 + 1 - i // 4 for i in range(8)]
+        assert nmse_db(h, right[:, :, order]) < -60
+        assert scene.los.astype(bool).tolist() == here["los"].tolist()
+
+
+def euler_deg(q: Any) -> list[float]:
+    """Roll, pitch and yaw of a quaternion [°]."""
+    w, x, y, z = q
+    roll, yaw = (
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+    return [float(np.degrees(angle)) for angle in (roll, np.arcsin(2 * (w * y - z * x)), yaw)]
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    folder = exported(data, "deepmimo", tmp_path, flavour)
+    scenario = folder / ("data" if flavour == "static" else "data_e000001")
+    right = data.users() if flavour == "static" else data.select([1]).users()
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    found = Dataset(tmp_path / "back").users()
+    assert len(found) == len(right)
+    assert nmse_db(found["channel.h"], right["channel.h"]) < -100
+    assert found["los"].tolist() == right["los"].tolist()
+    for name in ("channel.tau", "channel.aod", "channel.aoa", "x_m", "gain_db"):
+        assert np.allclose(
+            np.sort(found[name], axis=None), np.sort(right[name], axis=None), rtol=1e-5, atol=1e-12
+        ), name
+    poses = [[a.orientation for a in placed_antennas(users, "rx")] for users in (found, right)]
+    assert np.allclose(*poses)
+    assert list(verify(tmp_path / "back")) == []
+
+
+def broken(content: bytes, how: str) -> bytes:
+    """Damage a file."""
+    return {
+        "empty": b"",
+        "cut": content[: len(content) // 2],
+        "text": b"not of this format",
+        "flipped": content[::-1],
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "text", "flipped"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "params.json",
+        *(f"{name}_t000_tx000_r001.npz" for name in ("power", "aod_el", "rx_pos", "inter", "tx_pos")),
+    ],
+)
+def test_a_damaged_scenario_of_deepmimo_is_named(file: str, how: str, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    (scenario / file).write_bytes(broken((scenario / file).read_bytes(), how))
+    with pytest.raises(RunError, match=file):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deepmimo"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("power", lambda table: table[:, :2]),
+        ("delay", lambda table: table[:3]),
+        ("phase", lambda table: table * np.nan),
+        ("rx_pos", lambda table: table[:, :2]),
+    ],
+)
+def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    file = scenario / f"{name}_t000_tx000_r001.npz"
+    table = np.load(file)[name]
+    np.savez(file, **{name: change(table)})
+    with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
