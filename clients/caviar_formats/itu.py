@@ -472,9 +472,11 @@ def _write_database(
                 total = float(10 * np.log10(watts.sum())) if len(mine) else None
                 mean = float(watts @ mine[:, 1] / watts.sum()) if len(mine) else None
                 insert("receivers", receiver, total, mean, place.tobytes(), on)
-                for k, (power, delay, *angles, _, phase, _) in enumerate(mine.tolist()):
+                for k, (power, delay, *angles, straight, phase, _) in enumerate(mine.tolist()):
                     kind = kinds[user, k][kinds[user, k] > 0]
-                    text = "-".join(["Tx", *(LETTERS[i] for i in kind), "Rx"])
+                    letters = [LETTERS[i] for i in kind]
+                    # Two words are a straight ray to readers: interactions that nobody recorded are a third.
+                    text = "-".join(["Tx", *(letters or ([] if straight else ["?"])), "Rx"])
                     met = points[user, k][: len(kind)].tobytes()
                     row = (*angles, power, delay, text, phase, met, receiver)
                     insert("rays", receiver * SLOTS[1] + k, *row)
