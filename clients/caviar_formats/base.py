@@ -116,11 +116,12 @@ class Format:
         """
         return f"# {users.dataset.name}\n\n{type(self).__doc__ or ''}"
 
-    def read(self, path: Path) -> Source:
+    def read(self, path: Path, frequency_hz: float | None = None) -> Source:
         """Open files of the format, of which `import_dataset` makes a dataset.
 
         Args:
             path: File or folder.
+            frequency_hz: Of the carrier [Hz], where the files do not have it.
 
         Raises:
             RunError: They are damaged, or none of the format; names file and place. So does their iterator.
@@ -133,6 +134,7 @@ FORMATS: Mapping[str, str] = {
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
+    "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
     "sionna": "caviar_formats.npz:Sionna",
 }

@@ -432,3 +432,113 @@ def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path
     np.savez(file, **{name: change(table)})
     with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
         import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+
+
+# --- Wireless InSite ----------------------------------------------------------------------------------------
+
+P2M = """# Receiver Set: three points
+     3
+     1    2
+ -80.0   0.1E-06   0.1E-07
+    1   0   -81.0  {phase}0.1667820E-06    90.0   180.0    90.0     0.0
+Tx-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+    2   1   -90.0  {phase}0.1886919E-06    90.0   152.0725    90.0     27.9275
+Tx-d-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.3325000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+     2    0
+     3    1
+ -95.0   0.1E-06   0.1E-07
+    1   1   -95.0  {phase}0.1886919E-06    90.0   207.9275    90.0   -27.9275
+Tx-R-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.0675000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+"""
+
+
+def p2m(folder: Path, text: str) -> Path:
+    """Write a file of paths."""
+    file = folder / "street.paths.t001_05.r006.p2m"
+    file.write_text(text, encoding="latin-1")
+    return file
+
+
+@pytest.mark.parametrize(("phase", "of_first"), [("", None), ("  -33.0  ", -33.0)])
+def test_paths_of_wireless_insite_become_users_and_npz(
+    phase: str, of_first: float | None, tmp_path: Path
+) -> None:
+    source = find_format("p2m").read(p2m(tmp_path, P2M.format(phase=phase)), 60e9)
+    data = Dataset(import_dataset(source, tmp_path / "data"))
+    assert list(verify(tmp_path / "data")) == []
+    with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
+        assert users["rx"].tolist() == ["r006-00001", "r006-00003"], "a receiver without paths has no place"
+        assert users["los"].tolist() == [True, False]
+        assert np.allclose(20 * np.log10(np.abs(users["channel.a"][0])), [-81.0, -90.0])
+        right = -2 * np.pi * 60e9 * 0.1667820e-6 if of_first is None else np.radians(of_first)
+        assert np.allclose(users["channel.a"][0, 0] / abs(users["channel.a"][0, 0]), np.exp(1j * right))
+        assert np.allclose(np.degrees(users["channel.aoa"][0]), [[90.0, 180.0], [90.0, 152.0725]])
+        assert np.allclose(np.degrees(users["channel.aod"][1, 0]), [90.0, -27.9275])
+        assert users["channel.interactions"][0].tolist() == [[0], [2]]
+        assert users["channel.points"][1, 0].tolist() == [[35.0, 6.75, 5.0]]
+        assert (users["x_m"][1], users["y_m"][1]) == (60.0, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "line"),
+    [
+        ("     3\n", "", 2),
+        ("     3\n", "     2\n", 15),
+        ("     3\n", "     4\n", 22),
+        ("     3\n", "  three\n", 2),
+        ("     3\n", "     3.5\n", 2),
+        ("     3\n", "     -3\n", 2),
+        ("     1    2\n", "     1    1\n", 9),
+        ("     1    2\n", "     1    3\n", 14),
+        ("     1    2\n", "     1\n", 3),
+        (" -80.0   0.1E-06   0.1E-07\n", "", 4),
+        ("Tx-d-Rx", "Tx-X-Rx", 10),
+        ("Tx-d-Rx", "Tx-d", 10),
+        ("Tx-d-Rx\n", "", 10),
+        ("Tx-d-Rx", "Tx-d-d-Rx", 14),
+        ("   -81.0 ", "   81.0 ", 8),
+        ("   -81.0 ", "   nan ", 5),
+        ("   -81.0 ", "   -81.0 12.0 13.0 ", 5),
+        ("0.1667820E-06    90.0   180.0", "90.0   180.0   0.1667820E-06", 8),
+        ("0.1667820E-06    90.0", "0.1667820E-06    190.0", 8),
+        ("0.1667820E-06", "0.1867820E-06", 8),
+        ("0.3325000E+02", "0,3325000E+02", 12),
+        ("0.3325000E+02", "0.3325000É+02", 0),
+        (" 0.6000000E+02   0.2000000E+02   0.5000000E+01\n     2", "     2", 13),
+    ],
+)
+def test_damaged_files_of_wireless_insite_are_named_with_the_line(
+    before: str, after: str, line: int, tmp_path: Path
+) -> None:
+    text = P2M.format(phase="")
+    assert before in text
+    file = p2m(tmp_path, text.replace(before, after, 1))
+    with pytest.raises(RunError, match=rf"r006.p2m, line {line}:" if line else "r006.p2m: is no file"):
+        import_dataset(find_format("p2m").read(file, 60e9), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("content", ["", "\0" * 4096, "# only a comment\n", "1 2 3 4\n" * 9])
+def test_files_that_are_none_of_wireless_insite_are_refused(content: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"r006.p2m, line"):
+        find_format("p2m").read(p2m(tmp_path, content), 60e9)
+
+
+def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="give --frequency-hz"):
+        find_format("p2m").read(p2m(tmp_path, P2M.format(phase="")))
+
+
+def test_a_real_file_of_wireless_insite(shared_data: Path, tmp_path: Path) -> None:
+    import_dataset(find_format("p2m").read(shared_data / "insite-paths", 60e9), tmp_path / "data")
+    users = Dataset(tmp_path / "data").users()
+    assert (len(users), int(users["paths"].sum())) == (15, 375)
+    assert list(verify(tmp_path / "data")) == []
