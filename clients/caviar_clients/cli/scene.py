@@ -229,6 +229,8 @@ def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) 
                 **common,
                 "title": f"Scene {scene.name} with SUMO's traffic and {what}",
                 "name": f"{scene.name}-{name}",
+                "frames": "1" if name == "mobile" else "20",
+                "period": "1_000_000_000" if name == "mobile" else "500_000_000",
                 "lidar_topic": '"lidar.grid", ' if with_lidar else "",
                 "lidar_service": grid if with_lidar else "",
                 "devices": "\n".join(
