@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
@@ -58,6 +59,8 @@ class Format:
 
     flavours: ClassVar[Mapping[str, str]] = {}
     """Variants of the format by name, with what each is; the first is the default."""
+    packages: ClassVar[Sequence[str]] = ()
+    """Modules beyond the base installation that it imports; extra `formats` brings those of `FORMATS`."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
     whole_episodes: ClassVar[bool] = False
@@ -135,12 +138,11 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
         SetupError: A package that it needs is not installed; the text has the command.
     """
     place = FORMATS.get(name)
-    try:
-        cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
-    except ImportError as error:
-        raise SetupError(f"{option} {name} needs {error.name}: {install_command('formats')}") from error
+    cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
     if cls is None:
         raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
+    if lacking := [module for module in cls.packages if find_spec(module) is None]:
+        raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command('formats')}")
     found: Format = cls(flavour)
     return found
 

@@ -10,9 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
-import h5py
 import numpy as np
-from PIL import Image
 
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_formats.base import Format, Part, markdown_table
@@ -51,6 +49,7 @@ class Itu(Format):
         "full": "with phases, interactions and the SQLite database of rays",
         "baseline": "`raw_data` as of compat, and beside it `baseline_data`, which is ready for training",
     }
+    packages = ("h5py", "PIL")
     needs = ("channel.a", "channel.interactions")
     whole_episodes = True
     loses = (
@@ -130,27 +129,21 @@ class Itu(Format):
         for episode in np.unique(users["episode"]).tolist():
             mine = np.flatnonzero(users["episode"] == episode)
             at = users["scene"][mine], receivers[mine]
-            rays_file = (
-                raw / f"ray_tracing_data_{self._set}_carrier{self._ghz}GHz" / RAYS_FILE.format(episode)
-            )
+            rays_file = self._rays_file(raw, episode)
             _write_hdf5(rays_file, {"allEpisodeData": self._filled(at, rays[mine], np.nan)})
             if interactions:
                 arrays = {name: self._filled(at, rows[mine], -1) for name, rows in interactions.items()}
                 _write_hdf5(rays_file.with_name(f"{rays_file.stem}_interactions.hdf5"), arrays)
             if grid is not None:
                 cells = self._filled(at, grid[mine], 0)
-                file_of_cells = raw / f"lidar_data_{self._set}" / f"obstacles_e_{episode}.npz"
-                file_of_cells.parent.mkdir(parents=True, exist_ok=True)
+                folder_of_cells = raw / f"lidar_data_{self._set}"
+                folder_of_cells.mkdir(parents=True, exist_ok=True)
                 # A single scene has no axis of scenes.
+                found = cells[0] if len(cells) == 1 else cells
                 np.savez_compressed(
-                    file_of_cells, obstacles_matrix_array=cells[0] if len(cells) == 1 else cells
+                    folder_of_cells / f"obstacles_e_{episode}.npz", obstacles_matrix_array=found
                 )
-            for scene, row in enumerate(self._pictures(users, episode)):
-                name = f"{episode}_{scene}.png" if scene else f"{episode}.png"
-                for camera, rgb in enumerate(row, 1):
-                    picture = raw / f"image_data_{self._set}" / f"camera{camera}" / name
-                    picture.parent.mkdir(parents=True, exist_ok=True)
-                    Image.fromarray(rgb).save(picture, compress_level=1)
+            self._write_pictures(users, raw / f"image_data_{self._set}", episode)
         if self.flavour == "full":
             _write_database(folder / "episodedata.db", users, rays, order, self._shape, self._period_s)
         if self.flavour == "baseline":
@@ -195,6 +188,15 @@ class Itu(Format):
         cameras = users.dataset.episode(episode)["camera"]
         return cameras.rgb[:, cameras.index(self._cameras)]
 
+    def _write_pictures(self, users: Users, folder: Path, episode: int) -> None:
+        from PIL import Image
+
+        for scene, row in enumerate(self._pictures(users, episode)):
+            for camera, rgb in enumerate(row, 1):
+                file = folder / f"camera{camera}" / (f"{episode}_{scene}.png" if scene else f"{episode}.png")
+                file.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(rgb).save(file, compress_level=1)
+
     def _write_training(self, users: Users, folder: Path, number: int, grid: Any) -> None:
         """Write shards of `baseline_data`, of valid users."""
         found = {"coord": np.stack([users["x_m"], users["y_m"]], axis=1), "lidar": grid}
@@ -234,7 +236,7 @@ class Itu(Format):
 
     def readme(self, users: Users) -> str:
         (scenes, receivers), slots = self._shape, self._slots
-        rays = f"ray_tracing_data_{self._set}_carrier{self._ghz}GHz/{RAYS_FILE.format('N')}"
+        rays = self._rays_file(Path(), "N").as_posix()
         about = {
             f"CoordVehiclesRxPerScene_{self._set}.csv": "a row for each receiver of a scene: Val is V where "
             "a ray reaches it and, with a LIDAR, its vehicle lies in the area of the grid; x, y of it, z the "
@@ -275,6 +277,9 @@ which says nothing of the scene. SPLIT is `train` up to episode {self._last_trai
     def _raw(self, folder: Path) -> Path:
         return folder / "raw_data" if self.flavour == "baseline" else folder
 
+    def _rays_file(self, raw: Path, episode: int | str) -> Path:
+        return raw / f"ray_tracing_data_{self._set}_carrier{self._ghz}GHz" / RAYS_FILE.format(episode)
+
     @staticmethod
     def _shard(folder: Path, what: str, number: int, suffix: str) -> Path:
         return folder / SHARDS / f"{what}-{number:05d}.{suffix}"
@@ -293,6 +298,8 @@ def _shards(folder: Path, what: str) -> list[Path]:
 
 
 def _write_hdf5(file: Path, arrays: Mapping[str, Any]) -> None:
+    import h5py
+
     file.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(file, "w") as out:
         for name, values in arrays.items():

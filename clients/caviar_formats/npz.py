@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,8 +23,8 @@ class Npz(Format):
         self._names = users.readable()
 
     def write(self, part: Part, folder: Path) -> None:
-        columns: dict[str, Any] = dict(part.users.read([*USER_COLUMNS, *self._names]))
-        np.savez(folder / f"users-{part.number:05d}.npz", **columns)
+        columns = part.users.read([*USER_COLUMNS, *self._names])
+        np.savez(folder / f"users-{part.number:05d}.npz", allow_pickle=False, **columns)
 
     def readme(self, users: Users) -> str:
         about = USER_COLUMNS | self._names
@@ -65,7 +64,8 @@ class Sionna(Format):
         a, tau = valid.cir(paths=self._shape["num_paths"]).block(valid)
         columns = valid.read(["episode", "scene", "carrier", "tx", "rx"])
         a = a[:, None, :, None].astype(np.complex64)
-        np.savez(folder / f"cir-{part.number:05d}.npz", a=a, tau=tau[:, None, None], **columns)
+        file = folder / f"cir-{part.number:05d}.npz"
+        np.savez(file, allow_pickle=False, a=a, tau=tau[:, None, None], **columns)
 
     def readme(self, users: Users) -> str:
         sizes = "\n".join(f"    {name}={size}," for name, size in self._shape.items())
@@ -83,7 +83,6 @@ Paths that a user lacks have `a` = 0 and `tau` = 0. Elements of an array are num
 
 ```python
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from sionna.phy.channel import CIRDataset

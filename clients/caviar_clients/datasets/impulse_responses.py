@@ -10,7 +10,6 @@ import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.recording import Recording
 from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
@@ -40,8 +39,8 @@ class ImpulseResponses:
         paths: P; None: as many as the user with most has.
 
     Raises:
-        RecordingError: Arrays differ between users, or have several polarizations or panels, whose paths have
-            amplitudes of their own that are not recorded.
+        RecordingError: Arrays differ between users, see spherical waves, or have several polarizations or
+            panels, whose paths have amplitudes of their own that are not recorded.
 
     Example:
         >>> import caviar
@@ -57,6 +56,13 @@ class ImpulseResponses:
             raise ValueError(
                 f"time_steps {time_steps}, sampling_frequency {sampling_frequency}: both above 0"
             )
+        scenes = users.dataset.table("scenes")
+        for episode, scene, rung in zip(scenes["episode"], scenes["scene"], scenes["rung"], strict=True):
+            if rung and rung not in PLANE_WAVES:
+                raise RecordingError(
+                    f"{users.dataset.location}, episode {episode}, scene {scene}: the channel is {rung}, in "
+                    "which each pair of elements has paths of its own; use channel.hf or channel.h"
+                )
         self._users = users
         self._times = np.arange(time_steps) / sampling_frequency
         self._arrays = _arrays_of(users)
@@ -92,7 +98,7 @@ class ImpulseResponses:
             ``a``, Shape ``[N, Nr, Nt, P, S]``, and ``tau`` [s], Shape ``[N, P]``.
 
         Raises:
-            RecordingError: The channel is one in which arrays see spherical waves, or was not recorded.
+            RecordingError: The channel was not recorded.
         """
         names = ("a", "tau", "aod", "aoa", "doppler")
         rows = users.read(["tx", "rx", *(f"channel.{name}" for name in names)])
@@ -141,7 +147,7 @@ def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:
     if len(arrays) != 1:
         raise RecordingError(
             f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
-            f"users[users[{end!r}] == NAME]"
+            f"users[users[{end!r}] == NAME], or with --tx or --object-class"
         )
     (array,) = arrays
     if len(array.polarizations) > 1 or array.panels:
@@ -150,18 +156,3 @@ def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:
             "recorded; use channel.hf or channel.h"
         )
     return array
-
-
-def check_plane_waves(recording: Recording) -> None:
-    """Check that arrays see plane waves, so that paths between reference points say all.
-
-    Raises:
-        RecordingError: They do not; names frame and rung.
-    """
-    channel = recording["channel"]
-    for frame, rung in zip(channel.frame, channel.rung, strict=True):
-        if rung and rung not in PLANE_WAVES:
-            raise RecordingError(
-                f"{recording.path}, frame {frame}: the channel is {rung}, in which each pair of elements has "
-                "paths of its own; use channel.hf or channel.h"
-            )
