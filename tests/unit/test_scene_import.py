@@ -319,7 +319,11 @@ MUTATIONS: dict[str, tuple[str, Callable[[str], str | bytes] | None, str]] = {
         lambda t: t.replace("<!DOCTYPE InSite>", '<!DOCTYPE a [<!ENTITY b "c">]>'),
         r"an entity is declared",
     ),
-    "frequency": ("town.study.xml", replaced("60000000000", "sixty"), r"CarrierFrequency is no number"),
+    "frequency": (
+        "town.study.xml",
+        replaced("60000000000", "sixty"),
+        r"CarrierFrequency sixty: write numbers",
+    ),
     "network cut": ("sumo/a.net.xml", lambda t: t[:-4], r":1: .*mend the XML"),
     "network without offset": ("sumo/a.net.xml", lambda t: "<net/>", r"netOffset ''; write x,y"),
     "routes gone": ("sumo/a.rou.xml", None, r": No such file"),
