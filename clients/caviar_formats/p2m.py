@@ -106,7 +106,7 @@ class _File:
             self._fail(f"zenith angles {angles[0]:g}° and {angles[2]:g}° are not within 0° to 180°")
         return values, points, [int(LETTERS[token]) for token in tokens[1:-1]]
 
-    def _paths(self, rx: str, found: list[tuple[list[float], np.ndarray, list[int]]]) -> Paths:  # type: ignore[type-arg]
+    def _paths(self, rx: str, found: list[tuple[list[float], np.ndarray, list[int]]]) -> Paths:
         values = np.array([one for one, *_ in found])
         tau, depth = values[:, -5], max(len(kinds) for *_, kinds in found)
         angles = np.radians(values[:, -4:])
