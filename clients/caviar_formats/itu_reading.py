@@ -68,10 +68,10 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
         scenes=_scenes(table, rows, rays, scenes, position, hertz),
         carriers=(Carrier(name=f"{hertz / 1e9:g}GHz", frequency_hz=hertz, bandwidth_hz=100e6),),
         scenes_of_episode=scenes,
-        lacks="receivers that are not valid, objects, velocities and Doppler shifts, LIDARs and pictures"
-        + ("" if phases else ", and phases: those of paths are of their delays"),
-        assumed=f"arrays of {ARRAYS['tx'].size} and {ARRAYS['rx'].size} elements, TX yaw {TX_YAW_DEG:g}°, "
-        f"receivers {ABOVE_M} m above their vehicles; the transmitter lies where straight rays begin",
+        lacks="No receivers that are not valid, objects, velocities, Doppler shifts, LIDARs and pictures are "
+        "imported." + ("" if phases else " The files have no phases: those of paths are of their delays."),
+        assumed=f"Arrays have {ARRAYS['tx'].size} and {ARRAYS['rx'].size} elements, TX yaw {TX_YAW_DEG:g}°, "
+        f"receivers are {ABOVE_M} m above their vehicles, the transmitter is where straight rays begin.",
     )
 
 
