@@ -26,6 +26,7 @@ PACKAGES = (
     "caviar_services",
     "caviar_bridges",
     "caviar_clients",
+    "caviar_formats",
     "caviar_labs",
 )
 """Import packages; those that are not installed are left out."""

@@ -8,7 +8,7 @@
 | ``caviar.observations`` | part of the observation | a subclass of `caviar_protocol.observations.Part` |
 | ``caviar.codebooks`` | codebook of antenna arrays | a `caviar_protocol.space.codebooks.Codebook` class |
 | ``caviar.noise`` | ``lidar:name``, ``camera:name`` | a subclass of `SensorNoise` |
-| ``caviar.formats`` | format of ``caviar dataset export`` | a subclass of `datasets.formats.Format` |
+| ``caviar.formats`` | format of ``caviar export`` and ``import`` | a `caviar_formats.base.Format` class |
 | ``caviar.commands`` | what is typed after ``caviar`` | a function for Typer, or a ``typer.Typer`` |
 | ``caviar.traffic`` | traffic model of the link ``cell`` | a `caviar_protocol.cell.traffic.TrafficModel` |
 

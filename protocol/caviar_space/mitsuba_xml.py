@@ -106,12 +106,18 @@ def transformed_mesh(file: Path, to_world: Float64Array, called: str = "") -> Me
 class RadioMaterial(NamedTuple):
     """A material of scenery that a world makes in memory."""
 
-    itu_material: str
-    """Its name in ITU-R P.2040: ``concrete``."""
+    itu_material: str = ""
+    """Its name in ITU-R P.2040: ``concrete``; empty where it has ``constants``, or is for cameras alone."""
     thickness_m: float = 0.2
     """[m]"""
     colour: tuple[float, float, float] | None = None
     """Linear sRGB, 0…1, as cameras see it; None: as its material looks."""
+    constants: tuple[float, float] | None = None
+    """Relative permittivity and conductivity [S/m], the same on each carrier; None: those of ITU-R P.2040."""
+    scattering_coefficient: float = 0.0
+    """Share of the reflected amplitude that is scattered, 0…1."""
+    xpd_coefficient: float = 0.0
+    """Share of the scattered power in the other polarization, 0…1."""
 
 
 def scenery_files(
@@ -140,7 +146,8 @@ def scenery_files(
 
     lines = ['<scene version="2.1.0">']
     for key, material in materials.items():
-        if material.itu_material not in ITU_MATERIALS:
+        cameras = material.constants is None and not material.itu_material and material.colour is not None
+        if material.constants is None and not cameras and material.itu_material not in ITU_MATERIALS:
             raise AssetError(
                 f"material {key!r}: ITU-R P.2040 has no material {material.itu_material!r}; "
                 f"{suggestion(material.itu_material, ITU_MATERIALS)}"
@@ -149,11 +156,20 @@ def scenery_files(
             raise AssetError(
                 f"material {key!r}: a thickness of {material.thickness_m:g} m; write one above 0"
             )
-        lines += [
-            f'  <bsdf type="itu-radio-material" id={quoteattr(key)}>',
-            f'    <string name="type" value="{material.itu_material}"/>',
-            f'    <float name="thickness" value="{material.thickness_m:g}"/>',
-        ]
+        numbers = {"thickness": material.thickness_m}
+        if cameras:
+            lines.append(f'  <bsdf type="diffuse" id={quoteattr(key)}>')
+            numbers = {}
+        elif material.constants is None:
+            lines.append(f'  <bsdf type="itu-radio-material" id={quoteattr(key)}>')
+            lines.append(f'    <string name="type" value="{material.itu_material}"/>')
+        else:
+            lines.append(f'  <bsdf type="radio-material" id={quoteattr(key)}>')
+            numbers["relative_permittivity"], numbers["conductivity"] = material.constants
+        for number in ("scattering_coefficient", "xpd_coefficient"):
+            if value := getattr(material, number):
+                numbers[number] = value
+        lines += [f'    <float name="{name}" value="{value:.9g}"/>' for name, value in numbers.items()]
         if material.colour is not None:
             red, green, blue = material.colour
             lines.append(f'    <rgb name="color" value="{red:.6f} {green:.6f} {blue:.6f}"/>')

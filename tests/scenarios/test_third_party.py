@@ -49,7 +49,7 @@ from caviar_protocol.cell.traffic import Offered, TrafficModel
 from caviar_protocol.observations import Bounds, Part
 from caviar_protocol.space.codebooks import Codebook
 from caviar_protocol.space.scene import device_pose
-from caviar_clients.datasets.formats import Format
+from caviar_formats.base import Format
 from caviar_services.world.base import ObjectState, World
 
 
@@ -87,11 +87,10 @@ class Switched(Codebook):
 class Positions(Format):
     """A line for each user of each scene."""
 
-    def write(self, dataset, folder):
-        users = dataset.users()
-        columns = [users[name] for name in ("episode", "scene", "x_m")]
+    def write(self, part, folder):
+        columns = [part.users[name] for name in ("episode", "scene", "x_m")]
         lines = [",".join(map(str, row)) for row in zip(*columns)]
-        (folder / "positions.csv").write_text("\\n".join(lines))
+        (folder / f"positions-{part.number}.csv").write_text("\\n".join(lines))
 
 
 BURST = TrafficModel(burst, needs=("rate_bit_s", "period_s"))
@@ -237,12 +236,12 @@ def test_its_format_is_one_of_export(site: Path, tmp_path: Path) -> None:
     scenario = site.parent / "harbour.toml"
     done = caviar("dataset", "generate", scenario, "--episodes", "1", "--workers", "1", "--out", data, **here)
     assert done.status == 0, done.output
-    export = ("dataset", "export", data, "--to", "positions", "--out", out)
-    assert caviar(*export, **here).output == f"{out}\n"
-    rows = [line.split(",") for line in (out / "positions.csv").read_text().splitlines()]
+    export = ("export", data, "--to", "positions", "--out", out)
+    assert caviar(*export, **here).output.endswith(f"{out}\n")
+    rows = [line.split(",") for line in (out / "positions-0.csv").read_text().splitlines()]
     assert [float(x) for _, _, x in rows] == pytest.approx([0.5 * frame for frame in range(10)])
     assert "not empty" in caviar(*export, **here).output
-    again = caviar("dataset", "export", data, "--to", "position", "--out", tmp_path / "other", **here)
+    again = caviar("export", data, "--to", "position", "--out", tmp_path / "other", **here)
     assert (again.status, "did you mean 'positions'" in again.output) == (1, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out"]
 

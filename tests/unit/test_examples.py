@@ -28,6 +28,7 @@ PACKAGES = (
     "caviar_services",
     "caviar_bridges",
     "caviar_clients",
+    "caviar_formats",
     "caviar_labs",
     "caviar",
 )

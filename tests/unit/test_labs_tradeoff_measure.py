@@ -21,6 +21,8 @@ from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray
+from caviar_space.meshes import unit_box
+from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
 
 
 def scenes() -> Scenes:
@@ -57,9 +59,16 @@ def test_a_setting_may_have_arrays_of_its_own() -> None:
 
 
 def test_every_material_scatters_unless_the_scenario_says_which(tmp_path: Path) -> None:
-    xml = tmp_path / "street.xml"
-    xml.write_text('<scene><bsdf type="a" id="mat-brick"/><bsdf id="glass" type="b"/></scene>')
-    assets = {"scenery/street.xml": xml, "scenery/meshes/a.ply": tmp_path / "a.ply"}
+    materials = {
+        "mat-brick": RadioMaterial("brick"),
+        "glass": RadioMaterial(constants=(6.0, 0.1)),
+        "leaves": RadioMaterial(colour=(0.0, 0.3, 0.0)),  # for cameras: waves do not meet it
+    }
+    shapes = {f"piece-{name}": (unit_box(), name) for name in materials}
+    assets = {name: tmp_path / name for name in scenery_files("street", shapes, materials)}
+    for name, content in scenery_files("street", shapes, materials).items():
+        assets[name].parent.mkdir(parents=True, exist_ok=True)
+        assets[name].write_bytes(content)
     given = {"glass": {"thickness_m": 0.1}}
     assert scattering_materials(given, assets) == {
         "brick": {"scattering_coefficient": SCATTERING},

@@ -30,14 +30,17 @@ ENTRY_POINT_GROUP = "caviar.commands"
 
 GROUPS = {
     "dataset": (
-        DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables, export."
+        DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."
     ),
+    "scene": (RUN, "caviar_clients.cli.scene:app", "Scenes of other programs: import, picture."),
     "policy": (
         POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."
     ),
     "keys": (OPERATE, "caviar_clients.cli.keys:app", "Keys: who may take part in a run, and as what."),
 }  # fmt: skip
 """Panel, place and help of groups that are imported when one of their commands is typed."""
+
+_OWN_PANELS = {"caviar_labs": LABORATORIES, "caviar_formats": DATASETS}
 
 FORMER = {
     "generate": "dataset generate", "look": "dataset look", "verify": "dataset verify",
@@ -119,7 +122,7 @@ def added_command(name: str) -> Any:
     points = added().get(name)
     if points is None:
         return None
-    panel = LABORATORIES if _is_own(points[0]) else PLUG_INS
+    panel = _OWN_PANELS.get(points[0].module.partition(".")[0], PLUG_INS)
     sources = " and ".join(f"{p.value} of {p.dist.name} {p.dist.version}" for p in points if p.dist)
     if len(points) > 1:
         return _refusing(name, panel, f"{name} is {sources}; uninstall one of them")

@@ -70,7 +70,8 @@ def generate_command(
     scene: Annotated[
         Path | None,
         typer.Option(
-            help="scenario, by name or file, that a preset is applied to, instead of a street canyon"
+            help="what a preset is applied to, instead of a street canyon: scenario, by name or file, or "
+            "folder of an imported scene"
         ),
     ] = None,
     more: Annotated[
@@ -111,6 +112,8 @@ def generate_command(
     settings = keys_set(set_, record)
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
+        if scene is not None and scene.is_dir():
+            scene /= f"{preset.receivers}.toml"
         loaded = apply_preset(preset, load_scenario(scene or preset.scenario, settings))
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
@@ -180,20 +183,6 @@ def tables_command(
     catalogue, console = Catalogue(directory.catalogue), Console()
     for file in export_tables(catalogue, out or directory.tables, form):  # type: ignore[arg-type]
         print_line(console, file)
-
-
-@app.command("export")
-def export_command(
-    dataset: DatasetLocation,
-    to: Annotated[str, typer.Option(help="format, of an installed package")],
-    out: Annotated[Path, typer.Option(help="folder that is made")],
-) -> None:
-    """Write a dataset in the format of another program."""
-    from caviar_clients.datasets.formats import export_dataset, format_of
-    from caviar_clients.datasets.reader import Dataset
-
-    export_dataset(Dataset(dataset), format_of(to), out)
-    print_line(Console(), out)
 
 
 @app.command("look")

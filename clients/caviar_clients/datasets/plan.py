@@ -252,7 +252,7 @@ class Preset:
     episodes: int
     scenes: int
     arrays_turn: bool
-    """Whether arrays on vehicles turn with them; else they keep their orientation in the world."""
+    """Whether arrays on vehicles turn with them; else their rows of elements lie north–south in the world."""
     rung: Literal["siso-rt", "spherical"]
     """Paths between reference points and plane waves over the arrays, or a path for each antenna pair."""
 
@@ -390,7 +390,7 @@ def _with_receivers(preset: Preset, scenario: Scenario) -> tuple[DeviceSpec, ...
 
 def _device(preset: Preset, device: DeviceSpec) -> DeviceSpec:
     if device.kind == "antenna" and device.on and not preset.arrays_turn:
-        return replace(device, keeps_heading=True)
+        return replace(device, keeps_heading=True, yaw_deg=0.0)
     return device
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from caviar_protocol.errors import RecordingError, suggestion
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.space.codebooks import CODEBOOKS_FOLDER, add_codebook_files
+
+if TYPE_CHECKING:
+    from caviar_clients.datasets.impulse_responses import ImpulseResponses
 
 _READS = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(?:select|with)\b", re.IGNORECASE | re.DOTALL)
 KEPT_RECORDINGS = 16
@@ -227,6 +230,21 @@ class Dataset:
                     )
                 mask &= table[column] == name
         return Users(self, table.where(mask))
+
+    def cir(self, **narrowing: Any) -> ImpulseResponses:
+        """Impulse responses of the users with a path, for Sionna's ``CIRDataset`` (`Users.cir`).
+
+        Args:
+            narrowing: As of `users`.
+
+        Raises:
+            RecordingError: As of `users` and `Users.cir`.
+
+        Example:
+            >>> cir = Dataset("data/s008").cir(tx="bs")  # doctest: +SKIP
+            >>> channel = sionna.phy.channel.CIRDataset(cir, batch_size=64, **cir.shape)  # doctest: +SKIP
+        """
+        return self.users(**{"valid": True, **narrowing}).cir()
 
     def query(self, sql: str, parameters: Sequence[Any] = ()) -> dict[str, NDArray[Any]]:
         """Ask the catalogue in SQL, over all episodes; nothing is written.

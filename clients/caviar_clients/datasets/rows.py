@@ -116,6 +116,18 @@ USER_COLUMNS = {
 }
 """What each column of the users is, with its unit."""
 
+SCENE_COLUMNS = {
+    "episode": "number, from 0",
+    "scene": "number in the episode, from 0",
+    "t_s": "simulated time in the episode [s]",
+    "objects": "number of objects",
+    "users": "receivers, on each carrier",
+    "valid": "of these, how many have a path",
+    "los": "of these, how many have a free line of sight",
+    "rung": "step of the channel's fidelity ladder",
+}
+"""What each column of the scenes is, with its unit."""
+
 
 @dataclass(frozen=True)
 class ProductRow:

@@ -20,6 +20,7 @@ from caviar_protocol.recording.topics import TOPIC_ARRAYS
 from caviar_protocol.topics import Lidar, Link, topics_of
 
 if TYPE_CHECKING:
+    from caviar_clients.datasets.impulse_responses import ImpulseResponses
     from caviar_clients.datasets.reader import Dataset
     from caviar_clients.datasets.torch_data import UserBatches, UserSamples
 
@@ -102,6 +103,11 @@ class Users:
     def __init__(self, dataset: Dataset, table: Columns) -> None:
         self._dataset, self._table = dataset, table
 
+    @property
+    def dataset(self) -> Dataset:
+        """The dataset that they are of."""
+        return self._dataset
+
     def __len__(self) -> int:
         """Number of users."""
         return len(self._table)
@@ -133,6 +139,24 @@ class Users:
             for name, column in TOPIC_ARRAYS[topic].columns.items()
             if not _lacks(recording, topic, name)
         }
+
+    def readable(self) -> dict[str, str]:
+        """Recorded arrays, as of `recorded`, of which each user has one row: no sensors of which it has none
+        or several."""
+        found = self.recorded()
+        some = self.one_of_each_kind()
+        for topic in {name.partition(".")[0] for name in found}.intersection(SENSORS):
+            try:
+                some._recorded([next(name for name in found if name.startswith(f"{topic}."))])
+            except RecordingError:
+                found = {name: text for name, text in found.items() if not name.startswith(f"{topic}.")}
+        return found
+
+    def one_of_each_kind(self) -> Users:
+        """Take the first user of each transmitter, class of object and device on it."""
+        columns = zip(self["tx"], self["object_class"], self["rx"], strict=True)
+        kinds = np.array([f"{tx} {cls} {rx.rpartition('/')[2]}" for tx, cls, rx in columns])
+        return Users(self._dataset, self._table.where(np.sort(np.unique(kinds, return_index=True)[1])))
 
     def __getitem__(self, name: str | slice | Sequence[int] | NDArray[Any]) -> Any:
         """A column, a recorded array, or with a slice, a mask or positions these users only.
@@ -178,6 +202,21 @@ class Users:
         recorded = [name for name in names if "." in name]
         rows = self._recorded(recorded) if recorded else {}
         return Columns({name: columns[name] if name in columns else _stacked(rows[name]) for name in names})
+
+    def rows(self, names: Sequence[str]) -> dict[str, list[Any]]:
+        """Read the rows of recorded arrays as they are, without padding.
+
+        Args:
+            names: Of recorded arrays.
+
+        Returns:
+            For each name an array or a number a user, in their order.
+
+        Raises:
+            RecordingError, ValueError, TypeError: As of `read`.
+        """
+        self.check_names(names)
+        return self._recorded(names)
 
     def distinct(self, name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Read each row of a recorded array once, however many users have it, as the pictures of cameras.
@@ -236,6 +275,24 @@ class Users:
         check_batches(size, shuffle)
         order = np.arange(len(self)) if shuffle is None else self._shuffled(shuffle)
         return [self[order[start : start + size]] for start in range(0, len(order), size)]
+
+    def cir(
+        self, *, time_steps: int = 1, sampling_frequency: float = 1.0, paths: int | None = None
+    ) -> ImpulseResponses:
+        """Impulse responses between antenna elements, for Sionna's ``CIRDataset``.
+
+        Args:
+            time_steps: Of each response.
+            sampling_frequency: Of the time steps [Hz].
+            paths: Of each response; None: as many as the user with most has.
+
+        Raises:
+            RecordingError: The users' arrays differ, or have several polarizations or panels.
+            ValueError: There is no time step, or the frequency is not positive.
+        """
+        from caviar_clients.datasets.impulse_responses import ImpulseResponses
+
+        return ImpulseResponses(self, time_steps, sampling_frequency, paths)
 
     def torch(self, names: Sequence[str]) -> UserSamples:
         """A PyTorch ``Dataset`` of these users, by position (`torch_data.UserSamples`).
@@ -346,6 +403,10 @@ class Users:
     def _recorded(self, names: Sequence[str]) -> dict[str, list[Any]]:
         """Rows of recorded arrays, in the order of the users."""
         found: dict[str, list[Any]] = {name: [None] * len(self) for name in names}
+        by_topic: dict[str, list[str]] = {}
+        for name in names:
+            topic, _, field = name.partition(".")
+            by_topic.setdefault(topic, []).append(field)
         table = self._table
         scenes = np.stack([table["episode"], table["scene"]], axis=1)
         # Each scene once, in the order in which they lie on the disk.
@@ -355,26 +416,33 @@ class Users:
             stop = starts[at + 1] if at + 1 < len(starts) else len(order)
             users = order[start:stop]
             episode, scene = (int(value) for value in scenes[users[0]])
-            for name in names:
-                for user, row in zip(users, self._rows(name, episode, scene, users), strict=True):
-                    found[name][user] = row
+            for topic, fields in by_topic.items():
+                rows = self._rows(topic, fields, episode, scene, users)
+                for field, values in zip(fields, rows, strict=True):
+                    column = found[f"{topic}.{field}"]
+                    for user, row in zip(users, values, strict=True):
+                        column[user] = row
         return found
 
-    def _rows(self, name: str, episode: int, scene: int, users: NDArray[Any]) -> list[Any]:
-        """Rows of a recorded array, of users of one scene."""
-        topic, _, field = name.partition(".")
+    def _rows(
+        self, topic: str, fields: Sequence[str], episode: int, scene: int, users: NDArray[Any]
+    ) -> list[list[Any]]:
+        """Rows of recorded arrays of a topic, of users of one scene, whose payload is decoded once."""
         recording = self._dataset.episode(episode)
         arrays: TopicArrays[Any, Any] = recording[topic]
         payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
         place = f"{recording.path}, scene {scene}"
         if payload is None:
             raise RecordingError(f"{place}: {topic} is absent")
-        rows = arrays.columns[field].rows(arrays, payload)
         at = {key: number for number, key in enumerate(arrays.keys_of(payload))}
         keys = [self._key(topic, at, user, place) for user in users]
-        # Users with one row have one object, which `_stacked` and `distinct` know again.
-        found = {key: rows[key] for key in set(keys)}
-        return [found[key] for key in keys]
+        all_rows = list[list[Any]]()
+        for field in fields:
+            rows = arrays.columns[field].rows(arrays, payload)
+            # Users with one row have one object, which `_stacked` and `distinct` know again.
+            found = {key: rows[key] for key in set(keys)}
+            all_rows.append([found[key] for key in keys])
+        return all_rows
 
     def _key(self, topic: str, at: Mapping[Any, int], user: int, place: str) -> int:
         """The row of a product that a user has."""

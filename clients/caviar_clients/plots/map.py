@@ -6,9 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,35 @@ def draw_map(data: MapData, file: Path) -> None:
             draw_beam(axes, beam)
         draw_objects(axes, data, Labels(marked=served_object(data)))
         draw_antennas(axes, data)
+
+
+def draw_site(
+    data: MapData, materials: Mapping[str, Footprints], lanes: Sequence[Float64Array], file: Path
+) -> None:
+    """Draw scenery with its materials, the lanes of a road network, and objects.
+
+    Args:
+        data: Scene and title.
+        materials: Footprints of the scenery by material, as the legend calls it.
+        lanes: Centre lines in the world [m], Shape ``[P, 2]`` each.
+        file: PNG that is written.
+    """
+    from matplotlib.collections import LineCollection
+
+    points = np.concatenate([*(drawn.faces.reshape(-1, 2) for drawn in materials.values()), *lanes])
+    view = view_around(points.min(axis=0), points.max(axis=0), 5.0, 20.0, (0.9, 0.4), scale=1.08)
+    with _map_figure(file, view, data.title, columns=1) as (_, axes):
+        for (label, drawn), color in zip(materials.items(), cycle(_SITE_COLORS), strict=False):
+            draw_scenery(axes, drawn, area=color)
+            legend_square(axes, label, color)
+        lines: Any = lanes
+        axes.add_collection(LineCollection(lines, colors=SKY, linewidths=1.0, zorder=2, label="lanes"))
+        draw_objects(axes, data)
+        draw_antennas(axes, data)
+
+
+# Areas below lanes and objects: pale.
+_SITE_COLORS = ("#d9d2c5", "#bfdcae", "#c9c3dc", "#e6c9c3", "#c3dde6")
 
 
 def view_of(data: MapData, beam: Beam | None) -> View:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
-from caviar_protocol.space.scene import device_pose
+from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import Channel, Scene
 from caviar_protocol.topics.channel import Interaction
 from caviar_space.ground import STEEP, Piece, ground_and_buildings
@@ -230,6 +231,52 @@ def obstacle_boxes(services: Any) -> list[Box]:
         if spec.get("role") == "channel" and isinstance(settings := spec.get("settings"), dict)
     ]
     return [(box["minimum_m"], box["maximum_m"]) for boxes in found for box in boxes]
+
+
+def lanes_of(net: Path, offset_m: Sequence[float], yaw_deg: float) -> list[Float64Array]:
+    """Read the centre lines of the lanes of a SUMO network.
+
+    Args:
+        net: ``.net.xml``.
+        offset_m: Place of the network's origin in the world [m].
+        yaw_deg: What the network is turned by [°].
+
+    Returns:
+        Points in world x and y [m], Shape ``[P, 2]`` each.
+    """
+    turn = np.exp(1j * np.radians(yaw_deg))
+    lanes = []
+    for lane in ElementTree.parse(net).iter("lane"):  # noqa: S314 - a file of the user's
+        points = [point.split(",") for point in lane.get("shape", "").split()]
+        line = turn * np.array([complex(float(x), float(y)) for x, y, *_ in points])
+        lanes.append(np.stack([line.real, line.imag], axis=-1) + np.asarray(offset_m[:2], float))
+    return lanes
+
+
+def covered_objects(scene: Scene, roofs: Iterable[Footprints]) -> Iterator[tuple[str, int]]:
+    """Count the corners of each object's box that lie within footprints, from above.
+
+    Args:
+        scene: The objects.
+        roofs: Footprints of buildings.
+
+    Yields:
+        Name, and number of the centre and the four corners that lie within.
+    """
+    faces = np.concatenate([np.zeros((0, 3, 2)), *(drawn.faces for drawn in roofs)])
+    a, edges = faces, np.roll(faces, -1, axis=1) - faces
+    low, high = faces.min(axis=1), faces.max(axis=1)
+    unit = np.array([(0, 0, 0), (1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)]) / 2
+    for i, name in enumerate(scene.names):
+        pose = object_pose(scene, i)
+        corners = (unit * scene.dimensions[i]) @ rotation_matrix(pose.orientation).T + np.array(pose.position)
+        count = 0
+        for x, y in corners[:, :2]:
+            near = ((low <= (x, y)) & (high >= (x, y))).all(axis=1)
+            to = np.array((x, y)) - a[near]
+            side = edges[near, :, 0] * to[..., 1] - edges[near, :, 1] * to[..., 0]
+            count += bool(((side >= 0).all(axis=1) | (side <= 0).all(axis=1)).any())
+        yield name, count
 
 
 def _level(shape: Piece) -> Float64Array:

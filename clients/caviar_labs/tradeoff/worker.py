@@ -8,7 +8,6 @@ distinguished from that of the other; and a model that takes too long could not 
 from __future__ import annotations
 
 import multiprocessing
-import re
 import signal
 import time
 from collections.abc import Mapping
@@ -31,6 +30,7 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaDevice, Channel, Scene
 from caviar_services.registry import load
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
+from caviar_space.mitsuba_xml import read_scenery
 
 SERVICE = "channel"
 """Name of every model, so that the seeds that they derive from it are the same."""
@@ -173,16 +173,12 @@ def scattering_materials(given: Mapping[str, Any], assets: Mapping[str, Path]) -
     # Coefficients that the user chose are better than one value for all.
     if any(entry.get("scattering_coefficient") for entry in given.values()):
         return dict(given)
-    names = {name for file in assets.values() if file.suffix == ".xml" for name in _materials(file)}
+    shapes = (
+        shape for file in assets.values() if file.suffix == ".xml" for shape in read_scenery(file).shapes
+    )
+    names = {shape.radio.name for shape in shapes if shape.radio}  # none of foliage that is a volume alone
     made = {name: {**given.get(name, {}), "scattering_coefficient": SCATTERING} for name in sorted(names)}
     return {**given, **made}
-
-
-def _materials(file: Path) -> list[str]:
-    """Names of the materials in a scenery file, as Sionna RT calls them."""
-    # Mitsuba keeps the prefix of Blender's exporter, Sionna RT drops it.
-    found = re.findall(r"<bsdf\b[^>]*\bid=\"([^\"]+)\"", file.read_text())
-    return [name.removeprefix("mat-") for name in found]
 
 
 # [s] for a process to end by itself, before it is killed.

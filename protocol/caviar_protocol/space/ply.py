@@ -144,7 +144,7 @@ def _parse(data: bytes) -> tuple[Float64Array, Int64Array]:
         )
     if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(f"faces refer to vertices {corners.min()} to {corners.max()} of {len(vertices)}")
-    return vertices, _cut(corners, sizes, vertices)
+    return vertices, cut_polygons(corners, sizes, vertices)
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -265,9 +265,9 @@ def _triangle_row(
     return np.dtype(row)
 
 
-def _cut(corners: Int64Array, sizes: Int64Array, vertices: Float64Array) -> Int64Array:
-    """Triangles of polygons, in their sense and order, Shape ``[F, 3]``: around the first corner of each,
-    unless that would reach out of one that is not convex, as roofs often are.
+def cut_polygons(corners: Int64Array, sizes: Int64Array, vertices: Float64Array) -> Int64Array:
+    """Cut polygons into triangles, in their sense and order, Shape ``[F, 3]``: around the first corner of
+    each, unless that would reach out of one that is not convex, as roofs often are.
 
     Args:
         corners: Vertices of all polygons, one polygon after the other.

@@ -38,6 +38,7 @@ OWN = frozenset(
         "_bridges",
         "_broker",
         "_clients",
+        "_formats",
         "_labs",
         "_protocol",
         "_scenarios",

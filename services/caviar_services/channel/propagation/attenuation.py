@@ -116,7 +116,8 @@ class FoliageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     attenuation_db_per_m: dict[
         str, Annotated[float, quantity("dB/m", "specific attenuation γ on a carrier", ge=0)]
     ] = {}
-    """By name of the carrier. Absent: that of ITU-R P.833's table 1, from 105.9 to 2117.5 MHz."""
+    """By name of the carrier; ``"*"``: on all others. Absent: that of ITU-R P.833's table 1, from 105.9 to
+    2117.5 MHz."""
     maximum_db: dict[
         str, Annotated[float, quantity("dB", "attenuation A_m at most, on a carrier", gt=0)]
     ] = {}
@@ -252,7 +253,7 @@ def _kind(
     for field in ("attenuation_db_per_m", "maximum_db"):
         given: Mapping[str, float] = getattr(settings, field)
         for name in given:
-            if name not in names:
+            if name not in names and (name, field) != ("*", "attenuation_db_per_m"):
                 raise place.at(field).at(name).error(f"no carrier {name!r}; {suggestion(name, names)}")
         if given and not settings.source:
             raise place.at(field).error(
@@ -269,7 +270,7 @@ def _kind(
 
 def _on_carrier(settings: FoliageSettings, carrier: Carrier, place: Place) -> tuple[float, float, str]:
     """γ [dB/m], A_m [dB] and their source on a carrier."""
-    given = settings.attenuation_db_per_m.get(carrier.name)
+    given = settings.attenuation_db_per_m.get(carrier.name, settings.attenuation_db_per_m.get("*"))
     if given is not None:
         return given, settings.maximum_db.get(carrier.name, np.inf), settings.source
     megahertz, low, high = carrier.frequency_hz / 1e6, _TABLE_1[0, 0], _TABLE_1[-1, 0]

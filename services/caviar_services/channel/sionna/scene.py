@@ -134,9 +134,9 @@ class SionnaScene(NumberedTriangles):
         own = own_materials(assets)
         skins = self._skins = self._skin_materials(pool, settings, own)
         description = find_scenery(assets)
-        pieces, self.notes = file_pieces(description)
+        pieces, self.notes = file_pieces(description, settings.foliage)
         """Warnings for the user about the scenery."""
-        self._scene = new_scene(piece.material for piece in pieces.values())
+        self._scene = new_scene(piece.material for piece in pieces.values() if piece.material is not None)
         self._objects, self._foliage = settings.objects, settings.foliage
         leaves = [name for name in pieces if self._foliage.material_for(name)]
         self.foliage_meshes = {name: pieces.pop(name).mesh for name in leaves}

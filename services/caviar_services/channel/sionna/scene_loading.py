@@ -69,16 +69,19 @@ class Piece:
     mesh: Mesh
     """In world coordinates [m]."""
     material: Any
-    """Of the ray tracer: a `sionna.rt.RadioMaterialBase`."""
+    """Of the ray tracer: a `sionna.rt.RadioMaterialBase`; None: foliage that has none."""
     place: str
     """Where it stands, for messages: file, line and name."""
 
 
-def file_pieces(description: Path | None) -> tuple[dict[str, Piece], tuple[str, ...]]:
+def file_pieces(
+    description: Path | None, foliage: ObjectMaterials | None = None
+) -> tuple[dict[str, Piece], tuple[str, ...]]:
     """Read the pieces of scenery, by name, in the order of the description.
 
     Args:
         description: The scene description; None: there is none.
+        foliage: Pieces that need no radio material, since waves pass through them.
 
     Returns:
         The pieces, and a warning where meshes without triangles are left out.
@@ -91,7 +94,8 @@ def file_pieces(description: Path | None) -> tuple[dict[str, Piece], tuple[str, 
     pieces, empty = {}, []
     materials: dict[str, Any] = {}
     for shape in read_scenery(description, asset_name(description)).shapes:
-        material = _radio_material(shape, materials)
+        leaves = shape.radio is None and foliage is not None and foliage.material_for(shape.name)
+        material = None if leaves else _radio_material(shape, materials)
         mesh = world_mesh(shape)
         if len(mesh.faces):
             pieces[shape.name] = Piece(mesh, material, shape.place)

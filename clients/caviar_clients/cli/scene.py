@@ -1,0 +1,320 @@
+"""``caviar scene``: scenes of other programs are imported, and looked at with their traffic."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Annotated
+from xml.etree import ElementTree
+
+import msgspec
+import typer
+from rich.console import Console
+
+from caviar_clients.cli.shared import print_line, progress_bar
+from caviar_protocol.errors import AssetError
+
+if TYPE_CHECKING:
+    from caviar_space.imported_scenes import ImportedScene
+    from caviar_space.mitsuba_xml import SceneryShape
+
+app = typer.Typer()
+TEMPLATE = "new/imported.toml"
+"""The scenarios of an imported scene, in the package of scenarios."""
+
+
+@app.callback()
+def scenes() -> None:
+    """Scenes: import, picture."""
+
+
+@app.command("import")
+def import_command(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="Wireless InSite project: its folder, .study.xml, or one .city, .ter, .object or .veg",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the scene, which is made")],
+    sumo: Annotated[
+        Path | None,
+        typer.Option(help="SUMO configuration, .sumocfg; by default the one in the project's folder"),
+    ] = None,
+    lidar: Annotated[
+        str,
+        typer.Option(help="X0,Y0,X1,Y1 of the grid of LIDARs beside the receivers [m]; by default no LIDAR"),
+    ] = "",
+) -> None:
+    """Import a scene: meshes, materials, and scenarios with the project's transmitters and traffic."""
+    from caviar_space.imported_scenes import write_scene
+    from caviar_space.wireless_insite import read_project
+
+    console = Console()
+    with progress_bar(Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(path.name, total=1.0)
+        scene = read_project(path, lambda name, share: bar.update(task, description=name, completed=share))
+    more = _scenarios(scene, path, sumo, lidar)
+    write_scene(scene, out, more)
+    for note in scene.notes:
+        print_line(console, f"note: {note}")
+    kinds = [piece.kind for piece in scene.pieces.values()]
+    counted = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    print_line(console, f"{out}: {counted}; {len(scene.transmitters_m)} TX, {len(scene.receivers_m)} RX")
+    for name in more:
+        if name.endswith(".toml"):
+            print_line(
+                console, f"{out / name} is a scenario; run it with: caviar run {shlex.quote(str(out / name))}"
+            )
+
+
+@app.command("picture")
+def picture_command(
+    scenario: Annotated[Path, typer.Argument(help="scenario with traffic by SUMO, by name or file")],
+    out: Annotated[Path, typer.Option(help="PNG that is written")] = Path("scene.png"),
+    frames: Annotated[int, typer.Option(min=1, help="frames of traffic, of which the last is drawn")] = 100,
+) -> None:
+    """Draw a scene from above: materials, lanes and traffic; count vehicles below roofs over all frames."""
+    from caviar_clients.plots.map import MapData, draw_site
+    from caviar_clients.plots.rays import covered_objects, footprints, lanes_of
+    from caviar_clients.session.prepared import prepare
+    from caviar_clients.session.scenes import simulated_scenes
+    from caviar_protocol.scenario import load_scenario
+    from caviar_protocol.scenario.rules import with_overrides
+    from caviar_space.materials import ObjectMaterials
+    from caviar_space.mitsuba_xml import find_scenery, read_scenery
+
+    found = simulated_scenes(scenario, prepare(with_overrides(load_scenario(scenario), frames=frames)))
+    description = find_scenery(found.assets)
+    channel = next((spec.settings for spec in found.services.values() if spec.role == "channel"), {})
+    foliage = ObjectMaterials({key: key for key in channel.get("foliage", {})})
+    by_label: dict[str, list[SceneryShape]] = {}
+    for shape in read_scenery(description).shapes if description else ():
+        what = "foliage" if foliage.material_for(shape.name) else _material_label(shape)
+        by_label.setdefault(what, []).append(shape)
+    drawn = {
+        label: footprints((shape.file, shape.to_world) for shape in shapes)
+        for label, shapes in by_label.items()
+    }
+    traffic = next(
+        (s.settings for s in found.services.values() if s.role == "world" and "net" in s.settings), {}
+    )
+    lanes = (
+        lanes_of(Path(traffic["net"]), traffic.get("offset_m", (0, 0, 0)), traffic.get("yaw_deg", 0.0))
+        if traffic
+        else []
+    )
+    last = found.instants[-1].scene
+    draw_site(
+        MapData(last, None, None, None, None, None, f"{found.name}, frame {frames - 1}"), drawn, lanes, out
+    )
+    names: set[str] = set()
+    seen, below = 0, dict[str, int]()
+    for instant in found.instants:
+        for name, count in covered_objects(
+            instant.scene, [d for label, d in drawn.items() if label != "foliage"]
+        ):
+            names.add(name)
+            seen += 1
+            if count:
+                below[name] = below.get(name, 0) + 1
+    console = Console()
+    print_line(console, f"{out}: {len(drawn)} materials, {len(lanes)} lanes, {len(last.names)} objects")
+    print_line(
+        console,
+        f"{len(names)} objects in {len(found.instants)} frames, {seen} positions: "
+        f"{sum(below.values())} below a roof{': ' + ', '.join(sorted(below)[:5]) if below else ''}",
+    )
+
+
+def _material_label(shape: SceneryShape) -> str:
+    """Name of a material with its constants for radio waves."""
+    given = dict(re.findall(r'name="(\w+)" value="([^"]+)"', shape.radio.xml)) if shape.radio else {}
+    known = {
+        "relative_permittivity": "ε {}",
+        "conductivity": "σ {} S/m",
+        "thickness": "{} m",
+        "type": "ITU {}",
+    }
+    said = ", ".join(text.format(given[key]) for key, text in known.items() if key in given)
+    return f"{shape.material or 'no material'} ({said})" if said else shape.material
+
+
+def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) -> dict[str, bytes]:
+    """Content of the scenarios ``mobile.toml`` and ``fixed.toml``, and of SUMO's files, by path.
+
+    Raises:
+        AssetError: A file of SUMO is missing or wrong.
+    """
+    folder = path if path.is_dir() else path.parent
+    found = [sumo] if sumo else sorted(folder.rglob("*.sumocfg"))
+    if len(found) > 1:
+        raise AssetError(f"{folder} has {len(found)} .sumocfg; name one with --sumo {found[0]}")
+    if not found or not scene.transmitters_m or not scene.frequencies_hz:
+        lacking = [
+            what
+            for what, there in (
+                ("a SUMO configuration (--sumo)", found),
+                ("transmitters (.txrx)", scene.transmitters_m),
+                ("frequencies (.study.xml)", scene.frequencies_hz),
+            )
+            if not there
+        ]
+        scene.notes.append(f"no scenario is written: the project lacks {', '.join(lacking)}")
+        return {}
+    files, settings = _traffic(found[0])
+    carriers = [f"{frequency / 1e9:g}GHz" for frequency in scene.frequencies_hz]
+    grid = _grid(lidar)
+    foliage = ""
+    if any(piece.kind == "foliage" for piece in scene.pieces.values()):
+        if scene.without_foliage_loss:
+            values = 'attenuation_db_per_m = { "*" = 0.0 }\nsource = "FoliageModel None of the study"\n'
+        else:
+            values = (
+                '# attenuation_db_per_m = { … }, source = "…": see the Foliage section of topics/channel\n'
+            )
+        foliage = f'[services.channel.settings.foliage."foliage-*"]\n{values}\n'
+    common = {
+        **settings,
+        "command": " ".join(shlex.join(["caviar", *sys.argv[1:]]).split()),
+        "carriers": "".join(
+            f'[[carriers]]\nname = "{name}"\nfrequency_hz = {frequency:.15g}\nbandwidth_hz = 100e6\n\n'
+            for name, frequency in zip(carriers, scene.frequencies_hz, strict=True)
+        ),
+        "foliage": foliage,
+    }
+    mounted = {"on": "vehicle.*", "count": 10, "mount": "roof"}
+    transmitters = [
+        {
+            "name": f"tx{number or ''}",
+            "role": "tx",
+            "position_m": list(place),
+            "yaw_deg": 90.0,
+            "power_dbm": 0.0,
+        }
+        for number, place in enumerate(scene.transmitters_m)
+    ]
+    # The row of elements lies along the vehicle.
+    on_vehicles = {"name": "rx", "role": "rx", **mounted, "position_m": [0.0, 0.0, 0.1], "yaw_deg": -90.0}
+    standing = [
+        {"name": f"rx{number}", "role": "rx", "position_m": list(place)}
+        for number, place in enumerate(scene.receivers_m)
+    ]
+    rx_elements = {"array": {"columns": 8}}
+    made: dict[str, bytes] = {f"sumo/{name}": content for name, content in files.items()}
+    for name, elements, receivers in (("mobile", 32, [on_vehicles]), ("fixed", 64, standing)):
+        if not receivers:
+            continue
+        devices = [{**tx, "kind": "antenna", "array": {"columns": elements}} for tx in transmitters]
+        devices += [{**rx, "kind": "antenna", **rx_elements} for rx in receivers]
+        with_lidar = grid and name == "mobile"
+        if with_lidar:
+            scanner = {
+                "beams": 32,
+                "azimuth_steps": 900,
+                "elevation_deg": [-25.0, 3.0],
+                "range_m": [0.5, 100.0],
+            }
+            devices.append(
+                {"name": "lidar", "kind": "lidar", **mounted, "position_m": [0.0, 0.0, 0.5], **scanner}
+            )
+        what = "ten vehicles with receivers" if name == "mobile" else f"{len(standing)} receivers that stand"
+        made[f"{name}.toml"] = _filled(
+            {
+                **common,
+                "title": f"Scene {scene.name} with SUMO's traffic and {what}",
+                "name": f"{scene.name}-{name}",
+                "frames": "1" if name == "mobile" else "20",
+                "period": "1_000_000_000" if name == "mobile" else "500_000_000",
+                "lidar_topic": '"lidar.grid", ' if with_lidar else "",
+                "lidar_service": grid if with_lidar else "",
+                "devices": "\n".join(
+                    "[[devices]]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in device.items())
+                    for device in devices
+                ),
+            }
+        )
+    return made
+
+
+def _filled(values: dict[str, str]) -> bytes:
+    text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()
+    return Template(text).substitute(values).encode()
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    return msgspec.json.encode(value).decode()
+
+
+def _grid(lidar: str) -> str:
+    """Service of LIDARs with a grid of 20 by 200 by 10 cells, the longer axis with more; empty: none."""
+    if not lidar:
+        return ""
+    try:
+        x0, y0, x1, y1 = (float(word) for word in lidar.split(","))
+    except ValueError:
+        x0 = y0 = x1 = y1 = 0.0
+    if not (x0 < x1 and y0 < y1):
+        raise AssetError(f"--lidar {lidar}: write X0,Y0,X1,Y1 [m], the lower corner first: 744,429,767,679")
+    cells = [20, 200, 10] if x1 - x0 < y1 - y0 else [200, 20, 10]
+    grid = f"{{ minimum_m = [{x0}, {y0}, 0.0], maximum_m = [{x1}, {y1}, 10.0], cells = {cells} }}"
+    return (
+        '[services.lidar]\nrole = "sensors"\nuse = "lidar"\nbudget_ms = 150\n\n'
+        f"[services.lidar.settings]\npoints_every = 0  # the grid alone\ngrid = {grid}\n"
+    )
+
+
+def _traffic(config: Path) -> tuple[dict[str, bytes], dict[str, str]]:
+    """SUMO's files by name, and the settings of the world, of a configuration."""
+    from caviar_space.meshes import SHAPES
+
+    def parsed(file: Path) -> tuple[bytes, ElementTree.Element]:
+        try:
+            data = file.read_bytes()
+            return data, ElementTree.fromstring(data)  # noqa: S314 - expat bounds what entities expand to
+        except OSError as error:
+            raise AssetError(f"cannot read {file}: {error.strerror}; named by {config}") from error
+        except ElementTree.ParseError as error:
+            raise AssetError(f"{file}:{error.position[0]}: {error}; mend the XML") from error
+
+    files: dict[str, bytes] = {}
+    roots: dict[str, list[ElementTree.Element]] = {}
+    names: dict[str, list[str]] = {"net-file": [], "route-files": [], "additional-files": []}
+    _, root = parsed(config)
+    for key, found in names.items():
+        for name in (part.strip() for each in root.iter(key) for part in each.get("value", "").split(",")):
+            if name:
+                files[Path(name).name], element = parsed(config.parent / name)
+                roots.setdefault(key, []).append(element)
+                found.append(f"file:sumo/{Path(name).name}")
+    if len(names["net-file"]) != 1 or not names["route-files"]:
+        raise AssetError(f"{config} names {len(names['net-file'])} net-file and {len(names['route-files'])} "
+                         "route-files; write one net-file, and route-files")  # fmt: skip
+    location = roots["net-file"][0].find("location")
+    offset = "" if location is None else location.get("netOffset", "")
+    try:
+        x, y = (-float(word) + 0.0 for word in offset.split(","))
+    except ValueError as error:
+        net = config.parent / names["net-file"][0].removeprefix("file:sumo/")
+        raise AssetError(f"{net}: <location> has the netOffset {offset!r}; write x,y in metres") from error
+    kinds = {
+        kind.get("id", ""): kind.get("id", "").lower()
+        for element in roots["route-files"] + roots.get("additional-files", [])
+        for kind in element.iter("vType")
+        if kind.get("id", "").lower() in SHAPES
+    }
+    additional, classes = names["additional-files"], ", ".join(f'"{k}" = "{v}"' for k, v in kinds.items())
+    return files, {
+        "net": _toml(names["net-file"][0]),
+        "routes": _toml(names["route-files"]),
+        "additional": f"additional = {_toml(additional)}\n" if additional else "",
+        "classes": f"classes = {{ {classes} }}" if classes else "",
+        "offset": f"{x!r}, {y!r}",
+    }

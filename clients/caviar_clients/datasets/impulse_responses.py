@@ -1,0 +1,182 @@
+"""Impulse responses between antenna elements: the paths of each user, with the phases of both arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from caviar_protocol.arrays import Complex128Array, Float64Array
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.space.antenna_arrays import steering_vector
+from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
+from caviar_protocol.topics.channel import PLANE_WAVES
+from caviar_protocol.topics.scene import AntennaArray, AntennaDevice
+
+if TYPE_CHECKING:
+    from caviar_clients.datasets.user_rows import Users
+
+
+class ImpulseResponses:
+    """Impulse responses of users, as the ``cir_generator`` of Sionna's ``CIRDataset`` gives them.
+
+    Calling it yields for each user, in their order, ``(a, tau)``:
+
+    - ``a``, complex, Shape ``[1, Nr, 1, Nt, P, S]``: gain of each path between elements, with the phase of
+      the carrier, in each time step: H(Δf, Δt) = Σ a·exp(−j2πΔf·τ) is ``channel.hf`` but for the Doppler
+      shift of Δf, ν·Δf/f;
+    - ``tau``, float, Shape ``[1, 1, P]``: delay [s].
+
+    Paths that a user lacks are zeros: P is the same for all users, as that of the one that has most.
+
+    Args:
+        users: Of one shape of arrays, with ``channel`` and ``scene`` recorded.
+        time_steps: S.
+        sampling_frequency: [Hz] of the time steps, the first of which is the scene's instant.
+        paths: P; None: as many as the user with most has.
+
+    Raises:
+        RecordingError: Arrays differ between users, see spherical waves, or have several polarizations or
+            panels, whose paths have amplitudes of their own that are not recorded.
+
+    Example:
+        >>> import caviar
+        >>> cir = caviar.dataset("data/s008").cir()  # doctest: +SKIP
+        >>> cir.shape  # doctest: +SKIP
+        {'num_rx': 1, 'num_rx_ant': 8, 'num_tx': 1, 'num_tx_ant': 64, 'num_paths': 43, 'num_time_steps': 1}
+    """
+
+    def __init__(
+        self, users: Users, time_steps: int = 1, sampling_frequency: float = 1.0, paths: int | None = None
+    ) -> None:
+        if time_steps < 1 or sampling_frequency <= 0.0:
+            raise ValueError(
+                f"time_steps {time_steps}, sampling_frequency {sampling_frequency}: both above 0"
+            )
+        scenes = users.dataset.table("scenes")
+        for episode, scene, rung in zip(scenes["episode"], scenes["scene"], scenes["rung"], strict=True):
+            if rung and rung not in PLANE_WAVES:
+                raise RecordingError(
+                    f"{users.dataset.location}, episode {episode}, scene {scene}: the channel is {rung}, in "
+                    "which each pair of elements has paths of its own; use channel.hf or channel.h"
+                )
+        self._users = users
+        self._times = np.arange(time_steps) / sampling_frequency
+        transmit, receive = (only_array(users, end) for end in ("tx", "rx"))
+        self.shape: Mapping[str, int] = {
+            "num_rx": 1,
+            "num_rx_ant": receive.size,
+            "num_tx": 1,
+            "num_tx_ant": transmit.size,
+            "num_paths": int(users["paths"].max(initial=0)) if paths is None else paths,
+            "num_time_steps": time_steps,
+        }
+        """Sizes of ``a``, by the names of the arguments of ``CIRDataset``."""
+
+    def __len__(self) -> int:
+        """Number of users."""
+        return len(self._users)
+
+    def __call__(self) -> Iterator[tuple[Complex128Array, Float64Array]]:
+        for part in self._users.parts(256):
+            a, tau = self.block(part)
+            yield from zip(a[:, None, :, None], tau[:, None, None], strict=True)
+
+    def block(self, users: Users) -> tuple[Complex128Array, Float64Array]:
+        """Compute the responses of some of the users.
+
+        Args:
+            users: Of those that this was made of.
+
+        Returns:
+            ``a``, Shape ``[N, Nr, Nt, P, S]``, and ``tau`` [s], Shape ``[N, P]``.
+
+        Raises:
+            RecordingError: The channel was not recorded.
+        """
+        names = ("a", "tau", "aod", "aoa", "doppler")
+        rows = users.read([f"channel.{name}" for name in names])
+        found, paths = np.nan_to_num(rows["channel.a"]), self.shape["num_paths"]
+        transmit, receive = (
+            self._responses(users, end, rows[f"channel.{angles}"])
+            for end, angles in (("tx", "aod"), ("rx", "aoa"))
+        )
+        shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
+        a = np.einsum("up,upm,upn,ups->umnps", found, receive, transmit, shifts, optimize=True)
+        missing = paths - found.shape[1]
+        return (
+            np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)]),
+            np.pad(np.nan_to_num(rows["channel.tau"]), [(0, 0), (0, missing)]),
+        )
+
+    def _responses(self, users: Users, end: str, angles: Float64Array) -> Complex128Array:
+        """Phases of the elements of one end, Shape ``[N, P, elements]``, by angles in world axes."""
+        placed = [*placed_antennas(users, end)]
+        turns = np.stack([rotation_matrix(antenna.orientation.tolist()) for antenna in placed])
+        local = np.einsum("uji,upj->upi", turns, unit_vectors(np.nan_to_num(angles)))
+        return steering_vector(placed[0].array, local)
+
+
+class PlacedAntenna(NamedTuple):
+    """Antenna of a user where it is in its scene."""
+
+    array: AntennaArray
+    position: Float64Array
+    """In world axes [m], Shape ``[3]``."""
+    orientation: Float64Array
+    """(w, x, y, z), device into world, Shape ``[4]``."""
+    power_dbm: float
+
+
+def placed_antennas(users: Users, end: str) -> Iterator[PlacedAntenna]:
+    """Find the antenna of each user at one end, in the order of the users.
+
+    Args:
+        users: With topic ``scene`` recorded.
+        end: ``tx`` or ``rx``.
+
+    Raises:
+        RecordingError: There is no scene.
+    """
+    scene, found = (-1, -1), dict[str, PlacedAntenna]()
+    for at in zip(users["episode"].tolist(), users["scene"].tolist(), users[end].tolist(), strict=True):
+        if at[:2] != scene:
+            scene = at[:2]
+            arrays = users.dataset.episode(scene[0])["scene"].select(episode=scene[0], frames=[scene[1]])
+            poses, devices = arrays.devices, arrays.devices.devices
+            rows = zip(poses.keys, poses.position[0], poses.orientation[0], strict=True)
+            found = {
+                name: PlacedAntenna(device.array, position, orientation, device.power_dbm)
+                for name, position, orientation in rows
+                if isinstance(device := devices[name], AntennaDevice)
+            }
+        yield found[at[2]]
+
+
+def only_array(users: Users, end: str) -> AntennaArray:
+    """Find the array that all users have at one end, whose elements differ by their places alone.
+
+    One user of each kind is looked at.
+
+    Args:
+        users: With topic ``scene`` recorded.
+        end: ``tx`` or ``rx``.
+
+    Raises:
+        RecordingError: Arrays differ, or have several polarizations or panels, for which paths are not
+            recorded.
+    """
+    place, arrays = users.dataset.location, {a.array for a in placed_antennas(users.one_of_each_kind(), end)}
+    if len(arrays) != 1:
+        raise RecordingError(
+            f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
+            f"users[users[{end!r}] == NAME], or with --tx or --object-class"
+        )
+    (array,) = arrays
+    if not array.is_uniform:
+        raise RecordingError(
+            f"{place}: the arrays at {end} have several polarizations or panels, for which paths are not "
+            "recorded; use channel.hf or channel.h"
+        )
+    return array

@@ -1,0 +1,544 @@
+"""Formats of other programs: conformance of each, and their numbers against those of the dataset."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from caviar_clients.datasets.catalogue import Catalogue
+from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
+from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.impulse_responses import placed_antennas
+from caviar_clients.datasets.plan import plan_dataset
+from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.verification.verify import verify
+from caviar_formats.base import FORMATS, Format, export_users, find_format
+from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
+from caviar_formats.runs import open_source
+from caviar_formats.testing import FormatConformance
+from caviar_protocol.digest import file_digest
+from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.topics import AntennaArray, AntennaDevice
+
+pytestmark = pytest.mark.slow
+
+EPISODES, SCENES = 2, 3
+FREQUENCY_HZ = 28e9
+
+
+def generated(out: Path, scenario: str | Path, episodes: int = EPISODES, scenes: int = SCENES) -> Dataset:
+    """Generate a dataset in this process."""
+    directory = DatasetDirectory(out)
+    plan = plan_dataset(load_scenario(str(scenario)), episodes=episodes, scenes=scenes)
+    with writing_dataset(directory):
+        catalogue = Catalogue(directory.catalogue, writable=True)
+        catalogue.plan(plan.settings(), episodes)
+        for number in range(episodes):
+            result = play_episode(EpisodeTask(plan.scenario, number, str(out)))
+            assert result.rows is not None, result.error
+            catalogue.add(result.rows, result.measured)
+        catalogue.close()
+    return Dataset(out)
+
+
+SCENARIO = """
+[run]
+name = "asymmetric"
+frames = 3
+sampling_period_ns = 100_000_000
+record = ["scene", "channel", "channel.h", "channel.hf", "link"]
+
+[[carriers]]
+name = "mm"
+frequency_hz = 28e9
+bandwidth_hz = 100e6
+subcarriers = 8
+subcarrier_spacing_hz = 1e6
+
+[services.world]
+role = "world"
+use = "trajectory"
+budget_ms = 20
+
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
+
+[services.channel]
+role = "channel"
+use = "geometric"
+budget_ms = 100
+
+[services.channel.settings]
+components = 4
+
+[services.link]
+role = "link"
+use = "beams"
+budget_ms = 20
+
+[services.agent]
+role = "agent"
+use = "los-beam"
+budget_ms = 20
+
+[services.recorder]
+role = "recorder"
+use = "mcap"
+budget_ms = 100
+
+[[devices]]
+name = "bs"
+kind = "antenna"
+role = "tx"
+position_m = [3.0, -40.0, 12.0]
+yaw_deg = 70.0
+pitch_deg = 10.0
+roll_deg = 20.0
+array = { rows = 2, columns = 4 }
+
+[[devices]]
+name = "rx"
+kind = "antenna"
+role = "rx"
+on = "car"
+position_m = [0.3, 0.2, 1.0]
+yaw_deg = -35.0
+array = { rows = 1, columns = 3 }
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("formats")
+    (place / "asymmetric.toml").write_text(SCENARIO)
+    return generated(place / "data", place / "asymmetric.toml").directory.path
+
+
+@pytest.fixture
+def data(folder: Path) -> Dataset:
+    return Dataset(folder)
+
+
+def exported(data: Dataset, name: str, out: Path, flavour: str = "") -> Path:
+    export_users(data.users(), find_format(name, flavour), out / name)
+    return out / name
+
+
+@pytest.mark.parametrize("name", FORMATS)
+class TestConformance(FormatConformance):
+    @pytest.fixture(autouse=True)
+    def _name(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        if find_format(name).write.__func__ is Format.write:  # type: ignore[attr-defined]
+            pytest.skip("is imported alone")
+        monkeypatch.setattr(type(self), "name", name, raising=False)
+
+    @pytest.fixture
+    def dataset(self, data: Dataset) -> Dataset:
+        return data
+
+
+def response(a: Any, tau: Any) -> Any:
+    """H(f) of the eight subcarriers by its definition, Shape ``[8, Nr, Nt]``."""
+    offsets = 1e6 * (np.arange(8) - 4)
+    return np.einsum("mnp,kp->kmn", a, np.exp(-2j * np.pi * offsets[:, None] * tau))
+
+
+def nmse_db(found: Any, right: Any) -> float:
+    return float(20 * np.log10(np.linalg.norm(found - right) / np.linalg.norm(right)))
+
+
+def test_npz_has_each_user_in_its_row(data: Dataset, tmp_path: Path) -> None:
+    with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as rows:
+        users = data.users()
+        for name in (*users.recorded(), "x_m", "rx", "gain_db"):
+            assert np.array_equal(rows[name], users[name], equal_nan=rows[name].dtype.kind in "fc"), name
+
+
+def test_impulse_responses_make_the_recorded_wideband_channel(data: Dataset, tmp_path: Path) -> None:
+    users = data.users()
+    cir = users.cir()
+    assert (len(cir), cir.shape["num_tx_ant"], cir.shape["num_rx_ant"]) == (len(users), 8, 3)
+    with np.load(exported(data, "sionna", tmp_path) / "cir-00000.npz") as rows:
+        for at, (a, tau) in enumerate(cir()):
+            right = users["channel.hf"][at, 0]
+            assert nmse_db(response(a[0, :, 0, ..., 0], tau[0, 0]), right) < -100
+            assert nmse_db(response(rows["a"][at, 0, :, 0, ..., 0], rows["tau"][at, 0, 0]), right) < -100
+
+
+def test_sionna_phy_makes_the_recorded_wideband_channel_of_them(data: Dataset) -> None:
+    channel = pytest.importorskip("sionna.phy.channel")
+    torch = pytest.importorskip("torch")
+    users = data.users()
+    cir = users.cir()
+    batch = channel.CIRDataset(cir, batch_size=len(cir), precision="double", **cir.shape)
+    a, tau = batch(len(cir), 1, 1.0)
+    offsets = torch.tensor(1e6 * (np.arange(8) - 4))
+    found = channel.cir_to_ofdm_channel(offsets, a, tau).cpu().numpy()[:, 0, :, 0, :, 0]
+    right = users["channel.hf"][:, 0].transpose(0, 2, 3, 1)
+    best = [min(nmse_db(row, other) for other in right) for row in found]  # it draws users at random
+    assert max(best) < -100
+
+
+def test_parquet_has_each_user_in_its_row_and_units(data: Dataset, tmp_path: Path) -> None:
+    import duckdb
+
+    out, users = exported(data, "parquet", tmp_path), data.users()
+    query = 'SELECT rx, x_m, "channel.tau" AS tau, "channel.h.imag" AS h, "channel.aod" AS aod FROM \'{}\''
+    rows = duckdb.sql(query.format(out / "users" / "*.parquet")).fetchall()
+    for at, (rx, x, tau, h, aod) in enumerate(rows):
+        assert (rx, x) == (users["rx"][at], users["x_m"][at])
+        assert np.array_equal(tau, users.rows(["channel.tau"])["channel.tau"][at])
+        assert np.array_equal(h, users["channel.h"][at].imag.ravel())
+        assert np.array_equal(np.reshape(aod, (-1, 2)), users.rows(["channel.aod"])["channel.aod"][at])
+    notes = dict(
+        duckdb.execute(
+            "SELECT key, value FROM parquet_kv_metadata(?)", [str(out / "users/part-00000.parquet")]
+        ).fetchall()
+    )
+    assert json.loads(notes[b"channel.tau"])["unit"] == "s"
+    assert json.loads(notes[b"gain_db"])["unit"] == "dB"
+    assert json.loads(notes[b"channel.h.real"])["shape"] == "[3, 8]"
+
+
+def test_croissant_names_each_file_with_its_digest(data: Dataset, tmp_path: Path) -> None:
+    out = exported(data, "huggingface", tmp_path)
+    described = json.loads((out / "croissant.json").read_text())
+    found = {file["contentUrl"]: file["sha256"] for file in described["distribution"]}
+    assert found == {name: file_digest(out / name) for name in ("users.parquet", "scenes.parquet")}
+    fields = {
+        field["name"]: field["dataType"] for record in described["recordSet"] for field in record["field"]
+    }
+    assert (fields["users/rx"], fields["users/channel.tau"]) == ("sc:Text", "sc:Float")
+
+
+def test_readers_of_hugging_face_and_croissant_open_the_folder(data: Dataset, tmp_path: Path) -> None:
+    datasets, croissant = pytest.importorskip("datasets"), pytest.importorskip("mlcroissant")
+    out, users = exported(data, "huggingface", tmp_path), data.users()
+    table = datasets.load_dataset(str(out), "users", split="train", cache_dir=str(tmp_path / "cache"))
+    assert table["channel.tau"][0] == users.rows(["channel.tau"])["channel.tau"][0].tolist()
+    os.chdir(out)
+    records = croissant.Dataset("croissant.json").records("users")
+    assert [row["users/rx"].decode() for row in records] == users["rx"].tolist()
+
+
+def test_a_run_is_exported_like_a_dataset(data: Dataset, tmp_path: Path) -> None:
+    run = data.directory.episode(1)
+    with open_source(str(run)) as found:
+        assert np.array_equal(found.users()["channel.h"], data.select([1]).users()["channel.h"])
+        assert found.cir().shape == data.cir().shape
+
+
+def test_an_unknown_format_names_those_there_are() -> None:
+    with pytest.raises(RunError, match="did you mean 'parquet'"):
+        find_format("parkuet")
+
+
+DEVICES = (
+    AntennaDevice(
+        name="bs", role="tx", position=(0.0, 0.0, 10.0), orientation=(0.8, 0.1, -0.3, 0.51),
+        array=AntennaArray(rows=2, columns=4),
+    ),
+    AntennaDevice(name="u", role="rx", position=(30.0, 5.0, 1.5), array=AntennaArray(columns=3)),
+)  # fmt: skip
+
+
+def imported_scenes(gain: float = 1e-5) -> Iterator[ImportedScene]:
+    """Two episodes of two scenes, of three paths each, that belong to no scene in particular."""
+    for number in range(4):
+        draw = np.random.default_rng(number)
+        paths = Paths(
+            tx="bs", rx="u", los=number % 2 == 0, a=gain * (draw.normal(size=(1, 3)) + 1j),
+            tau=np.array([1.2e-7, 1.1e-7, 1.5e-7]), aod=draw.uniform(0.5, 2.0, (3, 2)),
+            aoa=draw.uniform(0.5, 2.0, (3, 2)), interactions=np.array([[1, 0], [0, 0], [2, 1]], np.uint8),
+        )  # fmt: skip
+        yield ImportedScene(episode=number // 2, scene=number % 2, devices=DEVICES, paths=[paths])
+
+
+def source_of(place: Path, scenes: Iterable[ImportedScene]) -> Source:
+    carriers = (Carrier(name="mm", frequency_hz=FREQUENCY_HZ),)
+    return Source(path=place, scenes=scenes, carriers=carriers, scenes_of_episode=2, lacks="no sensors")
+
+
+def test_an_imported_dataset_is_one_that_everything_takes(tmp_path: Path) -> None:
+    data = Dataset(import_dataset(source_of(tmp_path / "files", imported_scenes()), tmp_path / "data"))
+    assert list(verify(data.directory.path)) == []
+    users, right = data.users(), [scene.paths[0] for scene in imported_scenes()]
+    assert users["los"].tolist() == [paths.los for paths in right]
+    for at, paths in enumerate(right):
+        assert np.allclose(users["channel.tau"][at], paths.tau[[1, 0, 2]])
+        assert np.allclose(users["channel.a"][at], paths.a[0, [1, 0, 2]])
+        a, _ = users[at : at + 1].cir().block(users[at : at + 1])
+        assert nmse_db(a[0, ..., 0].sum(-1), users["channel.h"][at]) < -200
+    assert (users["tx_beam"] >= 0).all()
+    assert "channel" in data.episode(0).topics
+    assert "camera" not in data.episode(0).topics
+    assert data.episode(0).metadata.notes == ("no sensors",)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "said"),
+    [
+        (lambda: iter(()), "no scene"),
+        (lambda: islice(imported_scenes(), 3), r"episode 1 has scenes \[0\], and not 0 to 1"),
+        (lambda: imported_scenes(float("nan")), "episode 0: .*channel"),
+    ],
+)
+def test_an_import_that_fails_leaves_nothing(scenes: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=said):
+        import_dataset(source_of(tmp_path / "files", scenes()), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- DeepMIMO -----------------------------------------------------------------------------------------------
+
+
+def described_channels(folder: Path, shapes: Any, quaternions: Any) -> Any:
+    """H by the description of DeepMIMO 4 alone, in our order of elements, Shape ``[N, Nr, Nt]``."""
+    end = "_t000_tx000_r001.npz"
+    files = {file.name.removesuffix(end): np.load(file) for file in folder.glob(f"*{end}")}
+    table = {name: file[name] for name, file in files.items() if name != "user"}
+    gain = np.nan_to_num(10 ** (table["power"] / 20) * np.exp(1j * np.radians(table["phase"])))
+    out = []
+    for user, amplitudes in enumerate(gain):
+        responses = []
+        for name, (columns, rows), q in zip(
+            ("aoa", "aod"), shapes, (quaternions[0][user], quaternions[1][user]), strict=True
+        ):
+            theta, phi = np.nan_to_num(np.radians([table[f"{name}_el"][user], table[f"{name}_az"][user]]))
+            w, x, y, z = q
+            axes = np.array([
+                [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+                [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+            ])  # fmt: skip
+            along = axes @ [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+            places = [(c, rows - 1 - r) for c in range(columns) for r in range(rows)]
+            responses.append(np.exp(1j * np.pi * np.array(places) @ along))
+        out.append((responses[0] * amplitudes) @ responses[1].T)
+    return np.array(out)
+
+
+def test_a_reader_by_the_description_of_deepmimo_finds_h(data: Dataset, tmp_path: Path) -> None:
+    users, folder = data.users(), exported(data, "deepmimo", tmp_path) / "data"
+    poses = [[a.orientation for a in placed_antennas(users, end)] for end in ("rx", "tx")]
+    assert nmse_db(described_channels(folder, ((3, 1), (4, 2)), poses), users["channel.h"]) < -100
+    with np.load(folder / "inter_t000_tx000_r001.npz") as file:
+        assert (file["inter"][:, 0] == 0).tolist() == users["los"].tolist()
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_itself_finds_h(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    dm = pytest.importorskip("deepmimo")
+    users, out = data.users(), exported(data, "deepmimo", tmp_path, flavour)
+    dm.config("scenarios_folder", str(out))
+    loaded = (
+        [dm.load("data")] if flavour == "static" else [s for e in range(2) for s in dm.load(f"data_e{e:06d}")]
+    )
+    row = 0
+    for scene in loaded:
+        here = users[row : row + scene.n_ue]
+        row += scene.n_ue
+        turns = [[euler_deg(a.orientation) for a in placed_antennas(here, end)] for end in ("tx", "rx")]
+        parameters = dm.ChannelParameters(
+            bs_antenna={"shape": [4, 2], "rotation": turns[0][0]},
+            ue_antenna={"shape": [3, 1], "rotation": np.array(turns[1])},
+            ofdm={"subcarriers": 512, "bandwidth": 512e6, "selected_subcarriers": np.arange(4)},
+        )
+        h = np.asarray(scene.compute_channels(parameters)) * np.sqrt(512)
+        right = here["channel.hf"][:, 0, 4:].transpose(0, 2, 3, 1)
+        order = [(i % 4) * 2 + 1 - i // 4 for i in range(8)]
+        assert nmse_db(h, right[:, :, order]) < -60
+        assert scene.los.astype(bool).tolist() == here["los"].tolist()
+
+
+def euler_deg(q: Any) -> list[float]:
+    """Roll, pitch and yaw of a quaternion [°]."""
+    w, x, y, z = q
+    roll, yaw = (
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+    return [float(np.degrees(angle)) for angle in (roll, np.arcsin(2 * (w * y - z * x)), yaw)]
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    folder = exported(data, "deepmimo", tmp_path, flavour)
+    scenario = folder / ("data" if flavour == "static" else "data_e000001")
+    right = data.users() if flavour == "static" else data.select([1]).users()
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    found = Dataset(tmp_path / "back").users()
+    assert len(found) == len(right)
+    assert nmse_db(found["channel.h"], right["channel.h"]) < -100
+    assert found["los"].tolist() == right["los"].tolist()
+    for name in ("channel.tau", "channel.aod", "channel.aoa", "x_m", "gain_db"):
+        assert np.allclose(
+            np.sort(found[name], axis=None), np.sort(right[name], axis=None), rtol=1e-5, atol=1e-12
+        ), name
+    poses = [[a.orientation for a in placed_antennas(users, "rx")] for users in (found, right)]
+    assert np.allclose(*poses)
+    assert list(verify(tmp_path / "back")) == []
+
+
+def broken(content: bytes, how: str) -> bytes:
+    """Damage a file."""
+    return {
+        "empty": b"",
+        "cut": content[: len(content) // 2],
+        "text": b"not of this format",
+        "flipped": content[::-1],
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "text", "flipped"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "params.json",
+        *(f"{name}_t000_tx000_r001.npz" for name in ("power", "aod_el", "rx_pos", "inter", "tx_pos")),
+    ],
+)
+def test_a_damaged_scenario_of_deepmimo_is_named(file: str, how: str, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    (scenario / file).write_bytes(broken((scenario / file).read_bytes(), how))
+    with pytest.raises(RunError, match=file):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deepmimo"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("power", lambda table: table[:, :2]),
+        ("delay", lambda table: table[:3]),
+        ("phase", lambda table: table * np.nan),
+        ("rx_pos", lambda table: table[:, :2]),
+    ],
+)
+def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    file = scenario / f"{name}_t000_tx000_r001.npz"
+    table = np.load(file)[name]
+    np.savez(file, **{name: change(table)})
+    with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+
+
+# --- Wireless InSite ----------------------------------------------------------------------------------------
+
+P2M = """# Receiver Set: three points
+     3
+     1    2
+ -80.0   0.1E-06   0.1E-07
+    1   0   -81.0  {phase}0.1667820E-06    90.0   180.0    90.0     0.0
+Tx-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+    2   1   -90.0  {phase}0.1886919E-06    90.0   152.0725    90.0     27.9275
+Tx-d-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.3325000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+     2    0
+     3    1
+ -95.0   0.1E-06   0.1E-07
+    1   1   -95.0  {phase}0.1886919E-06    90.0   207.9275    90.0   -27.9275
+Tx-R-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.0675000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+"""
+
+
+def p2m(folder: Path, text: str) -> Path:
+    """Write a file of paths."""
+    file = folder / "street.paths.t001_05.r006.p2m"
+    file.write_text(text, encoding="latin-1")
+    return file
+
+
+@pytest.mark.parametrize(("phase", "of_first"), [("", None), ("  -33.0  ", -33.0)])
+def test_paths_of_wireless_insite_become_users_and_npz(
+    phase: str, of_first: float | None, tmp_path: Path
+) -> None:
+    source = find_format("p2m").read(p2m(tmp_path, P2M.format(phase=phase)), 60e9)
+    data = Dataset(import_dataset(source, tmp_path / "data"))
+    assert list(verify(tmp_path / "data")) == []
+    with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
+        assert users["rx"].tolist() == ["r006-00001", "r006-00003"], "a receiver without paths has no place"
+        assert users["los"].tolist() == [True, False]
+        assert np.allclose(20 * np.log10(np.abs(users["channel.a"][0])), [-81.0, -90.0])
+        right = -2 * np.pi * 60e9 * 0.1667820e-6 if of_first is None else np.radians(of_first)
+        assert np.allclose(users["channel.a"][0, 0] / abs(users["channel.a"][0, 0]), np.exp(1j * right))
+        assert np.allclose(np.degrees(users["channel.aoa"][0]), [[90.0, 180.0], [90.0, 152.0725]])
+        assert np.allclose(np.degrees(users["channel.aod"][1, 0]), [90.0, -27.9275])
+        assert users["channel.interactions"][0].tolist() == [[0], [2]]
+        assert users["channel.points"][1, 0].tolist() == [[35.0, 6.75, 5.0]]
+        assert (users["x_m"][1], users["y_m"][1]) == (60.0, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "line"),
+    [
+        ("     3\n", "", 2),
+        ("     3\n", "     2\n", 15),
+        ("     3\n", "     4\n", 22),
+        ("     3\n", "  three\n", 2),
+        ("     3\n", "     3.5\n", 2),
+        ("     3\n", "     -3\n", 2),
+        ("     1    2\n", "     1    1\n", 9),
+        ("     1    2\n", "     1    3\n", 14),
+        ("     1    2\n", "     1\n", 3),
+        (" -80.0   0.1E-06   0.1E-07\n", "", 4),
+        ("Tx-d-Rx", "Tx-X-Rx", 10),
+        ("Tx-d-Rx", "Tx-d", 10),
+        ("Tx-d-Rx\n", "", 10),
+        ("Tx-d-Rx", "Tx-d-d-Rx", 14),
+        ("   -81.0 ", "   81.0 ", 8),
+        ("   -81.0 ", "   nan ", 5),
+        ("   -81.0 ", "   -81.0 12.0 13.0 ", 5),
+        ("0.1667820E-06    90.0   180.0", "90.0   180.0   0.1667820E-06", 8),
+        ("0.1667820E-06    90.0", "0.1667820E-06    190.0", 8),
+        ("0.1667820E-06", "0.1867820E-06", 8),
+        ("0.3325000E+02", "0,3325000E+02", 12),
+        ("0.3325000E+02", "0.3325000É+02", 0),
+        (" 0.6000000E+02   0.2000000E+02   0.5000000E+01\n     2", "     2", 13),
+    ],
+)
+def test_damaged_files_of_wireless_insite_are_named_with_the_line(
+    before: str, after: str, line: int, tmp_path: Path
+) -> None:
+    text = P2M.format(phase="")
+    assert before in text
+    file = p2m(tmp_path, text.replace(before, after, 1))
+    with pytest.raises(RunError, match=rf"r006.p2m, line {line}:" if line else "r006.p2m: is no file"):
+        import_dataset(find_format("p2m").read(file, 60e9), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("content", ["", "\0" * 4096, "# only a comment\n", "1 2 3 4\n" * 9])
+def test_files_that_are_none_of_wireless_insite_are_refused(content: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"r006.p2m, line"):
+        find_format("p2m").read(p2m(tmp_path, content), 60e9)
+
+
+def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="give --frequency-hz"):
+        find_format("p2m").read(p2m(tmp_path, P2M.format(phase="")))
+
+
+def test_a_real_file_of_wireless_insite(shared_data: Path, tmp_path: Path) -> None:
+    import_dataset(find_format("p2m").read(shared_data / "insite-paths", 60e9), tmp_path / "data")
+    users = Dataset(tmp_path / "data").users()
+    assert (len(users), int(users["paths"].sum())) == (15, 375)
+    assert list(verify(tmp_path / "data")) == []
