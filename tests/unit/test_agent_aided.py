@@ -28,6 +28,8 @@ from caviar_services.agent.sweeps import OutOfBandAgent, OutOfBandSettings
 from caviar_services.link.beams import BeamLink, BeamLinkSettings
 from caviar_services.service import Preparation, RunInfo, StepResult
 
+pytestmark = pytest.mark.slow
+
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 LOW = Carrier(name="sub6", frequency_hz=3.5e9)
 HIGH = Carrier(name="mmwave", frequency_hz=28e9)

@@ -12,6 +12,8 @@ from caviar_protocol.topics import Interaction
 from caviar_services.channel.paths import path_geometry
 from caviar_services.channel.propagation.image_method import distinct, image_points, refined_points
 
+pytestmark = pytest.mark.slow
+
 R, S, T = Interaction.REFLECTION, Interaction.SCATTERING, Interaction.TRANSMISSION
 D = Interaction.DIFFRACTION
 

@@ -24,6 +24,8 @@ from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 from caviar_space.meshes import box
 from caviar_space.obstacles import RISING_RAYS, Surfaces
 
+pytestmark = pytest.mark.slow
+
 HOUSE = box((-5.0, 5.0), (10.0, 20.0), (0.0, 8.0))
 CARRIERS = (Carrier(name="a", frequency_hz=3e9), Carrier(name="b", frequency_hz=28e9))
 

@@ -14,6 +14,8 @@ from caviar_labs.conform import conform
 from caviar_labs.conform.client import Rules
 from caviar_protocol.errors import SetupError
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 

@@ -22,6 +22,8 @@ from caviar_protocol.errors import RunError, SetupError
 from caviar_protocol.scenario import load_scenario, parse_scenario, shipped_scenarios
 from caviar_protocol.topics import AntennaArray
 
+pytestmark = pytest.mark.slow
+
 runner = CliRunner()
 SCENARIOS = Path(__file__).parents[2] / "deploy" / "caviar_scenarios"
 ENVIRONMENT = {"COLUMNS": "150", "TERM": "dumb"}

@@ -24,6 +24,8 @@ from caviar_protocol.scenario import Scenario, load_scenario, parse_scenario
 from caviar_services.agent.baselines import RandomAgent
 from caviar_services.service import Frame, StepResult
 
+pytestmark = pytest.mark.slow
+
 SMOKE = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "smoke.toml"
 
 

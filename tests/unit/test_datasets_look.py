@@ -32,6 +32,8 @@ from caviar_protocol.scenario import load_scenario
 
 pytest.importorskip("matplotlib", reason="pictures need Matplotlib: extra plot")
 
+pytestmark = pytest.mark.slow
+
 SECTIONS = (
     "dataset", "coverage", "sight", "gain", "angles", "beams", "correlation", "lidar", "cameras",
     "generation",

@@ -31,6 +31,8 @@ from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import load_scenario
 from caviar_protocol.topics import Camera, CameraImage, Intrinsics
 
+pytestmark = pytest.mark.slow
+
 EPISODES, SCENES, USERS = 6, 3, 2
 
 

@@ -33,6 +33,8 @@ from caviar_protocol.scenario import load_scenario
 from caviar_protocol.topics import Channel, Link
 from caviar_services.service import Frame
 
+pytestmark = pytest.mark.slow
+
 EPISODES, SCENES = 3, 4
 AT = 1, 2
 """Episode and scene of a fault."""

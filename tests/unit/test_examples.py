@@ -21,6 +21,8 @@ from recording_builders import record_run
 
 from caviar_protocol.scenario import find_scenario, parse_scenario
 
+pytestmark = pytest.mark.slow
+
 PACKAGES = (
     "caviar_protocol",
     "caviar_space",

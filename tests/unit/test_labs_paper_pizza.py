@@ -24,6 +24,8 @@ from caviar_labs.paper.pizza_town import Ways, draw_places, draw_round, is_clear
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 ALONG_Y = np.array([[-23.0, -20.0], [-23.0, 20.0]])
 """Both ends in one street between the blocks."""
 BEHIND = np.array([[0.0, 0.0], [0.0, 42.0]])

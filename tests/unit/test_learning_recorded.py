@@ -22,6 +22,8 @@ from caviar_protocol.observations import OBSERVATION_PARTS, is_feedback
 from caviar_protocol.recording import Recording
 from caviar_protocol.scenario import find_scenario, load_scenario, parse_scenario
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 40
 OBSERVED = ("departure", "position", "velocity", "last_abs_y", "last_beam", "last_rate")
 

@@ -24,6 +24,8 @@ from caviar_services.link.link_budget import noise_power
 from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, FrameInput, Preparation, RunInfo
 
+pytestmark = pytest.mark.slow
+
 BS = antenna("bs", "tx", (1, 4), power_dbm=30.0)
 A = antenna("a", "rx", (1, 1), (20.0, 10.0, 0.0))
 B = antenna("b", "rx", (1, 1), (100.0, -80.0, 60.0))

@@ -25,6 +25,8 @@ from caviar_services.link.nr import Blocks, Numerology, load_tables, numerology
 from caviar_services.link.terminals import CellSettings
 from caviar_services.service import Frame, Preparation, RunInfo, no_progress
 
+pytestmark = pytest.mark.slow
+
 BS = antenna("bs", "tx", power_dbm=30.0)
 USERS = tuple(antenna(name, "rx", position=(20.0, 10.0, 0.0)) for name in "ab")
 NOISE = noise_power(CARRIER, 9.0, 290.0)

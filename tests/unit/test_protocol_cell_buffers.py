@@ -11,6 +11,8 @@ import pytest
 from caviar_protocol.arrays import Int64Array
 from caviar_protocol.cell.buffers import NEVER, UNBOUNDED, PacketBuffers
 
+pytestmark = pytest.mark.slow
+
 
 class Case(NamedTuple):
     """Buffers, and what comes and goes in each slot, Shape ``[S, N]``."""

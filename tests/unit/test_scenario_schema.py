@@ -18,6 +18,8 @@ from caviar_protocol.errors import CaviarError
 from caviar_protocol.scenario import find_scenario, parse_scenario, shipped_scenarios
 from caviar_services.registry import scenario_schema
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 # Experiments, which `caviar policy train` takes, ship beside the scenarios.
 SHIPPED = sorted((ROOT / "deploy" / "caviar_scenarios").rglob("*.toml"))

@@ -23,6 +23,8 @@ from caviar_protocol.topics import Scene, VelocityCommand, WaypointCommand
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.testing import WorldConformance
 
+pytestmark = pytest.mark.slow
+
 CAR: Vector = (40.0, 90.0, 0.75)
 
 

@@ -17,6 +17,8 @@ from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.base import World
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig2", "geometric", "smoke", "street-canyon", "uav-base-station", "uav-munich")
 with_sumo = [
     pytest.mark.sumo,
