@@ -148,7 +148,7 @@ class _Table:
 def _copy(connection: DuckDBPyConnection, select: str, file: Path, about: Mapping[str, str]) -> None:
     """Write rows to a Parquet file with metadata."""
     notes = ", ".join(f"{_text(key)}: {_text(value)}" for key, value in about.items())
-    options = f"FORMAT parquet, COMPRESSION zstd, KV_METADATA {{{notes}}}"
+    options = f"FORMAT parquet, COMPRESSION snappy, KV_METADATA {{{notes}}}"
     connection.execute(f"COPY ({select}) TO {_text(str(file))} ({options})")
 
 
