@@ -376,8 +376,12 @@ def _add_study(scene: ImportedScene, file: Path) -> list[str]:
     frequencies, models, files = values.values()
     try:
         scene.frequencies_hz = sorted({float(value) for value in frequencies})
-    except ValueError as error:
-        raise AssetError(f"{file}: a CarrierFrequency is no number, {error}; correct it") from error
+    except ValueError:
+        scene.frequencies_hz = [math.nan]
+    if not all(0 < frequency < math.inf for frequency in scene.frequencies_hz):
+        raise AssetError(
+            f"{file}: CarrierFrequency {', '.join(frequencies)[:60]}: write numbers above 0 [Hz]"
+        )
     scene.without_foliage_loss = models == ["None"]
     if not files:
         raise AssetError(f"{file}: the study names no file of geometry; export it again")
@@ -397,12 +401,16 @@ def read_project(
     Raises:
         AssetError: A file is missing or wrong; names file, line and remedy.
     """
+    if not path.exists():
+        raise AssetError(
+            f"{path} is not there; name the folder of a project of Wireless InSite, or a file of it"
+        )
     folder = path if path.is_dir() else path.parent
     scene = ImportedScene(name=_slug(path.resolve().name.split(".")[0]) or "scene")
     studies = sorted(folder.glob("*.study.xml")) if path.is_dir() else [path] if path.suffix == ".xml" else []
     if len(studies) > 1:
         raise AssetError(f"{path} has studies {', '.join(s.name for s in studies)}; name one: {studies[0]}")
-    there = sorted(file for file in folder.iterdir() if file.suffix in KINDS) if folder.is_dir() else []
+    there = sorted(file for file in folder.iterdir() if file.suffix in KINDS)
     if studies:
         named = [(folder / name.replace("\\", "/")).resolve() for name in _add_study(scene, studies[0])]
         for file in named:

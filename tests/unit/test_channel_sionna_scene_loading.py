@@ -12,6 +12,7 @@ import pytest
 from caviar_protocol.errors import AssetError
 from caviar_services.channel.sionna.scene_loading import Shape, counting_centre, file_pieces
 from caviar_services.drjit_setup import choose_variant
+from caviar_space.materials import ObjectMaterials
 from caviar_space.meshes import Mesh, box, ply
 
 
@@ -155,3 +156,13 @@ def test_a_radio_material_keeps_its_properties_whatever_its_id(tmp_path: Path, n
     rough = '<float name="scattering_coefficient" value="0.3"/>'
     pieces, _ = file_pieces(described(tmp_path, CONCRETE.format(name, rough) + shape_of("wall", name)))
     assert float(pieces["wall"].material.scattering_coefficient[0]) == pytest.approx(0.3)
+
+
+def test_foliage_alone_may_have_a_material_without_radio_constants(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba").set_variant(choose_variant())
+    leaves = '<bsdf type="diffuse" id="leaves"><rgb name="color" value="0 0.3 0"/></bsdf>'
+    scene = described(tmp_path, leaves + shape_of("wall", "leaves"))
+    with pytest.raises(AssetError, match=r"'leaves' of type 'diffuse', of which .* no radio constants"):
+        file_pieces(scene)
+    pieces, _ = file_pieces(scene, ObjectMaterials({"wa*": "wa*"}))
+    assert pieces["wall"].material is None

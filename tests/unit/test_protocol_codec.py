@@ -205,7 +205,7 @@ def test_an_array_in_another_memory_order_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_non_finite_scalar_does_not_leave(value: float) -> None:
     """Also inside a device, which is no payload of its own."""
-    with pytest.raises(PayloadError, match=r"devices\[0\]\.position\[1\] is (nan|-?inf)"):
+    with pytest.raises(PayloadError, match=r"devices\[0\]\.position\[1\]"):
         encode_payload(scene(CameraDevice(name="x", position=(0.0, value, 0.0))))
 
 

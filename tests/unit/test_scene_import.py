@@ -9,13 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from link_builders import scene_of
+from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
 from caviar_clients.datasets.plan import PRESETS, apply_preset
+from caviar_clients.plots.rays import covered_objects, footprints, lanes_of
 from caviar_protocol.errors import AssetError
 from caviar_protocol.scenario import load_scenario
-from caviar_space.imported_scenes import Georeference, write_scene
+from caviar_space.imported_scenes import Georeference
+from caviar_space.meshes import box, ply
 from caviar_space.mitsuba_xml import read_scenery, world_mesh
 from caviar_space.wireless_insite import read_project
 
@@ -315,7 +319,11 @@ MUTATIONS: dict[str, tuple[str, Callable[[str], str | bytes] | None, str]] = {
         lambda t: t.replace("<!DOCTYPE InSite>", '<!DOCTYPE a [<!ENTITY b "c">]>'),
         r"an entity is declared",
     ),
-    "frequency": ("town.study.xml", replaced("60000000000", "sixty"), r"CarrierFrequency is no number"),
+    "frequency": (
+        "town.study.xml",
+        replaced("60000000000", "sixty"),
+        r"CarrierFrequency sixty: write numbers",
+    ),
     "network cut": ("sumo/a.net.xml", lambda t: t[:-4], r":1: .*mend the XML"),
     "network without offset": ("sumo/a.net.xml", lambda t: "<net/>", r"netOffset ''; write x,y"),
     "routes gone": ("sumo/a.rou.xml", None, r": No such file"),
@@ -341,12 +349,40 @@ def test_a_damaged_project_is_refused_with_its_place_and_nothing_is_written(
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.sumo
 def test_rosslyn(shared_data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("libsumo")
+    pytest.importorskip("matplotlib")
     scene = read_project(shared_data / "rosslyn")
-    write_scene(scene, tmp_path / "rosslyn")
     kinds = [piece.kind for piece in scene.pieces.values()]
     assert [kinds.count(kind) for kind in ("city", "terrain", "foliage")] == [29, 1, 3]
     assert scene.transmitters_m == [(746.0, 560.0, 4.0)]
     assert len(scene.receivers_m) == 10
     assert scene.frequencies_hz == [60e9]
     assert scene.materials["insite-itu-concrete-60-ghz"].constants == (5.31, 0.8967)
+    run(str(shared_data / "rosslyn"), "--out", str(tmp_path / "rosslyn"))
+    picture = tmp_path / "rosslyn.png"
+    arguments = ["scene", "picture", str(tmp_path / "rosslyn" / "mobile.toml"), "--out", str(picture)]
+    result = CliRunner().invoke(app, [*arguments, "--frames", "20"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    assert picture.read_bytes()[1:4] == b"PNG"
+    objects, positions, below = map(
+        int, re.findall(r"(\d+) (?:objects in|positions|below)", result.stdout)[-3:]
+    )
+    assert objects > 20
+    assert positions > 400
+    assert below == 0
+
+
+def test_objects_below_roofs_and_lanes_are_found_in_the_world(tmp_path: Path) -> None:
+    (tmp_path / "house.ply").write_bytes(ply(box((0.0, 10.0), (0.0, 4.0), (0.0, 6.0))))
+    house = footprints([(tmp_path / "house.ply", np.eye(4))])
+    places = {"in": (5.0, 0.0), "half": (-1.5, 0.0), "across": (-1.5, np.pi / 2), "out": (-9.0, 0.0)}
+    objects = {name: ((x, 2.0, 0.5), yaw) for name, (x, yaw) in places.items()}
+    scene = replace(scene_of(objects=objects), dimensions=np.tile([4.0, 1.0, 1.0], (4, 1)))
+    # Of four metres along x, the front is in the house; turned by 90° nothing is.
+    assert dict(covered_objects(scene, [house])) == {"in": 5, "half": 2, "across": 0, "out": 0}
+    net = tmp_path / "a.net.xml"
+    net.write_text('<net><edge><lane shape="1.0,2.0 3.0,2.0"/></edge></net>')
+    assert lanes_of(net, (10.0, 20.0, 0.0), 0.0)[0].tolist() == [[11.0, 22.0], [13.0, 22.0]]
+    assert lanes_of(net, (10.0, 20.0, 0.0), 90.0)[0] == pytest.approx(np.array([[8.0, 21.0], [8.0, 23.0]]))

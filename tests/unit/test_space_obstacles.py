@@ -286,5 +286,5 @@ def test_a_start_inside_the_clearance_is_refused() -> None:
         name="uav", start_m=(8.5, 21.3, 26.5), max_speed_m_s=5.0, max_acceleration_m_s2=2.0, clearance_m=2.0
     )
     made = FlightWorld(FlightSettings(scenery="sionna:munich", flown=(thing,)), RunInfo(name="world"))
-    with pytest.raises(ScenarioError, match=r"m from the scenery, and 'uav' keeps 2\.000 m"):
+    with pytest.raises(ScenarioError, match=r"'uav' keeps 2\.000 m"):
         made.prepare(Preparation(demand={}))

@@ -181,7 +181,7 @@ def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) 
         foliage = f'[services.channel.settings.foliage."foliage-*"]\n{values}\n'
     common = {
         **settings,
-        "command": shlex.join(["caviar", *sys.argv[1:]]),
+        "command": " ".join(shlex.join(["caviar", *sys.argv[1:]]).split()),
         "carriers": "".join(
             f'[[carriers]]\nname = "{name}"\nfrequency_hz = {frequency:.15g}\nbandwidth_hz = 100e6\n\n'
             for name, frequency in zip(carriers, scene.frequencies_hz, strict=True)
@@ -229,6 +229,8 @@ def _scenarios(scene: ImportedScene, path: Path, sumo: Path | None, lidar: str) 
                 **common,
                 "title": f"Scene {scene.name} with SUMO's traffic and {what}",
                 "name": f"{scene.name}-{name}",
+                "frames": "1" if name == "mobile" else "20",
+                "period": "1_000_000_000" if name == "mobile" else "500_000_000",
                 "lidar_topic": '"lidar.grid", ' if with_lidar else "",
                 "lidar_service": grid if with_lidar else "",
                 "devices": "\n".join(
