@@ -45,7 +45,7 @@ def scenes(count: int) -> Iterator[ImportedScene]:
         ]
         paths = [
             Paths(
-                tx="bs", rx=name, los=True, a=1e-6 * draw.normal(size=(1, PATHS)) * (1 + 1j),
+                tx="bs", rx=name, los=True, a=draw.normal(size=(1, PATHS)).astype(np.complex128) * 1e-6,
                 tau=draw.uniform(3e-7, 9e-7, PATHS), aod=draw.uniform(0, 3, (PATHS, 2)),
                 aoa=draw.uniform(0, 3, (PATHS, 2)), points=draw.uniform(0, 9, (PATHS, 3, 3)),
                 interactions=np.ones((PATHS, 3), np.uint8),

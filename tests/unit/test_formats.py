@@ -460,6 +460,13 @@ Tx-R-Rx
 """
 
 
+def insite(path: Path) -> Source:
+    """Open files of paths at 60 GHz."""
+    form = find_format("p2m")
+    form.frequency_hz = 60e9
+    return form.read(path)
+
+
 def p2m(folder: Path, text: str) -> Path:
     """Write a file of paths."""
     file = folder / "street.paths.t001_05.r006.p2m"
@@ -471,7 +478,7 @@ def p2m(folder: Path, text: str) -> Path:
 def test_paths_of_wireless_insite_become_users_and_npz(
     phase: str, of_first: float | None, tmp_path: Path
 ) -> None:
-    source = find_format("p2m").read(p2m(tmp_path, P2M.format(phase=phase)), 60e9)
+    source = insite(p2m(tmp_path, P2M.format(phase=phase)))
     data = Dataset(import_dataset(source, tmp_path / "data"))
     assert list(verify(tmp_path / "data")) == []
     with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
@@ -522,14 +529,14 @@ def test_damaged_files_of_wireless_insite_are_named_with_the_line(
     assert before in text
     file = p2m(tmp_path, text.replace(before, after, 1))
     with pytest.raises(RunError, match=rf"r006.p2m, line {line}:" if line else "r006.p2m: is no file"):
-        import_dataset(find_format("p2m").read(file, 60e9), tmp_path / "data")
+        import_dataset(insite(file), tmp_path / "data")
     assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("content", ["", "\0" * 4096, "# only a comment\n", "1 2 3 4\n" * 9])
 def test_files_that_are_none_of_wireless_insite_are_refused(content: str, tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"r006.p2m, line"):
-        find_format("p2m").read(p2m(tmp_path, content), 60e9)
+        insite(p2m(tmp_path, content))
 
 
 def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
@@ -538,7 +545,25 @@ def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
 
 
 def test_a_real_file_of_wireless_insite(shared_data: Path, tmp_path: Path) -> None:
-    import_dataset(find_format("p2m").read(shared_data / "insite-paths", 60e9), tmp_path / "data")
+    import_dataset(insite(shared_data / "insite-paths"), tmp_path / "data")
     users = Dataset(tmp_path / "data").users()
     assert (len(users), int(users["paths"].sum())) == (15, 375)
     assert list(verify(tmp_path / "data")) == []
+
+
+# --- the page -----------------------------------------------------------------------------------------------
+
+
+def test_the_ten_lines_of_the_page_make_a_link_in_sionna_phy(
+    folder: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sionna.phy")
+    page = (repository / "docs" / "howto" / "formats.md").read_text(encoding="utf-8")
+    code = page.partition("```py\nimport caviar\n")[2].partition("```")[0]
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "s008").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec("import caviar\n" + code, names)  # noqa: S102 - the page's
+    assert names["y"].shape == (64, 1, 3, 14, 64)
+    assert names["h"].shape == (64, 1, 3, 1, 8, 14, 64)
