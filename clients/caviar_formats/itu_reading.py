@@ -32,11 +32,12 @@ LIGHT = 299_792_458.0
 Key = tuple[int, int, int]
 
 
-def read_itu(path: Path) -> Source:
+def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
     """Open the files of a set, or of one below ``raw_data``.
 
     Args:
         path: Folder with one ``CoordVehiclesRxPerScene_*.csv``, and the files of rays in its folders.
+        frequency_hz: Of the carrier [Hz]; None: by the name of a file of rays.
 
     Raises:
         RunError: A file is missing or damaged; names it, and the place in it. So does the iterator.
@@ -55,15 +56,17 @@ def read_itu(path: Path) -> Source:
             table.parent, "", f"has no file of rays *_e{missing[0]}.hdf5, an episode of {table.name}"
         )
     ghz = re.search(r"(\d+(?:\.\d+)?)GHz", next(iter(rays.values())).as_posix())
-    if ghz is None:
-        raise damaged(rays[0], "", "has no carrier, as 60GHz, in its name or folder")
-    frequency_hz = float(ghz[1]) * 1e9
+    if frequency_hz is None and ghz is None:
+        raise damaged(
+            table.parent, "", "files of rays have no carrier, as 60GHz, in their names; give --frequency"
+        )
+    hertz = frequency_hz or float(ghz[1]) * 1e9  # type: ignore[index]  # one of both is there
     scenes = max(scene for _, scene, _ in rows) + 1
     position, phases = _transmitter(rows, rays)
     return Source(
         path=path,
         scenes=_scenes(table, rows, rays, scenes, position),
-        carriers=(Carrier(name=f"{ghz[1]}GHz", frequency_hz=frequency_hz, bandwidth_hz=100e6),),
+        carriers=(Carrier(name=f"{hertz / 1e9:g}GHz", frequency_hz=hertz, bandwidth_hz=100e6),),
         scenes_of_episode=scenes,
         lacks="receivers that are not valid, objects, velocities and Doppler shifts, LIDARs and pictures"
         + ("" if phases else ", and phases: all are 0, so that sums of paths mean nothing"),
