@@ -135,8 +135,10 @@ FORMATS: Mapping[str, str] = {
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
+    "ns3-qd": "caviar_formats.traces:Ns3Qd",
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
+    "pcd": "caviar_formats.traces:Pcd",
     "sionna": "caviar_formats.npz:Sionna",
 }
 """Places of the formats that come with this distribution, by name."""

@@ -64,8 +64,8 @@ class Sionna(Format):
         cir = valid.cir(paths=self._shape["num_paths"])
         a = np.empty((len(valid), *self._shape.values()), np.complex64)
         tau = np.empty((len(valid), 1, 1, self._shape["num_paths"]))
-        for start in range(0, len(valid), 32):  # which stay in the cache of a core
-            cut = slice(start, start + 32)
+        for start in range(0, len(valid), 256):
+            cut = slice(start, start + 256)
             found, tau[cut, 0, 0] = cir.block(valid[cut])
             a[cut, 0, :, 0] = found
         columns = valid.read(["episode", "scene", "carrier", "tx", "rx"])

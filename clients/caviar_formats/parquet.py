@@ -26,19 +26,19 @@ CONVENTIONS = """Arrays are lists in C order; the metadata of a file has descrip
 row by the name of the column, as JSON, with sizes where all rows of the file share them. Complex arrays have
 two columns, `.real` and `.imag`. Angles are (zenith from +z, azimuth from +x) in world axes: x to the east, y
 to the north, z upwards. `channel.a` has the phase of the carrier."""
-PICTURES = ("camera", "depth", "segmentation")
-"""Topics without columns: a list of a million numbers a row is no table."""
+LEFT_OUT = ("camera", "depth", "segmentation", "channel.beam_gains")
+"""Topics without columns, as a list of a million numbers a row is no table; gains follow from H."""
 
 
 class Parquet(Format):
     """Tables ``users/part-NNNNN.parquet`` and ``scenes/part-NNNNN.parquet``."""
 
-    loses = f"{LOSES} Pictures, which `npz` has where a user has one camera."
+    loses = f"{LOSES} Pictures, which `npz` has where a user has one camera, and gains of beams."
 
     def begin(self, users: Users) -> None:
         require_installed("a format of Parquet", ["datasets"])
         found = users.readable().items()
-        self._names = {name: text for name, text in found if name.partition(".")[0] not in PICTURES}
+        self._names = {name: text for name, text in found if not name.startswith(LEFT_OUT)}
 
     def write(self, part: Part, folder: Path) -> None:
         with _connected() as connection:
