@@ -65,13 +65,13 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
     position, phases = _transmitter(rows, rays)
     return Source(
         path=path,
-        scenes=_scenes(table, rows, rays, scenes, position),
+        scenes=_scenes(table, rows, rays, scenes, position, hertz),
         carriers=(Carrier(name=f"{hertz / 1e9:g}GHz", frequency_hz=hertz, bandwidth_hz=100e6),),
         scenes_of_episode=scenes,
-        lacks="receivers that are not valid, objects, velocities and Doppler shifts, LIDARs and pictures"
-        + ("" if phases else ", and phases: all are 0, so that sums of paths mean nothing"),
-        assumed=f"arrays of {ARRAYS['tx'].size} and {ARRAYS['rx'].size} elements, TX yaw {TX_YAW_DEG:g}°, "
-        f"receivers {ABOVE_M} m above their vehicles; the transmitter lies where straight rays begin",
+        lacks="No receivers that are not valid, objects, velocities, Doppler shifts, LIDARs and pictures are "
+        "imported." + ("" if phases else " The files have no phases: those of paths are of their delays."),
+        assumed=f"Arrays have {ARRAYS['tx'].size} and {ARRAYS['rx'].size} elements, TX yaw {TX_YAW_DEG:g}°, "
+        f"receivers are {ABOVE_M} m above their vehicles, the transmitter is where straight rays begin.",
     )
 
 
@@ -205,6 +205,7 @@ def _scenes(
     rays: Mapping[int, Path],
     scenes: int,
     place: Float64Array,
+    hertz: float,
 ) -> Iterator[ImportedScene]:
     tx = AntennaDevice(
         name="tx",
@@ -230,15 +231,18 @@ def _scenes(
                     array=ARRAYS["rx"],
                 )
                 devices.append(rx)
-                paths.append(_paths(found[key], tx, rx, met and [values[key[1:]] for values in met]))
+                paths.append(_paths(found[key], hertz, tx, rx, met and [values[key[1:]] for values in met]))
             yield ImportedScene(episode=episode, scene=scene, devices=tuple(devices), paths=paths)
 
 
-def _paths(rays: Float64Array, tx: AntennaDevice, rx: AntennaDevice, met: list[Any]) -> Paths:
+def _paths(rays: Float64Array, hertz: float, tx: AntennaDevice, rx: AntennaDevice, met: list[Any]) -> Paths:
     """Columns of topic ``channel``; phases move from the first elements to the centres of the arrays."""
-    a: Any = 10 ** (rays[:, 0] / 20) * np.exp(1j * np.radians(np.nan_to_num(rays[:, 7])))
+    a: Any = 10 ** (rays[:, 0] / 20)
     angles = {"aod": np.radians(rays[:, 2:4]), "aoa": np.radians(rays[:, 4:6])}
-    if np.isfinite(rays[:, 7]).all():
+    if np.isnan(rays[:, 7]).any():
+        a = a * np.exp(-2j * np.pi * hertz * rays[:, 1])
+    else:
+        a = a * np.exp(1j * np.radians(rays[:, 7]))
         for device, towards in zip((tx, rx), angles.values(), strict=True):
             own = unit_vectors(towards) @ rotation_matrix(device.orientation)
             a = a * steering_vector(device.array, own)[:, 0].conj()
