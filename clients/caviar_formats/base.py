@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import msgspec
 import numpy as np
@@ -20,6 +20,9 @@ from caviar_protocol.errors import RecordingError, RunError, SetupError, suggest
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_protocol.plugins import plugin_class, plugins
+
+if TYPE_CHECKING:
+    from caviar_formats.imports import Source
 
 FORMAT_PLUGINS = "caviar.formats"
 """Group of entry points, each a subclass of `Format`, named as the format is."""
@@ -63,8 +66,10 @@ class Format:
     """Modules beyond the base installation that it imports; extra `formats` brings those of `FORMATS`."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
-    whole_episodes: ClassVar[bool] = False
+    whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
+    frequency_hz: float | None = None
+    """Of the carrier, where the files that are read do not have it [Hz]."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -113,12 +118,27 @@ class Format:
         """
         return f"# {users.dataset.name}\n\n{type(self).__doc__ or ''}"
 
+    def read(self, path: Path) -> Source:
+        """Open files of the format, of which `import_dataset` makes a dataset.
+
+        Args:
+            path: File or folder.
+
+        Raises:
+            RunError: They are damaged, or none of the format; names file and place. So does their iterator.
+        """
+        raise RunError(f"datasets are exported to {type(self).__name__}, not imported from it")
+
 
 FORMATS: Mapping[str, str] = {
+    "deepmimo": "caviar_formats.deepmimo:DeepMimo",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
+    "ns3-qd": "caviar_formats.traces:Ns3Qd",
+    "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
+    "pcd": "caviar_formats.traces:Pcd",
     "sionna": "caviar_formats.npz:Sionna",
 }
 """Places of the formats that come with this distribution, by name."""

@@ -18,7 +18,8 @@ def export_command(
     to: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="huggingface, npz, parquet, sionna, or that of an installed package"
+            metavar="NAME",
+            help="npz, parquet, huggingface, sionna, itu, deepmimo, ns3-qd, pcd, or an installed package's",
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder that is made")],
@@ -39,4 +40,32 @@ def export_command(
         users = dataset.users(carrier=carrier, tx=tx, object_class=object_class)
         task = bar.add_task(f"{to}: scenes", total=None)
         export_users(users, form, out, lambda done, of: bar.update(task, completed=done, total=of))
+    print_line(console, out)
+
+
+def import_command(
+    source: Annotated[Path, typer.Argument(metavar="FILE|DIR", help="files of another program")],
+    form: Annotated[
+        str,
+        typer.Option("--from", metavar="NAME", help="deepmimo, itu, p2m, or an installed package's"),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the dataset, which is made")],
+    flavour: Annotated[str, typer.Option(help="variant of the format")] = "",
+    frequency_hz: Annotated[
+        float | None, typer.Option(help="of the carrier, where the files lack it")
+    ] = None,
+) -> None:
+    """Make a dataset of the files of another program."""
+    from caviar_formats.base import find_format
+    from caviar_formats.imports import import_dataset
+
+    console = Console()
+    with progress_bar(console, "{task.completed}", transient=True) as bar:
+        task = bar.add_task(f"{form}: episodes", total=None)
+        reader = find_format(form, flavour, "--from")
+        reader.frequency_hz = frequency_hz
+        found = reader.read(source)
+        import_dataset(found, out, lambda done: bar.update(task, completed=done))
+    for text in filter(None, (found.lacks, found.assumed)):
+        print_line(console, text)
     print_line(console, out)

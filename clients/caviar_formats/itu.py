@@ -14,21 +14,20 @@ import numpy as np
 
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_formats.base import Format, Part, markdown_table
+from caviar_formats.imports import Source
+from caviar_formats.itu_reading import HEADER, LETTERS, read_itu
 from caviar_formats.itu_training import INPUTS, TRAINING, join_arrays, picture_inputs
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording.scene import SceneArrays
 from caviar_protocol.space.coordinates import rotation_matrix
 
-HEADER = ("Val", "EpisodeID", "SceneID", "VehicleArrayID", "VehicleName", "x", "y", "z", "rays", "LOS")
 RAYS_FILE = "rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e{}.hdf5"
 """Name of a file of rays, by the number of its episode: readers open no other, whatever scene it is."""
 SLOTS = (25, 100)
 """Rays of a receiver that a file has room for."""
 INTERACTIONS = 9
 """Interactions of a ray that a file has room for."""
-LETTERS = ("", "R", "D", "DS", "T")
-"""Interactions by their codes in ``channel.interactions``, as Wireless InSite writes them."""
 ARRAYS = (8, 32)
 """Elements of the challenge's arrays, of RX and TX."""
 GRID = (20, 200, 10)
@@ -159,7 +158,9 @@ class Itu(Format):
         with np.errstate(divide="ignore"):
             power = 20 * np.log10(np.abs(gain))
         angles = np.concatenate([rows["channel.aod"], rows["channel.aoa"]], axis=2)
-        straight = ~rows["channel.interactions"].any(axis=2)
+        # Where files of others had no interactions, no path has any: the straight one is the first.
+        first = rows["channel.tau"] == np.nanmin(rows["channel.tau"], axis=1, keepdims=True, initial=np.inf)
+        straight = first & users["los"][:, None] & ~rows["channel.interactions"].any(axis=2)
         columns = [
             power[..., None],
             np.take_along_axis(rows["channel.tau"], order, axis=1)[..., None],
@@ -273,6 +274,9 @@ which says nothing of the scene. SPLIT is `train` up to episode {self._last_trai
 
 {_ABOUT_PHASES[self.flavour]}
 """
+
+    def read(self, path: Path) -> Source:
+        return read_itu(path, self.frequency_hz)
 
     def _raw(self, folder: Path) -> Path:
         return folder / "raw_data" if self.flavour == "baseline" else folder
@@ -405,7 +409,8 @@ def _interactions(users: Users, order: Int64Array, slots: int, valid: BoolArray)
     codes = np.full((count, slots, INTERACTIONS, 2), -1, np.int64)
     places = np.full((count, slots, INTERACTIONS, 3), -1, np.float32)
     numbers = np.full((count, slots), -1, np.int64)
-    letters = np.array([[*(ord(c) for c in letter), -1, -1][:2] for letter in LETTERS])
+    letters = np.array([[*map(ord, letter), -1, -1][:2] for letter in LETTERS])
+    letters[0] = -1
     codes[:, :paths, :depth] = letters[kinds]
     places[:, :paths, :depth] = np.where(kinds[..., None] > 0, points, -1)
     numbers[:, :paths] = np.where(absent, -1, np.count_nonzero(kinds, axis=2))
@@ -467,9 +472,11 @@ def _write_database(
                 total = float(10 * np.log10(watts.sum())) if len(mine) else None
                 mean = float(watts @ mine[:, 1] / watts.sum()) if len(mine) else None
                 insert("receivers", receiver, total, mean, place.tobytes(), on)
-                for k, (power, delay, *angles, _, phase, _) in enumerate(mine.tolist()):
+                for k, (power, delay, *angles, straight, phase, _) in enumerate(mine.tolist()):
                     kind = kinds[user, k][kinds[user, k] > 0]
-                    text = "-".join(["Tx", *(LETTERS[i] for i in kind), "Rx"])
+                    letters = [LETTERS[i] for i in kind]
+                    # Two words are a straight ray to readers: interactions that nobody recorded are a third.
+                    text = "-".join(["Tx", *(letters or ([] if straight else ["?"])), "Rx"])
                     met = points[user, k][: len(kind)].tobytes()
                     row = (*angles, power, delay, text, phase, met, receiver)
                     insert("rays", receiver * SLOTS[1] + k, *row)

@@ -510,7 +510,7 @@ def test_an_unknown_case_a_bad_address_and_a_missing_program_are_named() -> None
     with pytest.raises(RunError, match="'no-such-program'"):
         conform(ANY, command="no-such-program {endpoint}")
     judged: list[Verdict] = []
-    with pytest.raises(RunError, match=r"did not connect: it ended with status 2 .*no-such-file\.py"):
+    with pytest.raises(RunError, match=r"status 2 .*no-such-file\.py"):
         conform(ANY, command=python("no-such-file.py", "{endpoint}"), each=judged.append)
     assert judged == []
 
@@ -563,5 +563,5 @@ def test_a_file_that_cannot_be_written_is_named_before_the_first_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
     monkeypatch.setattr("caviar_labs.conform.conform", lambda *_, **__: pytest.fail("a case was played"))
-    with pytest.raises(RunError, match=r"cannot write .*: Is a directory; choose another file"):
+    with pytest.raises(RunError, match=r"cannot write .*: Is a directory"):
         app(["conform", "--listen", ANY, option, str(tmp_path)], standalone_mode=False)

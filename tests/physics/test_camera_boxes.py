@@ -247,7 +247,7 @@ def test_from_within_a_box_its_inner_sides_are_seen(service: CameraSensors) -> N
 def test_a_camera_within_its_carrier_is_refused(service: CameraSensors) -> None:
     """As a LIDAR is: it would see nothing else."""
     device = CameraDevice(name="cab/camera", parent="cab", position=(0.5, 0.0, 0.0))
-    with pytest.raises(PayloadError, match=r"camera 'cab/camera'.*inside its carrier 'cab'.*roof"):
+    with pytest.raises(PayloadError, match=r"'cab/camera'.*'cab'"):
         products(service, scene_of({"cab": Body((0, 0, 1), (4, 2, 2))}, device))
 
 

@@ -276,7 +276,5 @@ def test_what_is_wrong_names_its_key(lab: Lab, foliage: dict[str, Any], key: str
 def test_an_open_piece_of_scenery_has_no_inside(lab: Lab) -> None:
     leaf = crown("crown.c", CROWNS["crown.a"], box(*[(0.0, 1.0)] * 3).faces[1:].tolist())
     stated = {"attenuation_db_per_m": {"c0": 1.0}, "source": "s"}
-    with pytest.raises(
-        AssetError, match=r"'crown.c' is foliage and has no inside: 3 of its 18 edges are open"
-    ):
+    with pytest.raises(AssetError, match=r"'crown.c'.*3 of its 18 edges"):
         lab.traced(F, [GROUND, leaf], foliage={"crown.*": stated})

@@ -143,13 +143,13 @@ def test_an_episode_begins_with_a_launch_also_where_nothing_moves(
 
 def test_who_was_started_again_within_an_episode_says_that_it_knows_nothing(channels: Channels) -> None:
     channel = channels(5)
-    with pytest.raises(PayloadError, match=r"started again in frame 7.*without its setting `follow`"):
+    with pytest.raises(PayloadError, match=r"frame 7.*`follow`"):
         stepped(channel, 7, street(7), previous=-1)
 
 
 @pytest.mark.parametrize("option", ["diffraction", "scattering"])
 def test_what_cannot_be_followed_is_refused(option: str) -> None:
-    with pytest.raises(msgspec.ValidationError, match="follow knows reflections and transmissions only"):
+    with pytest.raises(msgspec.ValidationError, match=r"follow.*reflections and transmissions"):
         msgspec.convert({"follow": 5, option: True}, SionnaSettings)
 
 

@@ -277,6 +277,6 @@ def test_memory_that_does_not_do_names_cells_that_would(nothing: SionnaChannel) 
         scene([antenna("bs", "tx", (0, 0, 10), AntennaArray(columns=64))]), "here", "mm"
     )
     fine, memory = level_surface((0, 0, 1000, 1000), 1.0, 1.5), 2**28
-    with pytest.raises(RunError, match=r"1000 × 1000 cells of 1 m and 64 beams need .* cells of 2\.\d m"):
+    with pytest.raises(RunError, match=r"1000 × 1000 cells.*64 beams.*2\.\d m"):
         rays_at_once(fine, devices, "best", RAYS, memory)
     assert rays_at_once(level_surface((0, 0, 1000, 1000), 3.0, 1.5), devices, "best", RAYS, memory) > 20_000

@@ -23,9 +23,7 @@ FRAMES = 40
 LENIENT_FRAMES = 80
 """Where frames go on without the victim, which needs time to come back."""
 FAULT_FRAME = 10
-CASE_S = 3.0
-"""[s] that a case may last."""
-HANG_S = 25.0
+HANG_S = 60.0
 """[s] after which a case is ended: it hangs."""
 FAULTS = ("kill", "stop", "garbage", "flood", "disconnect")
 POLICIES = {
@@ -122,26 +120,6 @@ def scenario(
     path = folder / f"{victim or 'all'}-{policy}-{rejoin_s:g}-{budget_ms:g}{'-remote' * remote}.toml"
     path.write_text(text)
     return path
-
-
-def in_time(result: Result) -> bool:
-    """Whether a case took no longer than it may, on a machine that is as busy as this one."""
-    return result.seconds <= CASE_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
-
-
-# --- what a run has to show --------------------------------------------------------------------------
-
-
-def told(result: Result, kind: str, service: str = "") -> list[str]:
-    """Texts of the notices of a kind about a service."""
-    return [n["text"] for n in result.notices if n["kind"] == kind and n["service"] == service]
-
-
-def told_after_s(result: Result, kind: str, service: str) -> float:
-    """From the fault until the first such notice [s]."""
-    at = [n["at"] for n in result.notices if n["kind"] == kind and n["service"] == service]
-    assert at, f"there is no notice {kind!r} of {service!r}"
-    return float(min(at)) - result.fault_at
 
 
 def assert_whole(result: Result, directory: Path, frames: int = FRAMES) -> Recording:

@@ -1,4 +1,4 @@
-"""Programs of `python -m MODULE` as forks of a process that has imported what they need.
+"""Programs of Python as forks of a process that has imported what they need.
 
 Tests start some thousand brokers, services and gateways; to start Python and to import takes most of their
 time. A fork is a process of its own, with its own sockets and signals, and a child of the process that asks
@@ -17,6 +17,7 @@ import gc
 import importlib
 import itertools
 import json
+import multiprocessing.util
 import os
 import runpy
 import socket
@@ -38,7 +39,8 @@ MARK = "CAVIAR_TEST_RUN"
 
 
 class Forked(subprocess.Popen[Any]):
-    """`subprocess.Popen` of ``[python, …, "-m", MODULE, …]``, with a fork in place of a new interpreter.
+    """`subprocess.Popen` of ``[python, "-m", MODULE, …]`` or ``[python, FILE, …]``, with a fork in place of a
+    new interpreter.
 
     Args:
         command: Whose interpreter is not looked at.
@@ -54,8 +56,7 @@ class Forked(subprocess.Popen[Any]):
         passed, cwd, env, session = sorted(given[3]), *given[4:6], given[20]
         in_read, _, _, out_write, _, error_write = given[9:15]
         order = {
-            "options": args[1 : args.index("-m")],
-            "argv": [str(word) for word in args[args.index("-m") + 1 :]],
+            "argv": [str(word) for word in args[1:]],
             "cwd": str(cwd or Path.cwd()),
             "env": dict(os.environ if env is None else env),
             "session": session,
@@ -72,6 +73,11 @@ class Forked(subprocess.Popen[Any]):
             prctl(_SUBREAPER, 0, 0, 0, 0)
         self._child_created = True
         self._close_pipe_fds(*given[9:15])
+
+    def abandoned(self) -> int:
+        """Return the process id; another object waits for the process."""
+        self.returncode = 0  # as far as this one is concerned
+        return self.pid
 
 
 @functools.cache
@@ -102,8 +108,8 @@ def _sockets() -> tuple[socket.socket, socket.socket]:
     return ends
 
 
-def _fork_processes_of_runs() -> None:
-    """Fork the broker and the services of this command's runs, too.
+def _fork_processes_of_this_one() -> None:
+    """Fork the broker and the services of this command's runs, too, and processes of `multiprocessing`.
 
     They have to be its children. So this process, before it has threads, forks the one that they come from.
     """
@@ -120,7 +126,18 @@ def _fork_processes_of_runs() -> None:
     theirs.close()
     global _nursery
     _nursery = lambda preload: ours  # noqa: E731
-    importlib.import_module(_OF_A_RUN).subprocess = forking()
+    if launch := sys.modules.get(_OF_A_RUN):
+        launch.subprocess = forking()
+    execute = multiprocessing.util.spawnv_passfds
+    turn = threading.Lock()
+
+    def start(path: bytes, args: list[str], passed: list[int]) -> int:
+        if "--multiprocessing-fork" not in args:
+            return execute(path, args, passed)
+        with turn:
+            return Forked(args, (), pass_fds=passed).abandoned()
+
+    multiprocessing.util.spawnv_passfds = start
 
 
 def forking(preload: tuple[str, ...] = ()) -> types.SimpleNamespace:
@@ -149,16 +166,25 @@ def _become(order: dict[str, Any], fds: list[int]) -> None:
     os.environ.update(order["env"])
     wanted = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     sys.path[1:1] = [folder for folder in wanted if folder not in before]
-    module, *sys.argv[1:] = order["argv"]
+    words = order["argv"]
+    if "-c" in words:  # of `multiprocessing`, after options of the interpreter
+        words = words[words.index("-c") :]
+    safe, option = words[0] == "-P", next((word for word in words[:2] if word in ("-m", "-c")), "")
+    program, *sys.argv[1:] = words[safe + bool(option) :]
     if mark := os.environ.get(MARK):
         # Linux shows the environment and the words with which a program was executed, which a fork was not.
-        os.memfd_create(f"{MARK}={mark} {' '.join(order['argv'])}"[:200])
-    if module == "caviar_clients" and _OF_A_RUN in sys.modules:
-        _fork_processes_of_runs()
-    if "-P" in order["options"]:
-        del sys.path[0]
+        os.memfd_create(f"{MARK}={mark} {' '.join(words)}"[:200])
+    if program == "caviar_clients":
+        _fork_processes_of_this_one()
     try:
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        if option == "-m":
+            del sys.path[:safe]
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
+        elif option == "-c":
+            exec(program, {"__name__": "__main__"})  # noqa: S102 - what a new interpreter would do
+        else:
+            sys.argv[0], sys.path[0] = program, str(Path(program).parent)
+            runpy.run_path(program, run_name="__main__")
     except SystemExit as end:
         if end.code is not None and not isinstance(end.code, int):
             raise  # a message is printed, and the status is 1

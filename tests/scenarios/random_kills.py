@@ -23,12 +23,13 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from scenarios_support import SCENARIOS, caviar, environment
+from scenarios_support import SCENARIOS, caviar, marked, started
 
 from caviar_broker.control.socket import ask
 from caviar_protocol.errors import RunError
@@ -82,6 +83,7 @@ class Disturber:
     """Kills what belongs to one run, and watches it go on."""
 
     process: subprocess.Popen[str]
+    mark: str
     directory: Path
     rng: random.Random
     kills: list[Kill] = field(default_factory=list)
@@ -110,17 +112,12 @@ class Disturber:
     def processes(self) -> dict[str, int]:
         """Process ids by name of the service, or ``broker``."""
         found = {}
-        for pid in map(
-            int, Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
-        ):
-            try:
-                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-            except OSError:
-                continue
+        for entry in marked(self.mark):
+            pid, *words = entry.split()
             if "caviar_broker" in words:
-                found["broker"] = pid
+                found["broker"] = int(pid)
             elif "caviar_services" in words:
-                found[words[words.index("caviar_services") + 1]] = pid
+                found[words[words.index("caviar_services") + 1]] = int(pid)
         return found
 
     def kill_some(self, number: int, frame: int, names: list[str], *, overlap: bool) -> Kill | None:
@@ -243,25 +240,14 @@ def disturb(
     rng = random.Random(seed)
     # Those that come late because a victim was waited for are made up for in the last third.
     at_frames = sorted(rng.sample(range(5, frames * 2 // 3), kills))
-    command = [
-        sys.executable,
-        "-m",
-        "caviar_clients",
-        "run",
-        str(scenario),
-        "--out",
-        str(out),
-        "--frames",
-        str(frames),
-    ]
-    log = out.parent / "disturbed.log"
+    log, mark = out.parent / "disturbed.log", uuid.uuid4().hex
     with log.open("w") as file:
-        env = environment("random-kills")
-        process = subprocess.Popen(command, env=env, stdout=file, stderr=file, text=True)
+        words = ("caviar_clients", "run", scenario, "--out", out, "--frames", str(frames))
+        process = started(*words, mark=mark, stdout=file)
     try:
         while not (found := list(out.glob("*/"))) and process.poll() is None:
             wait(0.05)
-        disturber = Disturber(process, found[0], rng)
+        disturber = Disturber(process, mark, found[0], rng)
         overlap = False
         for number, frame in enumerate(at_frames, 1):
             done = None

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 from forked import MARK, Forked
 
@@ -74,17 +74,18 @@ def caviar(*arguments: str | Path, timeout: float = 120.0, **extra: str) -> Fini
 
 
 def started(
-    *words: str | Path, mark: str, stderr: int = subprocess.STDOUT, **extra: str
+    *words: str | Path,
+    mark: str,
+    stdout: int | IO[str] = subprocess.PIPE,
+    stderr: int = subprocess.STDOUT,
+    **extra: str,
 ) -> subprocess.Popen[str]:
-    """Start ``python -m`` with these words in the checkout.
-
-    It is a fork of a process that has imported the command. Where its environment has something of its own,
-    which may be read when it is loaded, it is a new interpreter.
-    """
+    """Start ``python -m`` with these words in the checkout: a fork (`Forked`)."""
     command = [sys.executable, "-m", *map(str, words)]
-    given: dict[str, Any] = {"env": environment(mark, **extra), "stdout": subprocess.PIPE, "stderr": stderr}
-    given |= {"text": True, "cwd": ROOT}
-    return subprocess.Popen(command, **given) if extra else Forked(command, PRELOAD, **given)
+    return Forked(
+        command, PRELOAD, env=environment(mark, **extra), cwd=ROOT,
+        stdout=stdout, stderr=stderr, text=True,
+    )  # fmt: skip
 
 
 def run_as_printed(command: Sequence[str | Path], folder: Path) -> str:

@@ -13,8 +13,10 @@ from pathlib import Path
 from subprocess import DEVNULL, PIPE
 
 import pytest
+from forked import Forked
 from scenarios_support import (
     MARK,
+    PRELOAD,
     Finished,
     caviar,
     environment,
@@ -208,13 +210,15 @@ def test_a_service_that_answers_garbage_is_named(tmp_path: Path, garbage: str) -
     env = environment("garbage-" + os.urandom(8).hex())
     command = [sys.executable, "-m", "caviar_broker", str(faulty(tmp_path, "Raises"))]
     command += ["--bind", "tcp://127.0.0.1:0", "--directory", str(tmp_path / "run")]
-    with subprocess.Popen(command, env=env, stdout=PIPE, stderr=PIPE, text=True) as broker:
+    with Forked(command, PRELOAD, env=env, stdout=PIPE, stderr=PIPE, text=True) as broker:
         assert broker.stdout is not None
         endpoint = broker.stdout.readline().split()[-1]
-        services = [subprocess.Popen([sys.executable, "-c", GARBAGE_CLIENT, endpoint, garbage], env=env)]
+        services: list[subprocess.Popen[bytes]] = [
+            subprocess.Popen([sys.executable, "-c", GARBAGE_CLIENT, endpoint, garbage], env=env)
+        ]
         for name, use in SMOKE_SERVICES.items():
             command = [sys.executable, "-m", "caviar_services", name, "--use", use, "--broker", endpoint]
-            services.append(subprocess.Popen(command, env=env, stdout=DEVNULL, stderr=DEVNULL))
+            services.append(Forked(command, PRELOAD, env=env, stdout=DEVNULL, stderr=DEVNULL))
         output, errors = broker.communicate(timeout=120)
     for service in services:
         service.wait(10)

@@ -20,11 +20,8 @@ from fault_matrix import (
     assert_blamed,
     assert_same,
     assert_went_on,
-    assert_whole,
-    in_time,
     scenario,
     told,
-    told_after_s,
 )
 from fault_nursery import Case, Result
 
@@ -94,7 +91,6 @@ def test_under_wait_the_run_ends_as_if_nothing_had_happened(
     result, directory = wronged(nursery, scenario(tmp_path), victim, fault)
     assert_same(result, directory, digest)
     assert_named(result, victim, fault)
-    assert in_time(result)
 
 
 @pytest.mark.parametrize(("victim", "policy", "fault"), grid(LENIENT, PASSING))
@@ -105,7 +101,6 @@ def test_under_hold_and_drop_the_frames_go_on_and_say_what_they_lack(
     result, directory = wronged(nursery, path, victim, fault)
     assert_went_on(result, directory, victim, policy)
     assert_named(result, victim, fault)
-    assert in_time(result)
 
 
 @pytest.mark.parametrize(("victim", "fault"), grid([(service,) for service in SERVICES], PASSING))
@@ -115,7 +110,6 @@ def test_under_abort_the_run_ends_with_blame(
     path = scenario(tmp_path, victim, "abort", rejoin_s=0.0, budget_ms=1000.0)
     result, directory = wronged(nursery, path, victim, fault)
     assert_blamed(result, directory, victim, (WORDS[fault], f"frame {FAULT_FRAME}"))
-    assert in_time(result)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +127,6 @@ def test_garbage_ends_the_run_with_blame_whatever_the_policy(
     path = scenario(tmp_path, victim, policy, budget_ms=1000.0)
     result, directory = wronged(nursery, path, victim, "garbage")
     assert_blamed(result, directory, victim, (WORDS["garbage"],))
-    assert in_time(result)
 
 
 @pytest.mark.parametrize(("policy", "fault"), grid([("wait",), ("hold",), ("drop",)], PASSING))
@@ -144,7 +137,6 @@ def test_a_run_that_waits_for_nobody_ends_with_blame(
     path = scenario(tmp_path, "channel", policy, rejoin_s=0.0, budget_ms=1000.0)
     result, directory = wronged(nursery, path, "channel", fault)
     assert_blamed(result, directory, "channel", (WORDS[fault], f"frame {FAULT_FRAME}"))
-    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -162,7 +154,6 @@ def test_a_broker_that_is_wronged_goes_on_or_is_followed_by_another(
     else:
         words = {"garbage": "not in the protocol", "flood": "a connection from 127.0.0.1 was cut off"}
         assert any(words[fault] in text for text in told(result, "refused"))
-    assert in_time(result)
 
 
 @pytest.mark.parametrize("fault", ["kill", "stop"])
@@ -171,33 +162,11 @@ def test_without_rejoining_a_broker_that_dies_is_named(nursery: Nursery, tmp_pat
     assert "the broker died" in result.error
     assert WORDS[fault] in result.error
     assert result.leftovers == []
-    assert in_time(result)
     assert directory.is_dir()
 
 
-@pytest.mark.parametrize(
-    "victim",
-    [
-        pytest.param(service, marks=() if service in ("world", "link") else pytest.mark.exhaustive)
-        for service in SERVICES
-    ],
-)
-def test_a_service_that_is_stopped_is_named_within_100_ms(
-    nursery: Nursery, tmp_path: Path, victim: str
-) -> None:
-    """The operating system is asked every 50 ms; the rest is for a busy machine."""
-    delays = []
-    for attempt in range(3):
-        folder = tmp_path / str(attempt)
-        folder.mkdir()
-        result, directory = wronged(nursery, scenario(folder), victim, "stop")
-        assert_whole(result, directory)
-        delays.append(told_after_s(result, "lost", victim))
-    assert min(delays) <= 0.1
-
-
 @pytest.mark.parametrize("fault", ["kill", "stop", "disconnect"])
-def test_a_remote_service_that_is_gone_is_named_within_1_5_s_and_may_come_back(
+def test_a_remote_service_that_is_gone_is_named_and_may_come_back(
     nursery: Nursery, digest: str, tmp_path: Path, fault: str
 ) -> None:
     """No operating system tells of it. One that was killed is started again; others come back themselves."""
@@ -205,5 +174,4 @@ def test_a_remote_service_that_is_gone_is_named_within_1_5_s_and_may_come_back(
     result, directory = wronged(nursery, path, "link", fault, remote="link:beams")
     assert_same(result, directory, digest)
     assert "unreachable or stopped" in told(result, "lost", "link")[0]
-    assert told_after_s(result, "lost", "link") <= 1.5
     assert result.remotes == ([-signal.SIGKILL, 0] if fault == "kill" else [0])

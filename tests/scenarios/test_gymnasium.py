@@ -168,7 +168,7 @@ def test_a_reset_after_the_last_episode_says_that_there_is_none(tmp_path: Path) 
         env.reset()
         while not env.step(np.int64(0))[3]:
             pass
-        with pytest.raises(RunError, match=r"the broker ended the run.*run\.episodes of the scenario"):
+        with pytest.raises(RunError, match=r"run\.episodes"):
             env.reset()
         assert run.ended()[0] == 0
 
@@ -215,7 +215,7 @@ def test_an_environment_shows_its_key_to_a_broker_that_asks_for_one(tmp_path: Pa
 def test_an_agent_that_the_run_does_not_wait_for_is_refused(tmp_path: Path) -> None:
     with waiting(tmp_path, frames=4, episodes=1) as run:
         session = ConnectedSession(run.endpoint, "agnet", (Input(topic="scene"),))
-        with closing(session), pytest.raises(RunError, match=r"no service 'agnet'; did you mean 'agent'\?"):
+        with closing(session), pytest.raises(RunError, match=r"'agnet'.*'agent'"):
             session.reset()
 
 
@@ -225,7 +225,7 @@ def test_an_environment_of_another_scenario_does_not_begin_and_the_run_goes_on_w
     with waiting(tmp_path, frames=4, episodes=1) as run:
         with (
             closing(BeamSelectionEnv("smoke", broker=run.endpoint)) as wrong,
-            pytest.raises(ScenarioError, match=r"has .*64 elements.* that scenario 'smoke' lacks, which has"),
+            pytest.raises(ScenarioError, match=r"64 elements.*'smoke'"),
         ):
             wrong.reset(seed=1)
         with closing(run.environment()) as env:

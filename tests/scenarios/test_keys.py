@@ -11,7 +11,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from scenarios_support import ROOT, SCENARIOS, Finished, caviar, environment, eventually
+from forked import Forked
+from scenarios_support import PRELOAD, ROOT, SCENARIOS, Finished, caviar, environment, eventually
 
 from caviar_protocol import keys as k
 
@@ -48,8 +49,8 @@ def test_a_run_with_keys_lets_the_authorized_agent_in_and_writes_no_secret(
     command = [sys.executable, "-m", "caviar_clients", "run", str(SCENARIOS / "remote.toml"), "--frames", "5"]
     command += ["--bind", "tcp://0.0.0.0:0", "--keys", str(keys), "--out", str(out)]
     output: list[str] = []
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT,
+    with Forked(
+        command, PRELOAD, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT,
         env=environment("keys", TMPDIR=str(temporary)),
     ) as process:  # fmt: skip
         assert process.stdout is not None

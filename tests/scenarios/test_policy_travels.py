@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from forked import Forked
 from msgspec.structs import replace
 from scenarios_support import (
+    PRELOAD,
     Finished,
     caviar,
     environment,
@@ -84,8 +86,8 @@ def service(name: str, use: str, endpoint: str, folder: Path) -> Iterator[subpro
     """A service as on a machine of its own: another folder, and an empty cache."""
     folder.mkdir()
     command = [sys.executable, "-m", "caviar_clients", "service", name, "--use", use, "--broker", endpoint]
-    with subprocess.Popen(
-        command, cwd=folder, env=environment("travels", XDG_CACHE_HOME=str(folder / "cache")),
+    with Forked(
+        command, PRELOAD, cwd=folder, env=environment("travels", XDG_CACHE_HOME=str(folder / "cache")),
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     ) as process:  # fmt: skip
         try:
@@ -101,8 +103,8 @@ def test_an_agent_over_tcp_needs_no_copy_and_takes_a_swap(tmp_path: Path) -> Non
     command = [sys.executable, "-m", "caviar_clients", "broker", str(scenario), "--out", str(out)]
     with contextlib.ExitStack() as started:
         broker = started.enter_context(
-            subprocess.Popen(
-                [*command, "--bind", "tcp://127.0.0.1:0", "--pace", "4"],
+            Forked(
+                [*command, "--bind", "tcp://127.0.0.1:0", "--pace", "4"], PRELOAD,
                 env=environment("travels", XDG_CACHE_HOME=str(tmp_path / "here")),
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )

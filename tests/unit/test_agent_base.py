@@ -189,9 +189,7 @@ def test_a_command_for_an_actuator_that_is_not_declared_is_refused() -> None:
         def other_actuators(self) -> tuple[str, ...]:
             return ("motion:drone",)
 
-    with pytest.raises(
-        PayloadError, match=r"VelocityCommand for 'motion:uav', .* it returned 'motion:drone'"
-    ):
+    with pytest.raises(PayloadError, match=r"VelocityCommand.*'motion:uav'.*'motion:drone'"):
         action(Undeclared(AgentSettings(users=("*",)), RunInfo(name="pilot")))
 
 
@@ -211,9 +209,7 @@ def test_other_actuators_are_always_declared(
 
 
 def test_owning_the_motion_of_another_object_is_refused() -> None:
-    with pytest.raises(
-        ScenarioError, match="'motion:uva' is no beam, and this agent steers beams and 'motion:uav'"
-    ):
+    with pytest.raises(ScenarioError, match=r"'motion:uva'.*'motion:uav'"):
         driver(("motion:uva",))
 
 

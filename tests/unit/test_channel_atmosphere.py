@@ -166,10 +166,10 @@ def test_the_notes_say_state_and_attenuation() -> None:
 
 
 def test_a_carrier_outside_is_refused_with_the_key() -> None:
-    with pytest.raises(ScenarioError, match=r"^services\.radio\.settings\.atmosphere: .*0\.7 GHz"):
+    with pytest.raises(ScenarioError, match=r"^services\.radio\.settings\.atmosphere.*0\.7.*GHz"):
         lossy(28e9, 0.7e9, name="radio")
 
 
 def test_unit_power_and_absorption_exclude_each_other() -> None:
-    with pytest.raises(msgspec.ValidationError, match=r'atmosphere belongs to normalization = "path-loss"'):
+    with pytest.raises(msgspec.ValidationError, match=r'atmosphere.*normalization = "path-loss"'):
         msgspec.convert({"atmosphere": {}}, GeometricSettings)

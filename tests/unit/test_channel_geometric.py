@@ -245,7 +245,7 @@ def test_arrays_that_its_waves_have_no_polarization_for_are_refused(array: Anten
     """Before the run where the scenario has them, else in the frame."""
     spec = DeviceSpec(name="bs", kind="antenna", role="tx", array=array)
     run = RunInfo(name="channel", carriers=CARRIERS, devices=(spec,))
-    with pytest.raises(ScenarioError, match=r"devices.bs.array: device 'bs' has an array of dual"):
+    with pytest.raises(ScenarioError, match=r"devices\.bs\.array: .*dual"):
         GeometricChannel(GeometricSettings(), run).prepare(Preparation(demand={}))
     bs = AntennaDevice(name="bs", role="tx", array=array)
     with pytest.raises(PayloadError, match='use = "sionna-rt"'):

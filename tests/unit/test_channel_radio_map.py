@@ -122,5 +122,5 @@ def test_beams_to_choose_among() -> None:
     assert beams_of(planar, "wide", "bs") == range(0)
     assert beams_of(planar, 7, "bs") == range(7, 8)
     assert beams_of(AntennaArray(), "best", "bs") == range(0)
-    with pytest.raises(RunError, match="the codebook of 'bs' has the beams 0 to 7"):
+    with pytest.raises(RunError, match=r"'bs'.*beams 0 to 7"):
         beams_of(planar, 8, "bs")

@@ -129,9 +129,7 @@ def test_a_part_that_no_carrier_defines_is_empty_and_a_note_says_what_to_write()
 def test_parts_that_no_product_holds_are_refused_before_the_first_frame_by_their_key() -> None:
     huge = replace(CARRIERS[0], subcarriers=65536, slots=17)
     check_size({"hf", "taps"}, CARRIERS, 512, 64)
-    with pytest.raises(
-        ScenarioError, match=r"hf of 'wide' takes 1\.06 GiB between 128 transmitting and 1 "
-    ) as told:
+    with pytest.raises(ScenarioError, match=r"'wide' takes 1\.06 GiB.*128 tran") as told:
         check_size({"h", "hf"}, (CARRIERS[1], huge), 128, 1)
     assert told.value.key == "carriers[1].subcarriers"
     check_size({"h"}, (CARRIERS[1], huge), 128, 1)

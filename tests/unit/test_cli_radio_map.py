@@ -117,9 +117,7 @@ def test_a_scene_without_a_transmitter_is_refused() -> None:
 
 def test_a_run_without_a_channel_is_refused() -> None:
     scenes = dataclasses.replace(scene_at(Path("smoke")), services={})
-    with pytest.raises(
-        RunError, match=r"smoke.* has no channel; a radio map is made with the channel sionna"
-    ):
+    with pytest.raises(RunError, match=r"smoke.*no channel.*sionna"):
         channel_of(scenes, scenes.instants[0].scene)
 
 
@@ -128,7 +126,7 @@ def test_a_channel_that_traces_no_rays_is_refused_and_leaves_nothing_behind(tmp_
     text = shipped.read_text()
     assert 'use = "free-space"' in text
     (tmp_path / "mine.toml").write_text(text.replace('use = "free-space"', 'use = "geometric"'))
-    with pytest.raises(RunError, match="channel 'channel' is 'geometric', which traces no rays"):
+    with pytest.raises(RunError, match="'channel' is 'geometric'"):
         draw_radio_map(tmp_path / "mine.toml", tmp_path / "map.png", MapOptions(), Console())
     assert [file.name for file in tmp_path.iterdir()] == ["mine.toml"]
 
@@ -140,7 +138,7 @@ def test_a_channel_with_foliage_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(f"{traced}\n[services.channel.settings.foliage.hedge]\n")
     scenes = scene_at(file)
-    with pytest.raises(ScenarioError, match="no volumes that attenuate; map a scenario without") as refused:
+    with pytest.raises(ScenarioError, match="volumes that attenuate") as refused:
         channel_of(scenes, scenes.instants[0].scene)
     assert refused.value.key == "services.channel.settings.foliage"
 

@@ -93,7 +93,7 @@ def test_remote_services_may_produce_all_that_those_of_their_role_do() -> None:
 
 def test_a_run_without_a_broker_refuses_remote_services_by_place_and_remedy() -> None:
     refuse_remote(load_scenario(SCENARIOS / "smoke.toml"))
-    with pytest.raises(ScenarioError, match=r"remote\.toml:\d+: services\.agent\.use: .*an implementation"):
+    with pytest.raises(ScenarioError, match=r"remote\.toml:\d+.*services\.agent\.use"):
         refuse_remote(load_scenario(REMOTE))
 
 

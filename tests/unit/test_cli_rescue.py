@@ -98,15 +98,15 @@ def test_a_part_of_which_nothing_can_be_read_is_lost(tmp_path):
 
 
 def test_no_run_is_named(tmp_path):
-    with pytest.raises(RunError, match="is no directory; give the directory of a run"):
+    with pytest.raises(RunError, match="is no directory; give"):
         rescue(tmp_path / "nothing")
 
 
 def test_a_folder_that_is_no_runs_is_refused_with_the_run_in_it(tmp_path):
-    with pytest.raises(RunError, match=r"is no directory of a run: it has neither recording, run\.json nor"):
+    with pytest.raises(RunError, match=r"neither recording, run\.json nor"):
         rescue(tmp_path)
     record(tmp_path / "sample-1", frames=1)
-    with pytest.raises(RunError, match=r"it holds runs: give one of them, as .*sample-1$"):
+    with pytest.raises(RunError, match=r"holds runs.*sample-1$"):
         rescue(tmp_path)
 
 

@@ -97,9 +97,7 @@ def test_a_full_disk_costs_the_summary_and_not_the_figures_on_the_screen(
     for name in ("events.jsonl", "summary.json"):
         (directory / name).symlink_to("/dev/full")
     monkeypatch.setattr("caviar_clients.cli.run.new_run_directory", lambda root, name: directory)
-    with pytest.raises(
-        RunError, match=r"cannot write .*summary\.json: No space left on device; free space there"
-    ):
+    with pytest.raises(RunError, match=r"summary\.json: No space left"):
         run_scenario(Path("smoke"), tmp_path, Console(), frames=3, json_file=figures, embedded=True)
     assert "digest" in capsys.readouterr().out
     assert json.loads(figures.read_text())["frames"] == 3

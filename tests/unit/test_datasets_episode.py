@@ -215,7 +215,7 @@ def test_a_scenario_that_makes_no_dataset_is_refused() -> None:
         plan_dataset(elsewhere, episodes=1)
     text = text.replace('record = ["scene", "channel", "action", "link"]\n', "", 1)
     without = parse_scenario(text[: text.index("[services.recorder]")] + text[text.index("[[devices]]") :])
-    with pytest.raises(ScenarioError, match=r"needs one recorder; add \[services.recorder\]"):
+    with pytest.raises(ScenarioError, match=r"one recorder.*\[services.recorder\]"):
         plan_dataset(without, episodes=1)
 
 
@@ -251,5 +251,5 @@ def test_an_estimate_has_a_part_for_the_episode_and_one_for_each_scene() -> None
 
 
 def test_a_disk_that_is_too_small_is_refused_with_both_figures(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"too small: 1.05e\+06 TB are needed, [\d.]+ .B are free"):
+    with pytest.raises(RunError, match=r"1.05e\+06 TB.*[\d.]+ .B are free"):
         check_disk(tmp_path, 10**18)

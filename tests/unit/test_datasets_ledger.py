@@ -178,7 +178,7 @@ def test_who_locks_a_catalogue_is_named(data: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_catalogue_of_a_file_system_that_cannot_be_written_says_so(data: Path) -> None:
     catalogue = Catalogue(data / "catalogue.sqlite")
-    with pytest.raises(RecordingError, match="readonly database; allow writing it and its folder, or give"):
+    with pytest.raises(RecordingError, match="readonly database"):
         catalogue.forget([0])
     with pytest.raises(RecordingError, match="asks for no columns; write a SELECT"):
         catalogue.query("PRAGMA query_only = 1")
@@ -289,5 +289,5 @@ def test_a_plan_of_another_dataset_of_which_nothing_is_there_is_replaced(data: P
 
 def test_an_episode_in_the_folder_of_another_is_refused(data: Path) -> None:
     DatasetDirectory(data).episode(0).rename(DatasetDirectory(data).episode(7))
-    with pytest.raises(RunError, match=r"episode-000007 has the recording of episode 0, not of 7: remove it"):
+    with pytest.raises(RunError, match=r"episode-000007.*episode 0, not of 7"):
         generate(planned(), data, Notes())

@@ -355,9 +355,7 @@ def test_a_column_of_texts_is_no_column_of_numbers(copy: Path) -> None:
             "CREATE TABLE loose AS SELECT * FROM users; DROP TABLE users; ALTER TABLE loose RENAME TO users;"
             "UPDATE users SET gain_db = 'loud' WHERE episode = 2"
         )
-    with pytest.raises(
-        RecordingError, match=r"users\.gain_db of episode 2, scene 0, .* is 'loud', and 7 more"
-    ):
+    with pytest.raises(RecordingError, match=r"users\.gain_db.* 2, scene 0.*'loud'.* 7 "):
         write_page(copy)
 
 
@@ -417,7 +415,7 @@ def test_one_is_no_plural(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_no_dataset_stays_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"is no dataset, it has no catalogue\.sqlite; make one with"):
+    with pytest.raises(RecordingError, match=r"no dataset.*catalogue\.sqlite"):
         write_page(tmp_path / "nothing")
     assert list(tmp_path.iterdir()) == []
 
@@ -432,12 +430,13 @@ def test_overwrite_removes_the_page_of_what_is_removed(tmp_path: Path) -> None:
     assert other.exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_says_where_the_page_is(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     result = CliRunner().invoke(app, ["dataset", "look", str(folder), "--out", str(out)])
     assert result.exit_code == 0, result.output
     assert result.output.splitlines()[-1] == str(out)
-    assert out.stat().st_size > 100_000
+    assert Page(out).pictures
 
 
 def test_the_command_names_the_extra_that_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

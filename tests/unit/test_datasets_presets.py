@@ -85,7 +85,7 @@ def test_a_preset_that_is_misspelt_is_named() -> None:
             ScenarioError, match=f"no preset '{name}'; did you mean 's008'\\? presets: s001, s005"
         ):
             find_preset(name)
-    with pytest.raises(ScenarioError, match="there is no preset 's009'; did you mean 's00"):
+    with pytest.raises(ScenarioError, match=r"'s009'.*'s00"):
         find_preset("s009")
 
 

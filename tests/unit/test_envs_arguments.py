@@ -25,7 +25,7 @@ from caviar_protocol.scenario import find_scenario
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, "3", None, True, MOST_MEMBERS + 1, 10**9])
 def test_a_number_of_members_that_cannot_be_is_refused(wrong: object) -> None:
-    with pytest.raises(ScenarioError, match=r"num_envs=.*; write a whole number from 1 to 65536"):
+    with pytest.raises(ScenarioError, match=r"num_envs=.*from 1 to 65536"):
         checked_members(wrong)
 
 
@@ -64,7 +64,7 @@ def test_patterns_may_be_one_text() -> None:
     "wrong", [None, "ab", [1, 2, 3], [0.0, 1.0], [np.nan, 0], [1, [2]], [True, False], 5, {"a": 1}]
 )
 def test_actions_that_are_no_whole_numbers_are_refused(wrong: object) -> None:
-    with pytest.raises(PayloadError, match=r"the actions are .*; write whole numbers of shape \[2\]"):
+    with pytest.raises(PayloadError, match=r"the actions are .*shape \[2\]"):
         whole_numbers(wrong, (2,))
 
 
@@ -106,7 +106,7 @@ def test_a_scenario_without_a_link_is_refused_when_the_environment_is_made(tmp_p
     file = tmp_path / "without.toml"
     file.write_text(before + after[after.index("[services.agent]") :])
     for make in (gymnasium.make, partial(gymnasium.make_vec, num_envs=2)):
-        with pytest.raises(ScenarioError, match=r"without\.toml:\d+: services: no service is a link, .*;"):
+        with pytest.raises(ScenarioError, match=r"without\.toml:\d+: services: .*link"):
             make("caviar/BeamSelection-v0", scenario=str(file))
 
 

@@ -210,7 +210,7 @@ def test_a_run_that_failed_is_blamed_at_every_further_call() -> None:
         env.reset(seed=1)
         env._sizes = [BEAMS + 1]  # so that a beam that does not exist gets as far as the link
         for call in (lambda: env.step(np.int64(BEAMS)), lambda: env.step(np.int64(0)), lambda: env.reset()):
-            with pytest.raises(RunError, match=r"agent 'agent' made a wrong product.*TX beam 64"):
+            with pytest.raises(RunError, match=r"'agent'.*TX beam 64"):
                 call()
 
 
@@ -346,9 +346,7 @@ def test_an_action_that_is_no_pair_is_refused_by_value_and_the_episode_goes_on(a
     with environment() as env, environment() as other:
         env.reset(seed=1)
         other.reset(seed=1)
-        with pytest.raises(
-            PayloadError, match=r"the action is .* for bs → uav/rx; write an int from 0 to 63"
-        ) as error:
+        with pytest.raises(PayloadError, match=r"bs → uav/rx.*from 0 to 63") as error:
             env.step(action)
         assert " ".join(repr(action).split()) in str(error.value)
         assert env.step(np.int64(3))[1] == other.step(np.int64(3))[1]
@@ -358,7 +356,7 @@ def test_an_action_that_is_no_pair_is_refused_by_value_and_the_episode_goes_on(a
 def test_an_action_of_several_users_has_an_index_for_each(action: Any) -> None:
     with environment(SMOKE) as env:
         env.reset(seed=1)
-        with pytest.raises(PayloadError, match=r"write 2 ints, .* from 0 to 127 and from 0 to 31") as error:
+        with pytest.raises(PayloadError, match=r"2 ints.*0 to 127.*0 to 31") as error:
             env.step(action)
         text = str(error.value)
         if np.size(action) == 2:
@@ -421,7 +419,7 @@ def test_what_waits_is_observed_before_it_is_decided_upon() -> None:
 
 @pytest.mark.parametrize("options", [{"reward": "delay"}, {"observe": ("buffered",)}])
 def test_packets_are_not_for_a_link_that_sends_none(options: dict[str, Any]) -> None:
-    with pytest.raises(ScenarioError, match="is of packets, and link 'link' is 'beams'") as error:
+    with pytest.raises(ScenarioError, match=r"packets.*'link' is 'beams'") as error:
         BeamSelectionEnv(GEOMETRIC, **options)
     assert 'use = "cell"' in str(error.value)
 
@@ -490,7 +488,7 @@ def two_agents(folder: Path) -> Path:
 
 
 def test_with_two_agents_one_has_to_be_named(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"agent=…; the scenario's agents are: agent, second"):
+    with pytest.raises(ScenarioError, match=r"agent=….*agent, second"):
         BeamSelectionEnv(two_agents(tmp_path))
 
 

@@ -200,7 +200,7 @@ def test_packets_are_observed_with_all_carriers_together(scenario: Scenario) -> 
 
 
 def test_packets_of_a_link_without_any_are_refused(scenario: Scenario) -> None:
-    with pytest.raises(ScenarioError, match="'waiting' is of packets, and the link of the run sends none"):
+    with pytest.raises(ScenarioError, match="'waiting' is of packets"):
         read(scenario, "waiting", cars(1), link=link_of([("bs", "car.1/rx", 0.2)]))
 
 

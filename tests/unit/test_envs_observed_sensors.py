@@ -110,12 +110,10 @@ def test_a_lidar_on_several_objects_gives_each_user_the_grid_of_its_own(scenario
     elsewhere = replace(
         several, devices=tuple(replace(d, on="bus.*") if d.name == "top" else d for d in several.devices)
     )
-    with pytest.raises(ScenarioError, match=r"'top' is on up to 3 objects 'bus\.\*', of which none carries"):
+    with pytest.raises(ScenarioError, match=r"'top'.*3.*'bus\.\*'"):
         part(elsewhere, Users(elsewhere, ("*",)), "lidar_grid")
     wide = Lidar(object_names=(), scans=(scan("car.1/top", np.zeros((2, 1, 1), np.int8)),))
-    with pytest.raises(
-        PayloadError, match=r"car\.1/top shows \[2, 1, 1\], and the policy observes \[1, 1, 1\]"
-    ):
+    with pytest.raises(PayloadError, match=r"car\.1/top.*\[2.*1.*1\].*\[1.*1.*1\]"):
         read(several, "lidar_grid", cars(1), given("lidar", wide))
 
 
@@ -245,7 +243,7 @@ def test_a_grid_that_is_not_in_the_settings_is_asked_for() -> None:
         DeviceSpec(name="top", kind="lidar"),
         sensors={"lidar": {}},
     )
-    with pytest.raises(ScenarioError, match=r"needs \[services\.<lidar>\.settings\.grid\]"):
+    with pytest.raises(ScenarioError, match=r"\[services\.<lidar>\.settings\.grid\]"):
         part(scenario, Users(scenario, ("*",)), "lidar_grid")
 
 

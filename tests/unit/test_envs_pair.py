@@ -88,20 +88,20 @@ def test_the_episode_ends_for_both_with_the_last_frame() -> None:
 
 
 def test_mistakes_are_named() -> None:
-    with pytest.raises(ScenarioError, match="its agents are: agent; with a motion among their users: none"):
+    with pytest.raises(ScenarioError, match=r"its agents are: agent;.*none"):
         UavPairEnv("geometric")
-    with pytest.raises(ScenarioError, match=r"pilot='beams' and beams=None .* users: pilot"):
+    with pytest.raises(ScenarioError, match=r"pilot='beams'.*beams=None"):
         UavPairEnv("uav-pair", pilot="beams")
     with pair() as env:
         with pytest.raises(RunError, match=r"call reset\(\)"):
             env.step({"pilot": STILL, "beams": np.int64(0)})
         env.reset(seed=1)
-        with pytest.raises(PayloadError, match=r"actions are of \['pilot'\]; write one for 'pilot' and"):
+        with pytest.raises(PayloadError, match=r"\['pilot'\].*one for 'pilot'"):
             env.step({"pilot": STILL})
         with pytest.raises(PayloadError, match="the action is"):
             env.step({"pilot": STILL, "beams": np.int64(32)})
         env.step({"pilot": STILL, "beams": np.int64(31)})
-        with pytest.warns(UserWarning, match=r"no options of reset are called \['strat'\]; there are: start"):
+        with pytest.warns(UserWarning, match=r"\['strat'\].*start"):
             env.reset(seed=1, options={"strat": 1})
 
 

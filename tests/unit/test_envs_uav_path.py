@@ -332,7 +332,7 @@ def test_a_box_in_which_no_goal_is_far_enough_is_told(tmp_path: Path) -> None:
     box_m = ((0.0, 50.0, 20.0), (10.0, 60.0, 30.0))
     with (
         flight(tmp_path, box_m=box_m, distance_m=(100.0, 200.0)) as env,
-        pytest.raises(ScenarioError, match="no start and goal 100 to 200 m apart were found between"),
+        pytest.raises(ScenarioError, match="start and goal 100 to 200 m"),
     ):
         env.reset(seed=1)
 
@@ -345,13 +345,13 @@ def test_a_vehicle_that_is_not_flown_is_named_with_those_that_are(tmp_path: Path
 
 
 def test_a_scenario_in_which_nothing_is_flown_is_told_what_to_add() -> None:
-    with pytest.raises(ScenarioError, match=r"none; use a world 'flight' with \[\[services"):
+    with pytest.raises(ScenarioError, match=r"'flight'.*\[\[services"):
         UavPathEnv(SHIPPED / "smoke.toml")
 
 
 def test_an_agent_that_does_not_own_the_motion_is_told_what_to_add(tmp_path: Path) -> None:
     with (
-        pytest.raises(ScenarioError, match=r"agent 'agent' owns beam:uav/rx; add 'motion:uav' to its users"),
+        pytest.raises(ScenarioError, match=r"'agent'.*beam:uav/rx.*'motion:uav'"),
         flight(tmp_path, ('["motion:uav", "beam:uav/rx"]', '["beam:uav/rx"]')),
     ):
         pass

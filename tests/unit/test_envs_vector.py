@@ -246,7 +246,7 @@ users = ["uav/*"]
 
 
 def test_a_world_that_differs_from_episode_to_episode_is_refused_with_the_remedy() -> None:
-    with pytest.raises(ScenarioError, match=r"street-canyon\.toml.*world 'traffic' is 'sumo'") as error:
+    with pytest.raises(ScenarioError, match=r"street-canyon\.toml.*'traffic'.*'sumo'") as error:
         gymnasium.make_vec(NAME, num_envs=2, scenario=SCENARIOS / "street-canyon.toml")
     for text in ("services.traffic.use", "SyncVectorEnv", 'vectorization_mode="sync"', "AsyncVectorEnv"):
         assert text in str(error.value)
@@ -307,7 +307,7 @@ def test_sensors_are_not_observed_by_many(tmp_path: Path) -> None:
         "grid = { minimum_m = [0, 0, 0], maximum_m = [10, 10, 10], cell_m = [1, 1, 1] }\n"
     )
     scenario = changed(tmp_path, GEOMETRIC, extra=lidar + service)
-    with pytest.raises(ScenarioError, match="needs lidar, and sensors see one scene at a time"):
+    with pytest.raises(ScenarioError, match=r"needs lidar.*one scene"):
         BeamSelectionVectorEnv(2, scenario, observe=("lidar_grid",))
 
 

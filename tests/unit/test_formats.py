@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,19 @@ import pytest
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
+from caviar_clients.datasets.impulse_responses import placed_antennas
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.verification.verify import verify
 from caviar_formats.base import FORMATS, Format, export_users, find_format
+from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RunError
-from caviar_protocol.scenario import load_scenario
+from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.topics import AntennaArray, AntennaDevice
 
 pytestmark = pytest.mark.slow
 
@@ -98,6 +105,7 @@ role = "tx"
 position_m = [3.0, -40.0, 12.0]
 yaw_deg = 70.0
 pitch_deg = 10.0
+roll_deg = 20.0
 array = { rows = 2, columns = 4 }
 
 [[devices]]
@@ -116,6 +124,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("formats")
     (place / "asymmetric.toml").write_text(SCENARIO)
     return generated(place / "data", place / "asymmetric.toml").directory.path
+
+
+LIDAR = """
+[services.lidar]
+role = "sensors"
+use = "lidar"
+budget_ms = 1000
+
+[[devices]]
+name = "lidar"
+kind = "lidar"
+position_m = [16.0, 10.0, 3.0]
+yaw_deg = 25.0
+pitch_deg = 4.0
+beams = 8
+azimuth_steps = 180
+"""
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with a LIDAR."""
+    place = tmp_path_factory.mktemp("clouds")
+    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "scene"') + LIDAR
+    (place / "lidar.toml").write_text(text)
+    return generated(place / "data", place / "lidar.toml").directory.path
 
 
 @pytest.fixture
@@ -137,8 +171,8 @@ class TestConformance(FormatConformance):
         monkeypatch.setattr(type(self), "name", name, raising=False)
 
     @pytest.fixture
-    def dataset(self, data: Dataset) -> Dataset:
-        return data
+    def dataset(self, name: str, data: Dataset, request: pytest.FixtureRequest) -> Dataset:
+        return Dataset(request.getfixturevalue("clouds")) if name == "pcd" else data
 
 
 def response(a: Any, tau: Any) -> Any:
@@ -235,3 +269,384 @@ def test_a_run_is_exported_like_a_dataset(data: Dataset, tmp_path: Path) -> None
 def test_an_unknown_format_names_those_there_are() -> None:
     with pytest.raises(RunError, match="did you mean 'parquet'"):
         find_format("parkuet")
+
+
+DEVICES = (
+    AntennaDevice(
+        name="bs", role="tx", position=(0.0, 0.0, 10.0), orientation=(0.8, 0.1, -0.3, 0.51),
+        array=AntennaArray(rows=2, columns=4),
+    ),
+    AntennaDevice(name="u", role="rx", position=(30.0, 5.0, 1.5), array=AntennaArray(columns=3)),
+)  # fmt: skip
+
+
+def imported_scenes(gain: float = 1e-5) -> Iterator[ImportedScene]:
+    """Two episodes of two scenes, of three paths each, that belong to no scene in particular."""
+    for number in range(4):
+        draw = np.random.default_rng(number)
+        paths = Paths(
+            tx="bs", rx="u", los=number % 2 == 0, a=gain * (draw.normal(size=(1, 3)) + 1j),
+            tau=np.array([1.2e-7, 1.1e-7, 1.5e-7]), aod=draw.uniform(0.5, 2.0, (3, 2)),
+            aoa=draw.uniform(0.5, 2.0, (3, 2)), interactions=np.array([[1, 0], [0, 0], [2, 1]], np.uint8),
+        )  # fmt: skip
+        yield ImportedScene(episode=number // 2, scene=number % 2, devices=DEVICES, paths=[paths])
+
+
+def source_of(place: Path, scenes: Iterable[ImportedScene]) -> Source:
+    carriers = (Carrier(name="mm", frequency_hz=FREQUENCY_HZ),)
+    return Source(path=place, scenes=scenes, carriers=carriers, scenes_of_episode=2, lacks="no sensors")
+
+
+def test_an_imported_dataset_is_one_that_everything_takes(tmp_path: Path) -> None:
+    data = Dataset(import_dataset(source_of(tmp_path / "files", imported_scenes()), tmp_path / "data"))
+    assert list(verify(data.directory.path)) == []
+    users, right = data.users(), [scene.paths[0] for scene in imported_scenes()]
+    assert users["los"].tolist() == [paths.los for paths in right]
+    for at, paths in enumerate(right):
+        assert np.allclose(users["channel.tau"][at], paths.tau[[1, 0, 2]])
+        assert np.allclose(users["channel.a"][at], paths.a[0, [1, 0, 2]])
+        a, _ = users[at : at + 1].cir().block(users[at : at + 1])
+        assert nmse_db(a[0, ..., 0].sum(-1), users["channel.h"][at]) < -200
+    assert (users["tx_beam"] >= 0).all()
+    assert "channel" in data.episode(0).topics
+    assert "camera" not in data.episode(0).topics
+    assert data.episode(0).metadata.notes == ("no sensors",)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "said"),
+    [
+        (lambda: iter(()), "no scene"),
+        (lambda: islice(imported_scenes(), 3), r"episode 1 has scenes \[0\], and not 0 to 1"),
+        (lambda: imported_scenes(float("nan")), "episode 0: .*channel"),
+    ],
+)
+def test_an_import_that_fails_leaves_nothing(scenes: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=said):
+        import_dataset(source_of(tmp_path / "files", scenes()), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- DeepMIMO -----------------------------------------------------------------------------------------------
+
+
+def described_channels(folder: Path, shapes: Any, quaternions: Any) -> Any:
+    """H by the description of DeepMIMO 4 alone (`channels_of`)."""
+    end = "_t000_tx000_r001.npz"
+    files = {file.name.removesuffix(end): np.load(file) for file in folder.glob(f"*{end}")}
+    table = {name: file[name] for name, file in files.items() if name != "user"}
+    return channels_of(table, shapes, quaternions)
+
+
+def channels_of(table: dict[str, Any], shapes: Any, quaternions: Any) -> Any:
+    """H of paths with phases at first elements, in our order of elements, Shape ``[N, Nr, Nt]``."""
+    gain = np.nan_to_num(10 ** (table["power"] / 20) * np.exp(1j * np.radians(table["phase"])))
+    out = []
+    for user, amplitudes in enumerate(gain):
+        responses = []
+        for name, (columns, rows), q in zip(
+            ("aoa", "aod"), shapes, (quaternions[0][user], quaternions[1][user]), strict=True
+        ):
+            theta, phi = np.nan_to_num(np.radians([table[f"{name}_el"][user], table[f"{name}_az"][user]]))
+            w, x, y, z = q
+            axes = np.array([
+                [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+                [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+            ])  # fmt: skip
+            along = axes @ [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+            places = [(c, rows - 1 - r) for c in range(columns) for r in range(rows)]
+            responses.append(np.exp(1j * np.pi * np.array(places) @ along))
+        out.append((responses[0] * amplitudes) @ responses[1].T)
+    return np.array(out)
+
+
+def test_a_reader_by_the_description_of_deepmimo_finds_h(data: Dataset, tmp_path: Path) -> None:
+    users, folder = data.users(), exported(data, "deepmimo", tmp_path) / "data"
+    poses = [[a.orientation for a in placed_antennas(users, end)] for end in ("rx", "tx")]
+    assert nmse_db(described_channels(folder, ((3, 1), (4, 2)), poses), users["channel.h"]) < -100
+    with np.load(folder / "inter_t000_tx000_r001.npz") as file:
+        assert (file["inter"][:, 0] == 0).tolist() == users["los"].tolist()
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_itself_finds_h(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    dm = pytest.importorskip("deepmimo")
+    users, out = data.users(), exported(data, "deepmimo", tmp_path, flavour)
+    dm.config("scenarios_folder", str(out))
+    loaded = (
+        [dm.load("data")] if flavour == "static" else [s for e in range(2) for s in dm.load(f"data_e{e:06d}")]
+    )
+    row = 0
+    for scene in loaded:
+        here = users[row : row + scene.n_ue]
+        row += scene.n_ue
+        turns = [[euler_deg(a.orientation) for a in placed_antennas(here, end)] for end in ("tx", "rx")]
+        parameters = dm.ChannelParameters(
+            bs_antenna={"shape": [4, 2], "rotation": turns[0][0]},
+            ue_antenna={"shape": [3, 1], "rotation": np.array(turns[1])},
+            ofdm={"subcarriers": 512, "bandwidth": 512e6, "selected_subcarriers": np.arange(4)},
+        )
+        h = np.asarray(scene.compute_channels(parameters)) * np.sqrt(512)
+        right = here["channel.hf"][:, 0, 4:].transpose(0, 2, 3, 1)
+        order = [(i % 4) * 2 + 1 - i // 4 for i in range(8)]
+        assert nmse_db(h, right[:, :, order]) < -60
+        assert scene.los.astype(bool).tolist() == here["los"].tolist()
+
+
+def euler_deg(q: Any) -> list[float]:
+    """Roll, pitch and yaw of a quaternion [°]."""
+    w, x, y, z = q
+    roll, yaw = (
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+    return [float(np.degrees(angle)) for angle in (roll, np.arcsin(2 * (w * y - z * x)), yaw)]
+
+
+@pytest.mark.parametrize("flavour", ["static", "dynamic"])
+def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset, tmp_path: Path) -> None:
+    folder = exported(data, "deepmimo", tmp_path, flavour)
+    scenario = folder / ("data" if flavour == "static" else "data_e000001")
+    right = data.users() if flavour == "static" else data.select([1]).users()
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    found = Dataset(tmp_path / "back").users()
+    assert len(found) == len(right)
+    assert nmse_db(found["channel.h"], right["channel.h"]) < -100
+    assert found["los"].tolist() == right["los"].tolist()
+    for name in ("channel.tau", "channel.aod", "channel.aoa", "x_m", "gain_db"):
+        assert np.allclose(
+            np.sort(found[name], axis=None), np.sort(right[name], axis=None), rtol=1e-5, atol=1e-12
+        ), name
+    poses = [[a.orientation for a in placed_antennas(users, "rx")] for users in (found, right)]
+    assert np.allclose(*poses)
+    assert list(verify(tmp_path / "back")) == []
+
+
+def broken(content: bytes, how: str) -> bytes:
+    """Damage a file."""
+    return {
+        "empty": b"",
+        "cut": content[: len(content) // 2],
+        "text": b"not of this format",
+        "flipped": content[::-1],
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "text", "flipped"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "params.json",
+        *(f"{name}_t000_tx000_r001.npz" for name in ("power", "aod_el", "rx_pos", "inter", "tx_pos")),
+    ],
+)
+def test_a_damaged_scenario_of_deepmimo_is_named(file: str, how: str, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    (scenario / file).write_bytes(broken((scenario / file).read_bytes(), how))
+    with pytest.raises(RunError, match=file):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deepmimo"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("power", lambda table: table[:, :2]),
+        ("delay", lambda table: table[:3]),
+        ("phase", lambda table: table * np.nan),
+        ("rx_pos", lambda table: table[:, :2]),
+    ],
+)
+def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path, tmp_path: Path) -> None:
+    scenario = exported(Dataset(folder), "deepmimo", tmp_path) / "data"
+    file = scenario / f"{name}_t000_tx000_r001.npz"
+    table = np.load(file)[name]
+    np.savez(file, **{name: change(table)})
+    with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
+        import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+
+
+# --- Wireless InSite ----------------------------------------------------------------------------------------
+
+P2M = """# Receiver Set: three points
+     3
+     1    2
+ -80.0   0.1E-06   0.1E-07
+    1   0   -81.0  {phase}0.1667820E-06    90.0   180.0    90.0     0.0
+Tx-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+    2   1   -90.0  {phase}0.1886919E-06    90.0   152.0725    90.0     27.9275
+Tx-d-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.3325000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+     2    0
+     3    1
+ -95.0   0.1E-06   0.1E-07
+    1   1   -95.0  {phase}0.1886919E-06    90.0   207.9275    90.0   -27.9275
+Tx-R-Rx
+ 0.1000000E+02   0.2000000E+02   0.5000000E+01
+ 0.3500000E+02   0.0675000E+02   0.5000000E+01
+ 0.6000000E+02   0.2000000E+02   0.5000000E+01
+"""
+
+
+def insite(path: Path) -> Source:
+    """Open files of paths at 60 GHz."""
+    form = find_format("p2m")
+    form.frequency_hz = 60e9
+    return form.read(path)
+
+
+def p2m(folder: Path, text: str) -> Path:
+    """Write a file of paths."""
+    file = folder / "street.paths.t001_05.r006.p2m"
+    file.write_text(text, encoding="latin-1")
+    return file
+
+
+@pytest.mark.parametrize(("phase", "of_first"), [("", None), ("  -33.0  ", -33.0)])
+def test_paths_of_wireless_insite_become_users_and_npz(
+    phase: str, of_first: float | None, tmp_path: Path
+) -> None:
+    source = insite(p2m(tmp_path, P2M.format(phase=phase)))
+    data = Dataset(import_dataset(source, tmp_path / "data"))
+    assert list(verify(tmp_path / "data")) == []
+    with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
+        assert users["rx"].tolist() == ["r006-00001", "r006-00003"], "a receiver without paths has no place"
+        assert users["los"].tolist() == [True, False]
+        assert np.allclose(20 * np.log10(np.abs(users["channel.a"][0])), [-81.0, -90.0])
+        right = -2 * np.pi * 60e9 * 0.1667820e-6 if of_first is None else np.radians(of_first)
+        assert np.allclose(users["channel.a"][0, 0] / abs(users["channel.a"][0, 0]), np.exp(1j * right))
+        assert np.allclose(np.degrees(users["channel.aoa"][0]), [[90.0, 180.0], [90.0, 152.0725]])
+        assert np.allclose(np.degrees(users["channel.aod"][1, 0]), [90.0, -27.9275])
+        assert users["channel.interactions"][0].tolist() == [[0], [2]]
+        assert users["channel.points"][1, 0].tolist() == [[35.0, 6.75, 5.0]]
+        assert (users["x_m"][1], users["y_m"][1]) == (60.0, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "line"),
+    [
+        ("     3\n", "", 2),
+        ("     3\n", "     2\n", 15),
+        ("     3\n", "     4\n", 22),
+        ("     3\n", "  three\n", 2),
+        ("     3\n", "     3.5\n", 2),
+        ("     3\n", "     -3\n", 2),
+        ("     1    2\n", "     1    1\n", 9),
+        ("     1    2\n", "     1    3\n", 14),
+        ("     1    2\n", "     1\n", 3),
+        (" -80.0   0.1E-06   0.1E-07\n", "", 4),
+        ("Tx-d-Rx", "Tx-X-Rx", 10),
+        ("Tx-d-Rx", "Tx-d", 10),
+        ("Tx-d-Rx\n", "", 10),
+        ("Tx-d-Rx", "Tx-d-d-Rx", 14),
+        ("   -81.0 ", "   81.0 ", 8),
+        ("   -81.0 ", "   nan ", 5),
+        ("   -81.0 ", "   -81.0 12.0 13.0 ", 5),
+        ("0.1667820E-06    90.0   180.0", "90.0   180.0   0.1667820E-06", 8),
+        ("0.1667820E-06    90.0", "0.1667820E-06    190.0", 8),
+        ("0.1667820E-06", "0.1867820E-06", 8),
+        ("0.3325000E+02", "0,3325000E+02", 12),
+        ("0.3325000E+02", "0.3325000É+02", 0),
+        (" 0.6000000E+02   0.2000000E+02   0.5000000E+01\n     2", "     2", 13),
+    ],
+)
+def test_damaged_files_of_wireless_insite_are_named_with_the_line(
+    before: str, after: str, line: int, tmp_path: Path
+) -> None:
+    text = P2M.format(phase="")
+    assert before in text
+    file = p2m(tmp_path, text.replace(before, after, 1))
+    with pytest.raises(RunError, match=rf"r006.p2m, line {line}:" if line else "r006.p2m: is no file"):
+        import_dataset(insite(file), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("content", ["", "\0" * 4096, "# only a comment\n", "1 2 3 4\n" * 9])
+def test_files_that_are_none_of_wireless_insite_are_refused(content: str, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"r006.p2m, line"):
+        insite(p2m(tmp_path, content))
+
+
+def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="give --frequency-hz"):
+        find_format("p2m").read(p2m(tmp_path, P2M.format(phase="")))
+
+
+def test_a_real_file_of_wireless_insite(shared_data: Path, tmp_path: Path) -> None:
+    import_dataset(insite(shared_data / "insite-paths"), tmp_path / "data")
+    users = Dataset(tmp_path / "data").users()
+    assert (len(users), int(users["paths"].sum())) == (15, 375)
+    assert list(verify(tmp_path / "data")) == []
+
+
+# --- traces and clouds --------------------------------------------------------------------------------------
+
+
+def test_a_reader_by_the_description_of_qd_traces_finds_h(data: Dataset, tmp_path: Path) -> None:
+    out, users = exported(data, "ns3-qd", tmp_path) / "episode-000001", data.select([1]).users()
+    settings = dict(line.split("\t") for line in (out / "Input/paraCfgCurrent.txt").read_text().splitlines())
+    frequency = float(settings["carrierFrequency"])
+    assert (settings["numberOfTimeDivisions"], settings["totalTimeDuration"]) == ("3", "0.3")
+    lines = iter((out / "Output/Ns3/QdFiles/Tx0Rx1.txt").read_text().splitlines())
+    places = np.loadtxt(out / "Output/Ns3/NodesPosition/NodesPosition.csv", delimiter=",")
+    assert np.allclose(places[0], [3.0, -40.0, 12.0])
+    assert (out / "nodes.txt").read_text().split() == ["bs", "car/rx"]
+    for scene in range(3):
+        count = int(next(lines))
+        tau, gain, phase, *degrees = (np.array(next(lines).split(","), float) for _ in range(7))
+        assert len(tau) == count
+        assert np.allclose(tau, users.rows(["channel.tau"])["channel.tau"][scene])
+        table = {
+            "power": gain[None], "phase": np.degrees(phase - 2 * np.pi * frequency * tau)[None],
+            **{name: degrees[at][None] for at, name in enumerate(("aod_el", "aod_az", "aoa_el", "aoa_az"))},
+        }  # fmt: skip
+        poses = [
+            [a.orientation for a in placed_antennas(users[scene : scene + 1], end)] for end in ("rx", "tx")
+        ]
+        found = channels_of(table, ((3, 1), (4, 2)), poses)
+        assert nmse_db(found[0], users["channel.h"][scene]) < -150
+    assert next(lines, None) is None
+
+
+def test_clouds_of_points_are_where_the_lidar_saw_them(clouds: Path, tmp_path: Path) -> None:
+    data = Dataset(clouds)
+    out = exported(data, "pcd", tmp_path) / "000001"
+    assert len(list(out.iterdir())) == SCENES
+    for scene in range(SCENES):
+        head, _, body = (out / f"{scene:06d}-lidar.pcd").read_bytes().partition(b"DATA binary\n")
+        header = dict(line.split(" ", 1) for line in head.decode().splitlines()[1:])
+        cloud = np.frombuffer(body, "<f4").reshape(int(header["POINTS"]), 4)
+        x, y, z, *q = map(float, header["VIEWPOINT"].split())
+        right = data.episode(1)["lidar"].select(frames=[scene])
+        assert len(cloud) == right.hits[0, 0] > 0
+        turned = cloud[:, :3].astype(float) @ rotation_matrix(q).T + [x, y, z]
+        assert np.allclose(turned, right.points_world[0, 0], atol=1e-4)
+        assert np.allclose(np.linalg.norm(cloud[:, :3], axis=1), cloud[:, 3], atol=1e-4)
+
+
+def test_an_export_without_its_topic_says_what_to_record(data: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r'without lidar\.points: write "lidar" into `record`'):
+        exported(data, "pcd", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the page -----------------------------------------------------------------------------------------------
+
+
+def test_the_ten_lines_of_the_page_make_a_link_in_sionna_phy(
+    folder: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sionna.phy")
+    page = (repository / "docs" / "howto" / "formats.md").read_text(encoding="utf-8")
+    code = page.partition("```py\nimport caviar\n")[2].partition("```")[0]
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "s008").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec("import caviar\n" + code, names)  # noqa: S102 - the page's
+    assert names["y"].shape == (64, 1, 3, 14, 64)
+    assert names["h"].shape == (64, 1, 3, 1, 8, 14, 64)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from test_formats import generated
 
 from caviar_clients.datasets.reader import Dataset
 from caviar_formats.base import export_users, find_format
+from caviar_formats.imports import import_dataset
 from caviar_formats.testing import FormatConformance
 from caviar_protocol.errors import RunError
 
@@ -179,8 +182,8 @@ def exported(dataset: Dataset, flavour: str, out: Path) -> Path:
 
 def rays_of(folder: Path, row: dict[str, str]) -> Any:
     """Rays of a row of the CSV, without padding, float64 [rays, 9]."""
-    file = folder / "ray_tracing_data_s008_carrier60GHz"
-    with h5py.File(file / f"rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e{row['EpisodeID']}.hdf5") as data:
+    (file,) = folder.rglob(f"rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e{row['EpisodeID']}.hdf5")
+    with h5py.File(file) as data:
         found = data["allEpisodeData"][int(row["SceneID"]), int(row["VehicleArrayID"])].astype(float)
     return found[~np.isnan(found[:, 0])]
 
@@ -285,3 +288,102 @@ def test_a_dataset_that_the_baseline_cannot_hold_is_refused(poses: Dataset, tmp_
     with pytest.raises(RunError, match=r"scenes of an episode.* 50, .* 1"):
         exported(poses, "baseline", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_full_flavour_comes_back_as_it_went(paired: Dataset, tmp_path: Path) -> None:
+    folder = exported(paired, "full", tmp_path / "out")
+    back = Dataset(import_dataset(find_format("itu").read(folder), tmp_path / "back"))
+    theirs, ours = back.users(), paired.users()
+    ours = ours[np.isin(ours["object"], ["flow0.0", "flow1.0"])]
+    assert theirs["rx"].tolist() == [name.partition("/")[0] for name in ours["rx"].tolist()]
+    assert (theirs["los"] == ours["los"]).all()
+    for name in ("x_m", "y_m", "gain_db", "delay_s"):
+        np.testing.assert_allclose(theirs[name], ours[name], rtol=1e-5)
+    for exact, found in zip(ours["channel.h"], theirs["channel.h"], strict=True):
+        assert np.linalg.norm(found - exact) < 1e-3 * np.linalg.norm(exact)
+    assert (theirs["tx_beam"] == ours["tx_beam"]).all()
+    assert (theirs["rx_beam"] == ours["rx_beam"]).all()
+    again = exported(back, "full", tmp_path / "again")
+    for row in rows_of(folder):
+        if row["Val"] == "V":
+            np.testing.assert_allclose(rays_of(again, row), rays_of(folder, row), rtol=1e-4, atol=1e-2)
+
+
+def _first(folder: Path) -> Path:
+    return folder / "ray_tracing_data_s008_carrier60GHz/rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e0.hdf5"
+
+
+def _in_rows(folder: Path, old: str, new: str) -> None:
+    table = folder / "CoordVehiclesRxPerScene_s008.csv"
+    text = table.read_text()
+    assert old in text
+    table.write_text(text.replace(old, new, 1))
+
+
+def _in_rays(folder: Path, change: Callable[[Any], Any]) -> None:
+    with h5py.File(_first(folder), "r+") as data:
+        rays = change(data["allEpisodeData"][()])
+        del data["allEpisodeData"]
+        data["allEpisodeData"] = rays
+
+
+def _with(place: tuple[int, ...], value: float) -> Callable[[Any], Any]:
+    def change(rays: Any) -> Any:
+        rays[place] = value
+        return rays
+
+    return change
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no table": (lambda f: (f / "CoordVehiclesRxPerScene_s008.csv").unlink(), "CoordVehiclesRxPerScene"),
+    "empty table": (lambda f: (f / "CoordVehiclesRxPerScene_s008.csv").write_text(""), "line 1"),
+    "header": (lambda f: _in_rows(f, "VehicleArrayID", "Vehicle"), "line 1.*VehicleArrayID"),
+    "columns": (lambda f: _in_rows(f, "V,0,0,0,", "V,0,0,"), "line 2"),
+    "number": (lambda f: _in_rows(f, "V,0,0,0,", "V,0,zero,0,"), "line 2.*zero"),
+    "place": (lambda f: _in_rows(f, "V,0,0,1,flow1.0,760", "V,0,0,1,flow1.0,nan"), "line 3"),
+    "validity": (lambda f: _in_rows(f, "V,0,0,0,", "W,0,0,0,"), "line 2"),
+    "order": (lambda f: _in_rows(f, "V,0,0,1,", "V,0,0,0,"), "line 3"),
+    "name twice": (lambda f: _in_rows(f, "1,flow1.0", "1,flow0.0"), "episode 0, scene 0.*flow0.0"),
+    "encoding": (
+        lambda f: (f / "CoordVehiclesRxPerScene_s008.csv").write_bytes(
+            b"\xff\xfe" + "Val,Ä".encode("utf-16")
+        ),
+        "CoordVehiclesRxPerScene_s008.csv",
+    ),
+    "count": (lambda f: _in_rows(f, ",LOS=", "1,LOS="), r"e0.hdf5, allEpisodeData\[0, 0\]"),
+    "line of sight": (lambda f: _in_rows(f, "LOS=1", "LOS=0"), r"e0.hdf5, allEpisodeData\[0, 0\]"),
+    "receiver": (lambda f: _in_rows(f, "I,0,0,2,", "V,0,0,2,"), r"allEpisodeData\[0, 2\]"),
+    "no rays": (lambda f: _first(f).unlink(), "_e0.hdf5"),
+    "empty rays": (lambda f: _first(f).write_bytes(b""), "e0.hdf5"),
+    "cut rays": (lambda f: _first(f).write_bytes(_first(f).read_bytes()[:3000]), "e0.hdf5"),
+    "no array": (
+        lambda f: (_first(f).unlink(), h5py.File(_first(f), "w").close()),
+        "e0.hdf5.*allEpisodeData",
+    ),
+    "shape": (lambda f: _in_rays(f, lambda rays: rays[0]), r"e0.hdf5.*\(3, 25, 9\)"),
+    "columns of rays": (lambda f: _in_rays(f, lambda rays: rays[..., :7]), r"\(1, 3, 25, 7\)"),
+    "text": (lambda f: _in_rays(f, lambda rays: rays.astype("S9")), "e0.hdf5"),
+    "delay": (lambda f: _in_rays(f, _with((0, 0, 0, 1), -1e-9)), r"\[0, 0\].*delay"),
+    "zenith": (lambda f: _in_rays(f, _with((0, 1, 0, 2), 181.0)), r"\[0, 1\].*zenith"),
+    "infinite": (lambda f: _in_rays(f, _with((0, 1, 0, 0), np.inf)), r"\[0, 1\]"),
+    "interactions": (
+        lambda f: _first(f).with_name(f"{_first(f).stem}_interactions.hdf5").write_bytes(b"HDF"),
+        "e0_interactions.hdf5",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(paired: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(paired, "full", tmp_path_factory.mktemp("whole") / "out")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_named_and_nothing_is_written(whole: Path, tmp_path: Path, damage: str) -> None:
+    folder = shutil.copytree(whole, tmp_path / "in")
+    change, place = DAMAGES[damage]
+    change(folder)
+    with pytest.raises(RunError, match=place):
+        import_dataset(find_format("itu").read(folder), tmp_path / "back")
+    assert not list(tmp_path.glob("back*"))

@@ -167,7 +167,7 @@ def test_the_same_seeds_lead_to_the_same_figures_elsewhere(
 
 def test_a_folder_of_other_steps_or_another_scenario_is_refused(settings: Settings, report: Report) -> None:
     del report  # has filled the folder
-    with pytest.raises(RunError, match=r"begun with other values: .*experiment\.steps was 300 and is 600"):
+    with pytest.raises(RunError, match=r"experiment\.steps.*300.*600"):
         experiment(replace(settings, share=2 * TINY, channels=("geometric",)))
     copy = settings.folder / "geometric-quasi-static.toml"
     text = copy.read_text()

@@ -139,7 +139,7 @@ def test_users_of_legacy_go_on_to_the_next_episode_each_by_itself_and_the_last_o
     seen = [env.step([user, 0])[0][:3].tolist() for user in (0, 0, 0, 0, 1, 0)]
     assert seen[3:] == [second.position[0, 0].tolist(), first.position[0, 1].tolist(),
                         second.position[1, 0].tolist()]  # fmt: skip
-    with pytest.raises(EpisodesOverError, match="uav1 is at the end of the last of 2 episodes") as caught:
+    with pytest.raises(EpisodesOverError, match=r"uav1.*last of 2 episodes") as caught:
         env.step([0, 0])
     assert isinstance(caught.value, TypeError)
     env.reset(seed=1)
@@ -309,9 +309,9 @@ def test_a_wrong_action_is_refused(action: tuple[int, int], message: str) -> Non
 
 def test_wrong_options_of_a_reset_are_refused() -> None:
     env = RadioStrikeEnv(episodes=short_episode(0))
-    with pytest.raises(ScenarioError, match="options has no 'episod'; there is: episode"):
+    with pytest.raises(ScenarioError, match=r"'episod'.*episode"):
         env.reset(options={"episod": 1})
-    with pytest.raises(ScenarioError, match="episode 1 is not there; write a number from 0 to 0"):
+    with pytest.raises(ScenarioError, match=r"episode 1 .*from 0 to 0"):
         env.reset(options={"episode": 1})
     with pytest.raises(ScenarioError, match="plays its episodes in order"):
         RadioStrikeEnv("legacy", episodes=short_episode(0)).reset(options={"episode": 0})

@@ -181,14 +181,14 @@ def test_wrong_actions_and_seeds_are_refused_with_the_member() -> None:
     envs = batch(3)
     with pytest.raises(RunError, match=r"call reset\(\)"):
         envs.step(np.zeros((3, 2), np.int64))
-    with pytest.raises(ScenarioError, match="seed has 2 numbers; write 3, one for each member"):
+    with pytest.raises(ScenarioError, match="seed has 2 numbers; write 3"):
         envs.reset(seed=[1, 2])
     envs.reset(seed=1)
     with pytest.raises(ScenarioError, match=r"action \[0, 64\] of member 1"):
         envs.step(np.array([[0, 0], [0, 64], [0, 0]]))
     with pytest.raises(ScenarioError, match=r"action \[-1, 3\] of member 2"):
         envs.step(np.array([[0, 0], [0, 1], [-1, 3]]))
-    with pytest.raises(PayloadError, match=r"int64 of shape \[2, 2\]; write whole numbers of shape \[3, 2\]"):
+    with pytest.raises(PayloadError, match=r"int64 of shape \[2, 2\].*\[3, 2\]"):
         envs.step(np.zeros((2, 2), np.int64))
 
 

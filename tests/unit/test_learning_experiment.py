@@ -119,7 +119,7 @@ def test_what_is_wrong_is_named_with_its_place(old: str, new: str, expected: str
 
 def test_a_module_that_is_nowhere_is_named_with_the_places_looked_in() -> None:
     text = TEXT.replace("caviar/BeamSelection-v0", "no_such_module:Mine-v0")
-    with pytest.raises(ScenarioError, match="beside the experiment, in the current folder"):
+    with pytest.raises(ScenarioError, match="beside the experiment"):
         parse_experiment(text, "my.toml")
 
 
@@ -127,7 +127,7 @@ def test_a_module_that_breaks_is_named(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "breaks_at_import.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
     text = TEXT.replace("caviar/BeamSelection-v0", "breaks_at_import:Mine-v0")
-    with pytest.raises(ScenarioError, match=r"'breaks_at_import' cannot be imported: ZeroDivisionError"):
+    with pytest.raises(ScenarioError, match=r"'breaks_at_import'.*ZeroDivisionError"):
         parse_experiment(text, "my.toml")
 
 
@@ -144,7 +144,7 @@ def test_an_environment_of_a_module_beside_the_file(tmp_path: Path, monkeypatch:
     file.write_text(text)
     assert load_experiment(file).environment.options == {"length": 5}
     file.write_text(text.replace("BesideTheFile", "BesideFile"))
-    with pytest.raises(ScenarioError, match=r"'beside_the_file' registers no .*mean 'BesideTheFile-v0'\?"):
+    with pytest.raises(ScenarioError, match=r"'beside_the_file'.*'BesideTheFile-v0'"):
         load_experiment(file)
 
 
@@ -159,7 +159,7 @@ def test_an_environment_of_a_notebook_is_no_candidate(monkeypatch: pytest.Monkey
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"none\.toml: cannot be read: No such file"):
+    with pytest.raises(ScenarioError, match=r"none\.toml: .*No such file"):
         load_experiment(tmp_path / "none.toml")
 
 
@@ -176,7 +176,7 @@ def test_an_environment_that_takes_any_argument_is_not_judged_by_names() -> None
         'scenario = "geometric"\nobserve = ["position", "last_beam"]\n', "sutton_barto_reward = true\n"
     )
     assert parse_experiment(text).environment.options == {"sutton_barto_reward": True}
-    with pytest.raises(ScenarioError, match="unknown option 'sutton_barto'; did you mean"):
+    with pytest.raises(ScenarioError, match="'sutton_barto'"):
         parse_experiment(text.replace("sutton_barto_reward", "sutton_barto"))
 
 

@@ -222,7 +222,7 @@ def test_a_recording_without_a_channel_is_refused(tmp_path: Path) -> None:
     scenario = load_scenario("smoke")
     services = {name: scenario.services[name] for name in ("world", "recorder")}
     record_run(tmp_path / "run", replace(scenario, services=services), frames=3, record=("scene",))
-    with pytest.raises(CaviarError, match="no scene or no channel in frame 0: write record ="):
+    with pytest.raises(CaviarError, match=r"frame 0.*record ="):
         read_tracks([tmp_path / "run"], ("aod",))
 
 
@@ -231,7 +231,7 @@ def test_actions_are_checked_and_an_episode_has_to_begin(geometric: tuple[Path, 
     with pytest.raises(RunError, match=r"call reset\(\)"):
         env.step(np.zeros(2, np.int64))
     env.reset(seed=1)
-    with pytest.raises(PayloadError, match="the action of member 1 is 64; write numbers from 0 to 63"):
+    with pytest.raises(PayloadError, match=r"member 1 is 64.*0 to 63"):
         env.step(np.array([0, 64]))
     with pytest.raises(PayloadError, match=r"whole numbers of shape \[2\]"):
         env.step(np.array([0.5, 1.0]))
@@ -244,7 +244,7 @@ def test_actions_are_checked_and_an_episode_has_to_begin(geometric: tuple[Path, 
 @pytest.mark.parametrize("tracks", [[0, 99], [0, -1], [0], 0, "ab", [], [0.5, 0], [0, 0, 0]])
 def test_users_that_are_not_recorded_are_refused(tracks: Any, geometric: tuple[Path, Path]) -> None:
     env = RecordedBeamsVectorEnv(2, [geometric[1]])
-    with pytest.raises(ScenarioError, match=r"write 2 whole numbers from 0 to \d+, one for each member"):
+    with pytest.raises(ScenarioError, match=r"2 whole numbers from 0 to \d+"):
         env.reset(options={"tracks": tracks})
 
 

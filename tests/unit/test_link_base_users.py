@@ -79,13 +79,13 @@ def test_a_path_of_amplitude_zero_on_a_carrier_is_no_path_there() -> None:
 
 def test_a_channel_without_h_is_refused_naming_the_user_and_the_part() -> None:
     channel = channel_of(("bs",), ("car/rx",), {("mmwave", "bs", "car/rx"): random_h(1, 2, 4)}, with_h=False)
-    with pytest.raises(PayloadError, match=r"paths for bs → car/rx on mmwave but no H; .* part 'h'"):
+    with pytest.raises(PayloadError, match=r"bs → car/rx on mmwave.*'h'"):
         channels_of(channel, users_of(scene_of(BS, CAR), channel.carriers))
 
 
 def test_an_h_that_does_not_fit_the_arrays_is_refused_with_both_shapes() -> None:
     channel = channel_of(("bs",), ("car/rx",), {("mmwave", "bs", "car/rx"): random_h(1, 4, 2)})
-    with pytest.raises(PayloadError, match=r"bs → car/rx on mmwave has shape \(4, 2\), .* need \(2, 4\)"):
+    with pytest.raises(PayloadError, match=r"bs → car/rx.*\(4, 2\).*\(2, 4\)"):
         channels_of(channel, users_of(scene_of(BS, CAR), channel.carriers))
 
 

@@ -71,7 +71,7 @@ def test_where_paths_do_not_say_it_the_grid_is_asked_for(street: tuple[Scene, Us
         # The grid is in single precision: a beam that misses is a small difference of its large numbers.
         assert place is not None
         assert np.abs(y - expected).max() <= 1e-6 * np.abs(grid[place]).max()
-    with pytest.raises(PayloadError, match=r"rung 'spherical' does not follow from paths; ask for part 'hf'"):
+    with pytest.raises(PayloadError, match=r"'spherical'.*'hf'"):
         beam_responses(msgspec.structs.replace(near, hf=()), scene, users, beams)
 
 

@@ -261,9 +261,9 @@ def test_the_reward_of_delay_is_better_the_less_it_is() -> None:
 
 def test_settings_that_contradict_each_other_are_refused_with_their_key() -> None:
     place = Place("services.link.settings")
-    with pytest.raises(ScenarioError, match=r"settings\.traffic\[0\]\.rate_bit_s: is missing"):
+    with pytest.raises(ScenarioError, match=r"settings\.traffic\[0\]\.rate_bit_s"):
         CellLink.check_settings(CellSettings(traffic=(Traffic(model="poisson"),)), place)
-    with pytest.raises(ScenarioError, match=r'max_spectral_efficiency: .*; write rate_model = "capped"'):
+    with pytest.raises(ScenarioError, match=r'max_spectral_efficiency.*rate_model.*=.*"capped"'):
         CellLink.check_settings(CellSettings(max_spectral_efficiency=3.0), place)
 
 
@@ -392,9 +392,7 @@ def test_an_agent_takes_a_receiver_to_another_transmitter_by_its_beams() -> None
 
 
 def test_beams_of_two_transmitters_are_refused_where_the_agent_associates() -> None:
-    with pytest.raises(
-        ProductError, match=r"'pilot', .*: it chose beams of 'bs' and 'other' for 'a' .*; with association"
-    ):
+    with pytest.raises(ProductError, match=r"'pilot'.*'bs'.*'other'.*'a'"):
         link_of(association="agent").step(two_cells(0, (4.0, 1.0), "bs", "other"))
 
 
@@ -441,5 +439,5 @@ def test_traffic_of_a_receiver_that_is_not_there_is_refused(users: tuple[str, ..
 
 
 def test_a_reward_that_is_not_there_is_refused_with_all_that_are() -> None:
-    with pytest.raises(ScenarioError, match=r"'dlay' is not possible here; did you mean 'delay'\? One of"):
+    with pytest.raises(ScenarioError, match=r"'dlay'.*'delay'"):
         convert_settings(CellSettings, {"reward": "dlay"})

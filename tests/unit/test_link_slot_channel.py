@@ -213,19 +213,17 @@ def test_a_band_has_a_point_in_each_resource_block_up_to_a_bound() -> None:
 
 def test_channels_that_do_not_follow_from_paths_are_refused(channel: Channel) -> None:
     exact = granted(replace(channel, rung="spherical"), ("bs.0", "car.0/rx"))
-    with pytest.raises(PayloadError, match=r"does not follow from the paths of rung 'spherical'; leave out"):
+    with pytest.raises(PayloadError, match="rung 'spherical'"):
         cell(selective=("time",)).step(exact)
 
 
 def test_a_band_is_asked_for_with_the_rate_model_that_uses_it_and_carriers_that_have_one() -> None:
     place = Place("services.link.settings")
-    with pytest.raises(
-        ScenarioError, match=r"settings\.selective: 'frequency' has no effect with .*'shannon'"
-    ):
+    with pytest.raises(ScenarioError, match=r"settings\.selective.*'frequency'.*'shannon'"):
         CellLink.check_settings(CellSettings(selective=("frequency",)), place)
     flat = (Carrier(name="flat", frequency_hz=28e9),)
     link = CellLink(
         CellSettings(selective=("frequency",), rate_model="nr"), RunInfo(name="link", carriers=flat)
     )
-    with pytest.raises(ScenarioError, match=r"selective: 'frequency' needs a carrier with 24 subcarriers"):
+    with pytest.raises(ScenarioError, match=r"'frequency'.*24 subcarriers"):
         link.prepare(Preparation(demand={"link": frozenset()}))

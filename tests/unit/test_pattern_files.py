@@ -118,7 +118,7 @@ def test_files_with_a_byte_order_mark_are_read(tmp_path: Path, encoding: str) ->
 
 def test_a_pipe_is_named_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv")
-    with pytest.raises(AssetError, match=r"a.csv cannot be read: it is a named pipe, not a file; name a"):
+    with pytest.raises(AssetError, match=r"a\.csv .*named pipe"):
         read_pattern(tmp_path / "a.csv")
 
 
@@ -137,7 +137,7 @@ def test_the_mean_gain_is_that_over_the_sphere(tmp_path: Path) -> None:
 @pytest.mark.parametrize("gain", [10.1, 400.0, 7000.0, 1e308])
 def test_a_pattern_that_radiates_more_than_it_gets_is_refused(tmp_path: Path, gain: float) -> None:
     rows = [f"{t},{p},{gain}" for t in (0, 90, 180) for p in (0, 90, 180, 270)]
-    with pytest.raises(AssetError, match=r"a.csv: its gain has a mean of .* dBi over the sphere"):
+    with pytest.raises(AssetError, match=r"a\.csv: .*mean of .* dBi"):
         written(tmp_path, "a.csv", "theta_deg,phi_deg,gain_dbi", *rows)
 
 
@@ -153,5 +153,5 @@ def test_a_mean_gain_that_cannot_be_right_is_remarked_on(tmp_path: Path) -> None
 def test_a_table_of_scattered_angles_is_refused_before_it_takes_memory(tmp_path: Path) -> None:
     """20,000 lines would become a table of 4e8 directions."""
     rows = [f"{180 * k / 19_999},{k / 100},0" for k in range(20_000)]
-    with pytest.raises(AssetError, match=r"no line for theta_deg = 0, phi_deg = 0.01"):
+    with pytest.raises(AssetError, match=r"theta_deg = 0, phi_deg = 0\.01"):
         written(tmp_path, "a.csv", "theta_deg,phi_deg,gain_dbi", *rows)

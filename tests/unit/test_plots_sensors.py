@@ -140,7 +140,7 @@ def test_plot_draws_the_fixed_camera_of_a_recording_or_the_one_asked_for(tmp_pat
 
 def test_a_camera_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
     run = recorded(tmp_path / "run")
-    with pytest.raises(RecordingError, match=r"no images of camera 'pol'; did you mean 'pole'\?"):
+    with pytest.raises(RecordingError, match=r"'pol'.*'pole'"):
         plot_run(run, tmp_path, camera="pol")
-    with pytest.raises(RecordingError, match=r"frame 0 has no images of camera 'x'; known: car\.0/eye, pole"):
+    with pytest.raises(RecordingError, match=r"frame 0.*'x'.*car\.0/eye, pole"):
         plot_run(run, tmp_path, frame=0, camera="x")

@@ -48,9 +48,7 @@ def test_a_user_is_named_by_receiver_or_object(tmp_path, name):
 
 
 def test_an_unknown_user_is_refused_with_the_names_there_are(tmp_path):
-    with pytest.raises(
-        RecordingError, match=r"'car\.9/rx'; did you mean 'car\.\d/rx'\? known: car\.0/rx, car"
-    ):
+    with pytest.raises(RecordingError, match=r"'car\.9/rx'.*'car\.\d/rx'.*car\.0/rx"):
         choose_user(with_links(tmp_path, [2]), "car.9/rx")
 
 

@@ -90,14 +90,12 @@ def test_a_row_that_is_no_csv_is_refused_with_file_and_line(tmp_path: Path) -> N
 
 
 def test_a_trace_that_cannot_be_read_is_refused_with_its_key(tmp_path: Path) -> None:
-    with pytest.raises(
-        ScenarioError, match=r"traffic\[1\]\.file: the trace .*none.csv cannot be read: No such"
-    ):
+    with pytest.raises(ScenarioError, match=r"traffic\[1\]\.file: .*none\.csv"):
         check_traffic(Traffic(model="trace", file=f"file:{tmp_path / 'none.csv'}"), PLACE)
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe")
     with pytest.raises(ScenarioError, match="cannot be read: not UTF-8 text"):
         read_trace(f"file:{tmp_path / 'bytes.csv'}", PLACE)
-    with pytest.raises(ScenarioError, match=r'relative to nothing; write "file:video\.csv"'):
+    with pytest.raises(ScenarioError, match=r'"file:video\.csv"'):
         read_trace("video.csv", PLACE)
 
 

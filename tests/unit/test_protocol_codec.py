@@ -76,7 +76,7 @@ def scene(*devices: Any) -> Scene:
 
 
 @pytest.mark.parametrize("cls", get_args(Message), ids=lambda cls: cls.__struct_config__.tag)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_a_message_survives_the_wire(cls: type[Message], data: st.DataObject) -> None:
     """Equal when decoded, the same bytes when encoded again, and readable by the msgpack package."""
@@ -91,7 +91,7 @@ def test_a_message_survives_the_wire(cls: type[Message], data: st.DataObject) ->
 
 
 @pytest.mark.parametrize("topic", PAYLOADS)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_a_payload_survives_the_wire(topic: str, data: st.DataObject) -> None:
     payload = data.draw(ps.payload(PAYLOADS[topic]))
@@ -205,7 +205,7 @@ def test_an_array_in_another_memory_order_gives_the_same_bytes() -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_non_finite_scalar_does_not_leave(value: float) -> None:
     """Also inside a device, which is no payload of its own."""
-    with pytest.raises(PayloadError, match=r"devices\[0\]\.position\[1\] is (nan|-?inf)"):
+    with pytest.raises(PayloadError, match=r"devices\[0\]\.position\[1\]"):
         encode_payload(scene(CameraDevice(name="x", position=(0.0, value, 0.0))))
 
 

@@ -134,9 +134,9 @@ def test_wideband_parts_are_there_for_carriers_that_have_them(tmp_path: Path) ->
 def test_a_wideband_part_that_was_not_recorded_is_asked_for_by_name(street: Path, tmp_path: Path) -> None:
     """Where no carrier could have it, `record` alone would not bring it."""
     rays = Recording(street)["channel"]
-    with pytest.raises(RecordingError, match=r"no carrier of the run has subcarriers; write subcarriers = "):
+    with pytest.raises(RecordingError, match="write subcarriers = "):
         rays.hf  # noqa: B018
-    with pytest.raises(RecordingError, match=r"no carrier of the run has taps; write taps = … into \[\[carr"):
+    with pytest.raises(RecordingError, match=r"write taps = .*\[\[carr"):
         rays.first_tap  # noqa: B018
     assert "h: narrowband gain" in repr(rays)
     assert f"Here {rays.h.shape}" in repr(rays)
@@ -298,7 +298,7 @@ def test_a_damaged_product_is_named_and_those_beside_it_are_read(street: Path) -
     recording = Recording(street)
     assert recording["channel"].h.shape == (6, 3, 2, 4)
     assert recording["link"][2:].abs_y.shape == (4, 3)
-    with pytest.raises(RecordingError, match=r"episode 0, frame 1, link of 'link': its bytes are damaged"):
+    with pytest.raises(RecordingError, match="episode 0, frame 1, link of 'link'"):
         recording["link"].abs_y  # noqa: B018
 
 
@@ -324,11 +324,9 @@ def test_lidar_scans_are_padded_and_objects_renumbered(tmp_path: Path) -> None:
     assert (scans.object[0] == np.where(lidar(0).scans[0].object == 0, 0, 2)).all()
     assert scans.object[1, 0, :6].tolist() == [*np.array([2, 1])[scan.object], -1]
     assert np.isnan(scans.range[1, 0, 5:]).all()
-    with pytest.raises(RecordingError, match=r"was recorded without lidar\.grid: write it into `record`"):
+    with pytest.raises(RecordingError, match=r"lidar\.grid.*`record`"):
         scans.grid  # noqa: B018
-    with pytest.raises(
-        RecordingError, match=r"has lidar of 'front', 'rear': choose one, .*\['lidar', 'front'\]"
-    ):
+    with pytest.raises(RecordingError, match=r"'front'.*'rear'.*\['lidar'.*'front'\]"):
         Recording(tmp_path)["lidar"]
 
 
@@ -424,9 +422,7 @@ def test_paths_without_h_say_how_to_record_it(tmp_path: Path) -> None:
     record(tmp_path, [frame(0, product("channel", "rt", channel(0), 0))])
     rays = Recording(tmp_path)["channel"]
     assert rays.tau.shape == (1, 3, 2)
-    with pytest.raises(
-        RecordingError, match=r"channel was recorded without channel\.h: write it into `record`"
-    ):
+    with pytest.raises(RecordingError, match=r"channel\.h.*`record`"):
         rays.h  # noqa: B018
 
 
@@ -434,19 +430,19 @@ def test_a_recorder_that_asks_for_a_part_refuses_a_channel_without_it(tmp_path: 
     made = recorder(tmp_path, run={"record": ("channel.h",)})
     check = ProductCheck(ContentRules(parts=made.parts))
     bare = product("channel", "rt", channel(0), 0)
-    with pytest.raises(ProductError, match="channel of 'rt', frame 0: part 'h' is in demand"):
+    with pytest.raises(ProductError, match="'rt', frame 0: part 'h'"):
         made.step(frame(0, FrameInput(bare.provenance, bare.header, bare.body, check=check)))
     made.close()
 
 
 def test_a_part_that_was_asked_for_and_not_delivered_is_laid_on_its_source(tmp_path: Path) -> None:
     record(tmp_path, [frame(0, product("channel", "rt", channel(0), 0))], run={"record": ("channel.h",)})
-    with pytest.raises(RecordingError, match=r"has no channel\.h, which `record` .* asks for: 'rt' did not"):
+    with pytest.raises(RecordingError, match=r"channel\.h.*`record`.*'rt'"):
         Recording(tmp_path)["channel"].h  # noqa: B018
 
 
 def test_an_empty_recording_has_no_product(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="holds no product of 'scene'; it holds none"):
+    with pytest.raises(RecordingError, match="no product of 'scene'"):
         Recording(record(tmp_path, frames=0))["scene"]
 
 

@@ -191,9 +191,7 @@ def test_a_manifest_that_is_not_what_was_written_is_named(tmp_path):
     run = record(tmp_path, frames=2)
     file = run / "recording.json"
     file.write_bytes(file.read_bytes().replace(b'"frames":2', b'"frames":3'))
-    with pytest.raises(
-        RecordingError, match=r"recording\.json is damaged: its content does not have its CRC"
-    ):
+    with pytest.raises(RecordingError, match=r"recording\.json.*CRC"):
         read_manifest(run)
     file.write_bytes(b"")
     with pytest.raises(RecordingError, match=r"recording\.json is damaged"):

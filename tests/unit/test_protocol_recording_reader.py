@@ -75,12 +75,12 @@ def test_products_are_found_by_frame_and_by_topic(run):
     assert recording.product(0, 3, "scene", "world") == scene(3)
     assert [p.payload for _, p in recording.products("link")] == [link(k) for k in range(6)]
     assert [frame.number for frame in recording] == [frame.number for frame in recording.frames()]
-    with pytest.raises(RecordingError, match=r"recording\[3\] is no topic.*recording\.frame\(episode=0"):
+    with pytest.raises(RecordingError, match=r"recording\[3\].*recording\.frame\(episode=0"):
         recording[3]
     assert isinstance(recording.product(0, 0, "scene", "world"), Scene)
     with pytest.raises(RecordingError, match=r"frame 1 has no lidar of 'top'"):
         recording.product(0, 1, "lidar", "top")
-    with pytest.raises(RecordingError, match=r"no frame 9 of episode 0; it has frames \(0, 0\) to \(0, 5\)"):
+    with pytest.raises(RecordingError, match=r"frame 9 of episode 0.*\(0, 5\)"):
         recording.frame(0, 9)
 
 
@@ -212,20 +212,20 @@ def test_a_missing_segment_is_named(run):
     assert not recording.complete
     assert [frame.number for frame in recording.frames()] == [0, 1]
     (run / "recording-0000.mcap").unlink()
-    with pytest.raises(RecordingError, match=r"recording-0000\.mcap is missing, although recording-0002"):
+    with pytest.raises(RecordingError, match=r"recording-0000\.mcap.*recording-0002"):
         Recording(run)
 
 
 def test_a_segment_that_breaks_off_before_others_is_read_up_to_there(run):
     file = run / "recording-0001.mcap"
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.warns(RecordingWarning, match=r"0001\.mcap has \d+ B of \d+ B: its index is damaged, and no"):
+    with pytest.warns(RecordingWarning, match=r"0001\.mcap has \d+ B of \d+ B"):
         assert len(Recording(run)) == 6
     file.write_bytes(file.read_bytes()[: Segment(file).chunks[1].stop])
-    with pytest.warns(RecordingWarning, match="after frame 2 of episode 0 up to frame 3"):
+    with pytest.warns(RecordingWarning, match=r"frame 2 of episode 0.*frame 3"):
         assert len(Recording(run)) == 3
     (run / "recording.json").unlink()
-    with pytest.warns(RecordingWarning, match=r"breaks off at byte \d+: lost are all frames after frame 2"):
+    with pytest.warns(RecordingWarning, match=r"at byte \d+: .*frame 2"):
         assert len(Recording(run)) == 3
 
 
@@ -266,21 +266,21 @@ def test_a_held_product_in_an_earlier_segment_needs_that_segment(tmp_path):
         segment_frames=1,
     )
     assert Recording(tmp_path).product(0, 1, "link", "link") == link(0)
-    with pytest.raises(RecordingError, match=r"its bytes, of frame 0, are not in .*recording-0001\.mcap"):
+    with pytest.raises(RecordingError, match=r"frame 0,.*recording-0001\.mcap"):
         Recording(tmp_path / "recording-0001.mcap").product(0, 1, "link", "link")
 
 
 def test_what_is_no_recording_is_refused_by_name(tmp_path):
     with pytest.raises(RecordingError, match="does not exist: give a run directory"):
         Recording(tmp_path / "nothing")
-    with pytest.raises(RecordingError, match=r"holds no recording: there is no recording-\*\.mcap"):
+    with pytest.raises(RecordingError, match=r"recording-\*\.mcap"):
         Recording(tmp_path)
     record(tmp_path / "runs" / "sample-1", frames=1)
-    with pytest.raises(RecordingError, match=r"holds runs: give one of them, as .*/runs/sample-1$"):
+    with pytest.raises(RecordingError, match=r"/runs/sample-1$"):
         Recording(tmp_path / "runs")
     scenario = tmp_path / "mine.toml"
     scenario.write_text("[run]\n")
-    with pytest.raises(RecordingError, match=r"but a scenario: caviar run .*mine\.toml makes a run of it"):
+    with pytest.raises(RecordingError, match=r"mine\.toml"):
         Recording(scenario)
     text = tmp_path / "notes.txt"
     text.write_text("hello, this is text")
@@ -291,7 +291,7 @@ def test_what_is_no_recording_is_refused_by_name(tmp_path):
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start(profile="ros2")
         writer.finish()
-    with pytest.raises(RecordingError, match="of profile 'ros2', not a recording of CAVIAR"):
+    with pytest.raises(RecordingError, match=r"'ros2'.*CAVIAR"):
         Recording(foreign)
 
 
@@ -300,7 +300,7 @@ def test_another_format_is_refused(tmp_path):
     data = file.read_bytes()
     place = data.index(b"format\x01\x00\x00\x001") + len(b"format\x01\x00\x00\x00")
     file.write_bytes(data[:place] + b"2" + data[place + 1 :])
-    with pytest.raises(RecordingError, match="has format 2, this version reads format 1"):
+    with pytest.raises(RecordingError, match=r"format 2.*format 1"):
         Recording(tmp_path / "run")
 
 

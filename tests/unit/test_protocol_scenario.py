@@ -335,11 +335,11 @@ def test_a_file_that_is_not_text_is_named_with_its_line(tmp_path: Path) -> None:
 
 def test_a_missing_scenario_names_those_beside_it(folder: Path) -> None:
     (folder / "smoke.toml").write_text(GOOD)
-    with pytest.raises(ScenarioError, match=r"smok\.toml: cannot be read: No such file.*has smoke\.toml"):
+    with pytest.raises(ScenarioError, match=r"smok\.toml.*smoke\.toml"):
         load_scenario(folder / "smok.toml")
-    with pytest.raises(ScenarioError, match=r"No such file or directory; did you mean .*/smoke\.toml\?"):
+    with pytest.raises(ScenarioError, match=r"No such file.*/smoke\.toml\?"):
         load_scenario(folder / "smok.toml")
-    with pytest.raises(ScenarioError, match=r"No such file or directory; there is no folder .*/nowhere"):
+    with pytest.raises(ScenarioError, match=r"No such file.*/nowhere"):
         load_scenario(folder / "nowhere" / "mine.toml")
 
 
@@ -352,7 +352,7 @@ def test_a_name_of_an_own_scenario_is_found_too(folder: Path, monkeypatch: pytes
 
 def test_a_folder_in_place_of_a_scenario_names_those_in_it(folder: Path) -> None:
     (folder / "smoke.toml").write_text(GOOD)
-    with pytest.raises(ScenarioError, match=r"cannot be read: Is a directory.*has smoke\.toml"):
+    with pytest.raises(ScenarioError, match=r"Is a directory.*smoke\.toml"):
         load_scenario(folder)
 
 
@@ -365,11 +365,11 @@ def test_the_name_of_a_folder_is_told_from_that_of_a_shipped_scenario(
         Path(name).mkdir()
     (folder / "mine" / "a.toml").write_text(GOOD)
     (folder / "runs" / "run.json").touch()
-    with pytest.raises(ScenarioError, match=r"has a\.toml: name one of them, as mine/a\.toml"):
+    with pytest.raises(ScenarioError, match=r"a\.toml.*mine/a\.toml"):
         load_scenario("mine")
-    with pytest.raises(ScenarioError, match="Is a directory; a scenario is a TOML file: caviar new"):
+    with pytest.raises(ScenarioError, match=r"Is a directory.*caviar new"):
         load_scenario("empty")
-    with pytest.raises(ScenarioError, match=r"the directory of a run, .* with: caviar replay runs"):
+    with pytest.raises(ScenarioError, match=r"directory of a run.*caviar replay runs"):
         load_scenario("runs")
 
 
@@ -394,7 +394,7 @@ def test_a_mark_in_front_of_a_file_is_passed_over(tmp_path: Path) -> None:
 def test_a_name_that_is_too_long_for_a_directory_is_refused_with_the_limit(tmp_path: Path) -> None:
     text = find_scenario("smoke").read_text().replace('name = "smoke"', f'name = "{"n" * 300}"')
     (tmp_path / "long.toml").write_text(text)
-    with pytest.raises(ScenarioError, match=r"long\.toml:\d+: run\.name.*matches .*\{0,199\}"):
+    with pytest.raises(ScenarioError, match=r"long\.toml:\d+.*run\.name.*\{0,199\}"):
         load_scenario(tmp_path / "long.toml")
 
 
@@ -410,7 +410,7 @@ def test_a_name_with_a_control_character_is_refused_and_shown_escaped(
 
 
 def test_frames_of_the_command_line_are_within_the_longest_duration() -> None:
-    with pytest.raises(ScenarioError, match=r"9000000000000 frames of \d+ ns are longer than"):
+    with pytest.raises(ScenarioError, match=r"9000000000000 frames of \d+ ns"):
         with_overrides(load_scenario("smoke"), frames=9_000_000_000_000)
 
 
@@ -432,7 +432,7 @@ def test_pattern_files_are_found_beside_the_scenario_and_differ_in_name(tmp_path
     assert linked.pattern_file == str(tmp_path / "linked.msi")
     second = '\n[[devices]]\nname = "b2"\nkind = "antenna"\nrole = "rx"\n'
     (tmp_path / "two.toml").write_text(text + second + "array.pattern_file = 'file:b/sector.msi'\n")
-    with pytest.raises(ScenarioError, match=r"two.toml:\d+: devices\[2\].array.pattern_file: .*rename one"):
+    with pytest.raises(ScenarioError, match=r"two.toml:\d+.*devices\[2\].array.pattern_file"):
         load_scenario(tmp_path / "two.toml")
 
 

@@ -81,7 +81,7 @@ def test_what_is_wrong_in_a_file_is_named_with_its_line(
 
 
 def test_a_file_that_is_not_there_is_named() -> None:
-    with pytest.raises(ScenarioError, match=r"run\.instants_s: .*nowhere\.csv cannot be read"):
+    with pytest.raises(ScenarioError, match=r"run\.instants_s.*nowhere\.csv"):
         parsed('instants_s = "file:nowhere.csv"')
 
 
@@ -115,7 +115,7 @@ def test_fewer_frames_are_the_first_instants_and_more_are_refused() -> None:
     plan = plan_run(with_overrides(scenario, frames=2), "run", {})
     assert [plan.t_ns(frame) for frame in range(plan.frames)] == [100_000_000, 200_000_000]
     assert plan.t_ns(2) == 400_000_000
-    with pytest.raises(ScenarioError, match=r"run\.frames: is 4, and the scenario has 3 instants"):
+    with pytest.raises(ScenarioError, match=r"run\.frames: is 4.* 3 instants"):
         with_overrides(scenario, frames=4)
 
 

@@ -87,7 +87,7 @@ def test_overrides_replace_and_are_checked() -> None:
     changed = with_overrides(base, frames=9, seed=0)
     assert (changed.run.frames, changed.run.seed, changed.run.name) == (9, 0, "x")
     assert base.run.frames == 3
-    with pytest.raises(ScenarioError, match=r"run\.frames: is 0, write a whole number ≥ 1"):
+    with pytest.raises(ScenarioError, match=r"run\.frames: is 0.*≥ 1"):
         with_overrides(base, frames=0)
     with pytest.raises(ScenarioError, match=r"run\.seed: is -1"):
         with_overrides(base, seed=-1)
@@ -102,7 +102,7 @@ def test_a_pace_on_the_command_line_is_a_word_or_a_factor(text: str, pace: str |
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "1e9", "quick", ""])
 def test_a_pace_that_is_none_is_refused_on_the_command_line(text: str) -> None:
-    with pytest.raises(ScenarioError, match=r'run\.pace: is .*, write a number .*, or one of "fast", "free"'):
+    with pytest.raises(ScenarioError, match=r'run\.pace.*"fast".*"free"'):
         with_overrides(scenario(streets=world()), pace=text)
 
 
@@ -118,9 +118,7 @@ role = "world"
 use = "trajectory"
 budget_ms = 1
 """
-    with pytest.raises(
-        ScenarioError, match=r':5: run\.pace: is .*, write a number .*, or one of "fast", "free"'
-    ):
+    with pytest.raises(ScenarioError, match=r':5.*run\.pace.*"fast".*"free"'):
         parse_scenario(text, "paced.toml")
 
 
@@ -369,7 +367,7 @@ def test_an_agent_without_any_receiver_is_told_so() -> None:
     antenna = '[[devices]]\nname = "only"\nkind = "antenna"\nrole = "tx"\n'
     text = smoke_with('["car/rx"]', ('use = "free-space"\nbudget_ms = 20', 'use = "lidar"\nbudget_ms = 20'))
     text = text[: text.index("[[devices]]")].replace('role = "channel"', 'role = "sensors"') + antenna
-    with pytest.raises(ScenarioError, match="no receiver is named 'car/rx'; no antenna has role = \"rx\""):
+    with pytest.raises(ScenarioError, match=r"'car/rx'.*role = .rx."):
         parse_scenario(text)
 
 

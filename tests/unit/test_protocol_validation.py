@@ -205,9 +205,7 @@ def test_an_array_with_fewer_or_more_panels_than_the_scenario_says_is_refused(co
     check = ProductCheck(replace(RULES, devices={"world": specs}))
     wrong = replace(array, panels=(Panel(),) * count)
     devices = (BS, EYE, replace(A, array=wrong), replace(B, array=array))
-    with pytest.raises(
-        ProductError, match=r"'car.04/rx': array.panels \(.*\), by the scenario it is \(Panel\("
-    ):
+    with pytest.raises(ProductError, match=r"'car.04/rx'.*array.panels"):
         check(entry(), scene(devices=devices))
     right = (BS, EYE, replace(A, array=array), replace(B, array=array))
     check(entry(), scene(devices=right))
@@ -328,7 +326,7 @@ def test_squares_that_overflow_are_no_fault() -> None:
 
 def test_a_false_digest_is_refused() -> None:
     header, body = encode_payload(scene())
-    with pytest.raises(ProductError, match=r"its digest is [0-9a-f]{64}, its DONE said 0{64}"):
+    with pytest.raises(ProductError, match=r"[0-9a-f]{64}.*DONE.*0{64}"):
         check_digest(entry(digest="0" * 64), header, body)
 
 

@@ -84,7 +84,7 @@ def test_a_directory_that_is_removed_during_the_run_is_named(tmp_path):
     made = recorder(tmp_path / "run")
     made.step(frame(0))
     shutil.rmtree(tmp_path / "run")
-    with pytest.raises(RunError, match=r"run's directory was removed or renamed while the run wrote to it"):
+    with pytest.raises(RunError, match="directory was removed or renamed"):
         made.step(frame(1))
     made.close()
 

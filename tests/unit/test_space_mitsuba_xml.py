@@ -242,7 +242,5 @@ def test_the_materials_are_those_of_the_ray_tracer() -> None:
 
 def test_the_ray_tracer_refuses_a_shape_without_radio_constants(tmp_path: Path) -> None:
     body = '<bsdf type="diffuse" id="paint"/>\n' + SHAPE.format("wall", '<ref id="paint" name="bsdf"/>')
-    with pytest.raises(
-        AssetError, match=r"^scenery/scene\.xml:2: shape 'mesh-wall' has material 'paint' of type"
-    ):
+    with pytest.raises(AssetError, match=r"^scenery/scene\.xml:2.*'mesh-wall'.*'paint'"):
         file_pieces(described(tmp_path, body, "wall"))

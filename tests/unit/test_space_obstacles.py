@@ -218,7 +218,9 @@ def motion(rng: np.random.Generator) -> Motion:
     return Motion(velocity=place) if rng.random() < 0.5 else Motion(target=place, speed=12.0)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in range(2, 6))]
+)
 def test_the_acceleration_keeps_its_limit_at_walls_too(seed: int) -> None:
     """Seen in steps that are shorter than a sub-step."""
     made, rng, bounds = among_boxes(seed)
@@ -286,5 +288,5 @@ def test_a_start_inside_the_clearance_is_refused() -> None:
         name="uav", start_m=(8.5, 21.3, 26.5), max_speed_m_s=5.0, max_acceleration_m_s2=2.0, clearance_m=2.0
     )
     made = FlightWorld(FlightSettings(scenery="sionna:munich", flown=(thing,)), RunInfo(name="world"))
-    with pytest.raises(ScenarioError, match=r"m from the scenery, and 'uav' keeps 2\.000 m"):
+    with pytest.raises(ScenarioError, match=r"'uav' keeps 2\.000 m"):
         made.prepare(Preparation(demand={}))

@@ -133,7 +133,7 @@ def test_what_has_no_inside_is_refused() -> None:
         outward(Mesh(whole.vertices, whole.faces[1:]))
     turned = whole.faces.copy()
     turned[0] = turned[0, ::-1]
-    with pytest.raises(ValueError, match="at 3 of its 18 edges one triangle faces out and the other in"):
+    with pytest.raises(ValueError, match="3 of its 18 edges"):
         outward(Mesh(whole.vertices, turned))
 
 

@@ -116,13 +116,13 @@ def test_negative_zero_does_not_change_the_bytes() -> None:
 def test_names_have_the_characters_that_the_protocol_allows() -> None:
     """A no-break space, which Python does not count as printable, is no control character."""
     assert scene_at(ScriptedWorld([[state("car\u00a01")]]), 0).names == ("car\u00a01",)
-    with pytest.raises(PayloadError, match=r"has an object named 'car\\n'; leave out the control characters"):
+    with pytest.raises(PayloadError, match=r"'car\\n'"):
         scene_at(ScriptedWorld([[state("car\n")]]), 0)
 
 
 def test_two_objects_of_one_name_are_refused_by_name() -> None:
     world = ScriptedWorld([[state("car.a"), state("car.b"), state("car.a", position=(1.0, 0.0, 0.0))]])
-    with pytest.raises(PayloadError, match=r"world 'world' has two objects named 'car\.a'"):
+    with pytest.raises(PayloadError, match=r"'world'.*'car\.a'"):
         scene_at(world, 0)
 
 
@@ -298,7 +298,7 @@ def test_specifications_become_devices_in_radians() -> None:
 
 
 def test_an_antenna_without_a_role_is_refused_with_what_to_write() -> None:
-    with pytest.raises(ScenarioError, match=r"'rx' lacks its role; write role = \"tx\""):
+    with pytest.raises(ScenarioError, match=r"'rx'.*role = .tx."):
         ScriptedWorld([[]], [DeviceSpec(name="rx", kind="antenna")])
 
 

@@ -141,7 +141,7 @@ def test_prefixes_that_are_one_text_are_refused() -> None:
     class Odd(Yard):
         prefixes = "car"  # type: ignore[assignment]
 
-    with pytest.raises(PayloadError, match=r"Odd\.prefixes is 'car'; write \('car',\)"):
+    with pytest.raises(PayloadError, match=r"Odd\.prefixes.*'car'.*\('car',\)"):
         world(Odd())
 
 
@@ -152,7 +152,7 @@ def test_a_state_that_is_no_bytes_is_refused() -> None:
 
     made = world(Odd())
     stepped(made, 0)
-    with pytest.raises(PayloadError, match=r"Odd\.save returned str, and a state is bytes"):
+    with pytest.raises(PayloadError, match=r"Odd\.save returned str"):
         made.checkpoint()
 
 

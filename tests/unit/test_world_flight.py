@@ -232,9 +232,7 @@ def test_a_waypoint_out_of_the_geofence_is_warned_of_once_and_counted(
 
 
 def test_a_waypoint_out_of_any_range_is_refused() -> None:
-    with pytest.raises(
-        PayloadError, match=r"'uav' to \[1000000000000.0, .* at most 1e\+09 m from the origin"
-    ):
+    with pytest.raises(PayloadError, match=r"'uav'.*\[1000000000000.0.*1e\+09"):
         fly(world(), WaypointCommand(object="uav", position=(1e12, 0.0, 30.0), speed=9.0), 1)
 
 
@@ -268,7 +266,7 @@ def test_what_another_world_flies_is_left_to_it() -> None:
     position, velocity, _ = state(made.step(commanded(1, {"agent": (elsewhere,)})), "sky.uav")
     assert (position.tolist(), velocity.tolist()) == ([0.0, 0.0, 30.0], [0.0, 0.0, 0.0])
     mine = VelocityCommand(object="sky.uav2", velocity=(1.0, 0.0, 0.0))
-    with pytest.raises(PayloadError, match=r"'sky\.uav2', which world 'world' does not fly"):
+    with pytest.raises(PayloadError, match=r"'sky\.uav2'.*'world'"):
         made.step(commanded(2, {"agent": (mine,)}))
 
 
@@ -312,7 +310,7 @@ def test_another_process_flies_on_bit_by_bit(
 
 def test_two_agents_cannot_fly_one_object() -> None:
     command = VelocityCommand(object="uav", velocity=(1.0, 0.0, 0.0))
-    with pytest.raises(PayloadError, match="'a' and 'b' both command the motion of 'uav'"):
+    with pytest.raises(PayloadError, match=r"'a'.*'b'.*'uav'"):
         world().step(commanded(1, {"a": (command,), "b": (command,)}))
 
 
@@ -363,5 +361,5 @@ def test_an_object_that_is_put_somewhere_at_once_is_there_at_rest_and_flies_on_f
 @pytest.mark.parametrize("point", [(0.0, 0.0, 81.0), (0.0, -3.0, 0.0)], ids=["too high", "in the ground"])
 def test_an_object_is_not_put_where_it_cannot_be(point: Vector) -> None:
     made = world(flown(maximum_m=(100.0, 100.0, 80.0), minimum_m=(-100.0, -100.0, 1.0)))
-    with pytest.raises(PayloadError, match=r"'uav' cannot be at .* choose another point"):
+    with pytest.raises(PayloadError, match="'uav' cannot be at "):
         fly(made, WaypointCommand(object="uav", position=point, speed=3.0, at_once=True), 1)

@@ -188,7 +188,7 @@ def test_the_model_is_scenery_in_world_coordinates_with_its_materials(wall: Path
 def test_a_material_that_is_none_is_refused_by_its_node(tmp_path: Path) -> None:
     file = tmp_path / "yard.egg"
     file.write_text(WALL % "brik")
-    with pytest.raises(AssetError, match=r"node 'wall' has the material 'brik'.*'brick'"):
+    with pytest.raises(AssetError, match=r"'wall'.*'brik'.*'brick'"):
         Panda3dWorld(Panda3dSettings(model=str(file)), RunInfo(name="world")).scenery()
 
 

@@ -133,16 +133,14 @@ def test_a_missing_mesh_is_named_with_file_line_and_shape(tmp_path: Path) -> Non
         '<shape type="ply" id="mesh-a"><string name="filename" value="meshes/wall.ply"/></shape>\n'
         '<shape type="ply" id="mesh-b">\n<string name="filename" value="meshes/roof.ply"/></shape>',
     )
-    with pytest.raises(
-        AssetError, match=r"city\.xml:3: shape 'mesh-b': mesh .*meshes/roof\.ply is missing; put it there"
-    ):
+    with pytest.raises(AssetError, match=r"city\.xml:3.*'mesh-b'.*meshes/roof\.ply"):
         scenery_assets(str(xml))
 
 
 @pytest.mark.parametrize("name", ["../wall.ply", "/etc/wall.ply", ""])
 def test_a_mesh_outside_the_folder_cannot_travel(tmp_path: Path, name: str) -> None:
     xml = write_scene(tmp_path, f'<shape type="ply" id="a"><string name="filename" value="{name}"/></shape>')
-    with pytest.raises(AssetError, match=r"city\.xml:2: <shape> a names .* relative path"):
+    with pytest.raises(AssetError, match=r"city\.xml:2: <shape> a "):
         scenery_assets(str(xml))
 
 
@@ -168,7 +166,7 @@ def test_missing_scenery_and_nonsense_are_refused(tmp_path: Path) -> None:
 
 def test_without_sionna_the_extras_that_bring_its_scenes_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SetupError, match=r"`world` and `channel` bring.*pip install 'caviar-sim\[world\]'"):
+    with pytest.raises(SetupError, match=r"`world`.*`channel`.*'caviar-sim\[world\]'"):
         scenery_assets("sionna:simple_street_canyon")
 
 
@@ -205,5 +203,5 @@ def test_pattern_files_of_devices_travel_and_what_is_wrong_with_one_names_its_ke
     assert isinstance(published, AntennaDevice)
     assert published.array.pattern_file == "patterns/sector.msi"
     file.write_text("GAIN ten dBi\n")
-    with pytest.raises(ScenarioError, match=r"devices.bs.array.pattern_file: .*sector.msi:1: is 'ten'"):
+    with pytest.raises(ScenarioError, match=r"devices.bs.array.pattern_file.*sector.msi:1.*'ten'"):
         pattern_assets((device,))

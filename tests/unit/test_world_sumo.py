@@ -386,19 +386,19 @@ def test_names_have_the_prefix_that_is_declared(make: Make) -> None:
 
 def test_what_is_wrong_with_files_is_named(make: Make, tmp_path: Path) -> None:
     missing = tmp_path / "none.net.xml"
-    with pytest.raises(ScenarioError, match=r"settings\.net: there is no file .*none\.net\.xml"):
+    with pytest.raises(ScenarioError, match=r"settings\.net.*none\.net\.xml"):
         make(net=str(missing))
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net>\n<edge></net>")  # SUMO itself would end the process
-    with pytest.raises(ScenarioError, match=r"broken\.net\.xml:2: settings\.net: not well-formed XML"):
+    with pytest.raises(ScenarioError, match=r"broken\.net\.xml:2.*settings\.net.*XML"):
         make(net=str(broken))
     swapped = tmp_path / "swapped.rou.xml"
     swapped.write_text("<routes/>")
-    with pytest.raises(ScenarioError, match=r"holds <routes>, net takes a file with <net>"):
+    with pytest.raises(ScenarioError, match=r"<routes>.*<net>"):
         make(net=str(swapped))
     with pytest.raises(ScenarioError, match=r"needs net"):
         make(net="")
-    with pytest.raises(ScenarioError, match=r"no mesh is there for 'cart'; known: .*car"):
+    with pytest.raises(ScenarioError, match=r"'cart'.*car"):
         make(meshes=("cart",))
 
 
@@ -636,7 +636,7 @@ def test_other_traffic_than_that_which_was_saved_is_an_error(make: Make) -> None
     scenes(world, 7, 30)
     state = world.checkpoint()
     world.reset(0, 8, 0)
-    with pytest.raises(RunError, match="has other traffic 29 steps after frame 0 than it had before"):
+    with pytest.raises(RunError, match="29 steps after frame 0"):
         world.restore(state)
 
 
@@ -683,7 +683,5 @@ def test_an_episode_of_one_traffic_begins_where_a_run_comes_that_long_after_the_
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, 0.25, math.inf])
 def test_a_spacing_that_is_no_number_of_steps_is_refused(make: Make, spacing: float) -> None:
-    with pytest.raises(
-        ScenarioError, match=r"between_episodes_s.*not a whole number of SUMO's steps of 100 ms"
-    ):
+    with pytest.raises(ScenarioError, match=r"between_episodes_s.*100 ms"):
         make(between_episodes_s=spacing)

@@ -173,9 +173,7 @@ def test_what_is_not_there_is_refused_by_name(driven: Driven, command: Command, 
 
 def test_two_agents_that_drive_one_vehicle_are_both_named(driven: Driven) -> None:
     driven.step()
-    with pytest.raises(
-        PayloadError, match=r"'driver' and 'other' both command 'traffic.one'.*'motion:traffic"
-    ):
+    with pytest.raises(PayloadError, match=r"'driver'.*'other'.*'traffic.one'"):
         driven.step(DriveCommand(object="traffic.one", speed=1.0), other=DriveCommand(object="traffic.one"))
 
 
@@ -205,5 +203,5 @@ def test_commands_are_part_of_the_state(driven: Driven, files: SumoSettings) -> 
 
 def test_a_world_that_lost_its_commands_says_so(driven: Driven) -> None:
     driven.frame = 7
-    with pytest.raises(RunError, match="came back in frame 7: what agents had commanded is lost"):
+    with pytest.raises(RunError, match=r"frame 7: .*commanded"):
         driven.step()

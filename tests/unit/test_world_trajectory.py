@@ -273,7 +273,7 @@ def test_rows_of_a_wrong_length_are_refused(rows: tuple[tuple[float, ...], ...])
 
 
 def test_rows_out_of_order_are_named_by_index() -> None:
-    with pytest.raises(ScenarioError, match=r"waypoints\[1\]: t_s = 1\.0 does not come after 2\.0"):
+    with pytest.raises(ScenarioError, match=r"waypoints\[1\]: t_s = 1\.0.*2\.0"):
         read_waypoints(((2.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), "waypoints")
 
 
@@ -325,13 +325,13 @@ def test_whole_names_are_declared_without_a_prefix() -> None:
 
 
 def test_two_objects_of_one_name_are_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"objects\[1\].*second object is named 'uav'"):
+    with pytest.raises(ScenarioError, match=r"objects\[1\].*'uav'"):
         world(UAV, UAV)
 
 
 def test_an_object_without_size_is_refused() -> None:
     flat = {"name": "uav", "dimensions_m": [1.0, 0.0, 1.0], "waypoints": [[0.0, 0.0, 0.0, 0.0]]}
-    with pytest.raises(ScenarioError, match=r"objects\[0\].dimensions_m\[1\]: is 0.0, write a number > 0"):
+    with pytest.raises(ScenarioError, match=r"objects\[0\].dimensions_m\[1\]: is 0.0"):
         convert_settings(TrajectorySettings, {"objects": [flat]})
 
 
@@ -343,7 +343,7 @@ def test_control_characters_in_a_name_or_prefix_are_refused_and_other_signs_are_
         assert f"objects[0].name: is {odd!r}, write a string of 1 to 100 characters without" in str(
             caught.value
         )
-        with pytest.raises(ScenarioError, match=r"prefix: is .*, write a string without control characters"):
+        with pytest.raises(ScenarioError, match=r"prefix: is .*control characters"):
             convert_settings(TrajectorySettings, {"prefix": odd})
     for name in ("größe 1.a/b", "無人機", "a"):
         convert_settings(TrajectorySettings, {"prefix": "", "objects": [{"name": name, "waypoints": rows}]})
@@ -351,7 +351,7 @@ def test_control_characters_in_a_name_or_prefix_are_refused_and_other_signs_are_
 
 def test_a_waypoint_that_is_no_number_is_named_with_row_and_column() -> None:
     uav = {"name": "uav", "waypoints": [[0.0, 0.0, 0.0, 0.0], [1.0, "two", 0.0, 0.0]]}
-    with pytest.raises(ScenarioError, match=r"waypoints\[1\]\[1\]: is 'two', write a number"):
+    with pytest.raises(ScenarioError, match=r"waypoints\[1\]\[1\].*'two'"):
         convert_settings(TrajectorySettings, {"objects": [uav]})
 
 

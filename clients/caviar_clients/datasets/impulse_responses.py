@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
-import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.scenario.schema import DeviceSpec, is_made_by
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics.channel import PLANE_WAVES
-from caviar_protocol.topics.scene import AntennaArray
+from caviar_protocol.topics.scene import AntennaArray, AntennaDevice
 
 if TYPE_CHECKING:
+    from caviar_clients.datasets.reader import Dataset
     from caviar_clients.datasets.user_rows import Users
 
 
@@ -65,10 +66,7 @@ class ImpulseResponses:
                 )
         self._users = users
         self._times = np.arange(time_steps) / sampling_frequency
-        self._arrays = _arrays_of(users)
-        transmit, receive = (
-            _only({self._arrays[str(name)] for name in users[end]}, end, users) for end in ("tx", "rx")
-        )
+        transmit, receive = (only_array(users, end) for end in ("tx", "rx"))
         self.shape: Mapping[str, int] = {
             "num_rx": 1,
             "num_rx_ant": receive.size,
@@ -101,56 +99,98 @@ class ImpulseResponses:
             RecordingError: The channel was not recorded.
         """
         names = ("a", "tau", "aod", "aoa", "doppler")
-        rows = users.read(["tx", "rx", *(f"channel.{name}" for name in names)])
-        found, paths = np.nan_to_num(rows["channel.a"]), self.shape["num_paths"]
+        rows = users.read([f"channel.{name}" for name in names])
+        found = np.nan_to_num(rows["channel.a"])
         transmit, receive = (
-            self._responses(users, rows[end], rows[angles])
-            for end, angles in (("tx", "channel.aod"), ("rx", "channel.aoa"))
+            self._responses(users, end, rows[f"channel.{angles}"])
+            for end, angles in (("tx", "aod"), ("rx", "aoa"))
         )
-        shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
-        a = np.einsum("up,upm,upn,ups->umnps", found, receive, transmit, shifts, optimize=True)
-        missing = paths - found.shape[1]
-        return (
-            np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)]),
-            np.pad(np.nan_to_num(rows["channel.tau"]), [(0, 0), (0, missing)]),
+        # Paths last in memory, along which the product is vectorised: a third of the time of an einsum.
+        receive, transmit = (
+            np.ascontiguousarray(np.swapaxes(phases, 1, 2))
+            for phases in (found[..., None] * receive, transmit)
         )
+        a = (receive[:, :, None] * transmit[:, None])[..., None]
+        if self._times.any():
+            shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
+            a = a * shifts[:, None, None]
+        tau = np.nan_to_num(rows["channel.tau"])
+        if missing := self.shape["num_paths"] - found.shape[1]:
+            a = np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)])
+            tau = np.pad(tau, [(0, 0), (0, missing)])
+        return a, tau
 
-    def _responses(self, users: Users, devices: Any, angles: Float64Array) -> Complex128Array:
+    def _responses(self, users: Users, end: str, angles: Float64Array) -> Complex128Array:
         """Phases of the elements of one end, Shape ``[N, P, elements]``, by angles in world axes."""
-        turns = np.stack([rotation_matrix(q.tolist()) for q in _orientations(users, devices)])
+        placed = [*placed_antennas(users, end)]
+        turns = np.stack([rotation_matrix(antenna.orientation.tolist()) for antenna in placed])
         local = np.einsum("uji,upj->upi", turns, unit_vectors(np.nan_to_num(angles)))
-        return steering_vector(self._arrays[str(devices[0])], local)
+        return steering_vector(placed[0].array, local)
 
 
-def _orientations(users: Users, devices: Sequence[str]) -> Iterator[Float64Array]:
-    """Orientation of the device of each user in its scene, (w, x, y, z)."""
-    scenes: dict[tuple[int, int], Mapping[str, Float64Array]] = {}
-    for at in zip(users["episode"].tolist(), users["scene"].tolist(), devices, strict=True):
-        episode, scene, device = at
-        if (episode, scene) not in scenes:
-            recording = users.dataset.episode(episode)
-            poses = recording["scene"].select(episode=episode, frames=[scene]).devices
-            scenes[episode, scene] = dict(zip(poses.keys, poses.orientation[0], strict=True))
-        yield scenes[episode, scene][str(device)]
+class PlacedAntenna(NamedTuple):
+    """Antenna of a user where it is in its scene."""
+
+    array: AntennaArray
+    position: Float64Array
+    """In world axes [m], Shape ``[3]``."""
+    orientation: Float64Array
+    """(w, x, y, z), device into world, Shape ``[4]``."""
+    power_dbm: float
 
 
-def _arrays_of(users: Users) -> dict[str, AntennaArray]:
-    """Array of each device of these users, by the scenario of the dataset."""
-    specs = msgspec.convert(users.dataset.settings["scenario"].get("devices", ()), tuple[DeviceSpec, ...])
-    names = {str(name) for end in ("tx", "rx") for name in np.unique(users[end])}
-    return {name: spec.array or AntennaArray() for name in names for spec in specs if is_made_by(spec, name)}
+def placed_antennas(users: Users, end: str) -> Iterator[PlacedAntenna]:
+    """Find the antenna of each user at one end, in the order of the users.
+
+    Args:
+        users: With topic ``scene`` recorded.
+        end: ``tx`` or ``rx``.
+
+    Raises:
+        RecordingError: There is no scene.
+    """
+    columns = (users["episode"].tolist(), users["scene"].tolist(), users[end].tolist())
+    for episode, scene, name in zip(*columns, strict=True):
+        yield _antennas_of(users.dataset, episode, scene)[name]
 
 
-def _only(arrays: set[AntennaArray], end: str, users: Users) -> AntennaArray:
-    """The array that all users have at one end; one whose elements differ by their places alone."""
-    place = users.dataset.location
+# Both ends of a user are asked for in turn, by parts of fewer scenes.
+@lru_cache(maxsize=256)
+def _antennas_of(dataset: Dataset, episode: int, scene: int) -> dict[str, PlacedAntenna]:
+    recording = dataset.episode(episode)
+    payload = recording["scene"][recording.place(episode, scene)]
+    if payload is None:
+        raise RecordingError(f"{recording.path}, scene {scene}: scene is absent")
+    found = {}
+    for device in payload.devices:
+        if isinstance(device, AntennaDevice):
+            pose = device_pose(payload, device)
+            place = np.array(pose.position), np.array(pose.orientation)
+            found[device.name] = PlacedAntenna(device.array, *place, device.power_dbm)
+    return found
+
+
+def only_array(users: Users, end: str) -> AntennaArray:
+    """Find the array that all users have at one end, whose elements differ by their places alone.
+
+    One user of each kind is looked at.
+
+    Args:
+        users: With topic ``scene`` recorded.
+        end: ``tx`` or ``rx``.
+
+    Raises:
+        RecordingError: Arrays differ, or have several polarizations or panels, for which paths are not
+            recorded.
+    """
+    place, arrays = users.dataset.location, {a.array for a in placed_antennas(users.one_of_each_kind(), end)}
     if len(arrays) != 1:
         raise RecordingError(
             f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
             f"users[users[{end!r}] == NAME], or with --tx or --object-class"
         )
     (array,) = arrays
-    if len(array.polarizations) > 1 or array.panels:
+    if not array.is_uniform:
         raise RecordingError(
             f"{place}: the arrays at {end} have several polarizations or panels, for which paths are not "
             "recorded; use channel.hf or channel.h"

@@ -144,15 +144,19 @@ class Users:
         """Recorded arrays, as of `recorded`, of which each user has one row: no sensors of which it has none
         or several."""
         found = self.recorded()
-        ends = zip(self["object_class"], self["rx"], strict=True)
-        kinds = np.array([f"{cls}/{rx.rpartition('/')[2]}" for cls, rx in ends])
-        some = self[np.sort(np.unique(kinds, return_index=True)[1])]
+        some = self.one_of_each_kind()
         for topic in {name.partition(".")[0] for name in found}.intersection(SENSORS):
             try:
                 some._recorded([next(name for name in found if name.startswith(f"{topic}."))])
             except RecordingError:
                 found = {name: text for name, text in found.items() if not name.startswith(f"{topic}.")}
         return found
+
+    def one_of_each_kind(self) -> Users:
+        """Take the first user of each transmitter, class of object and device on it."""
+        columns = zip(self["tx"], self["object_class"], self["rx"], strict=True)
+        kinds = np.array([f"{tx} {cls} {rx.rpartition('/')[2]}" for tx, cls, rx in columns])
+        return Users(self._dataset, self._table.where(np.sort(np.unique(kinds, return_index=True)[1])))
 
     def __getitem__(self, name: str | slice | Sequence[int] | NDArray[Any]) -> Any:
         """A column, a recorded array, or with a slice, a mask or positions these users only.
@@ -426,7 +430,7 @@ class Users:
         """Rows of recorded arrays of a topic, of users of one scene, whose payload is decoded once."""
         recording = self._dataset.episode(episode)
         arrays: TopicArrays[Any, Any] = recording[topic]
-        payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
+        payload = arrays[recording.place(episode, scene)]
         place = f"{recording.path}, scene {scene}"
         if payload is None:
             raise RecordingError(f"{place}: {topic} is absent")

@@ -23,8 +23,9 @@ from caviar_protocol.arrays import (
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.fields import MAX_SUBCARRIERS
 
-# `spherical` has exact lengths between elements, `mimo-rt` traces every pair of them.
-PLANE_WAVES = ("free-space", "geometric", "siso-rt")
+# `imported` has paths of another program's files, `spherical` exact lengths between elements, and `mimo-rt`
+# traces every pair of them.
+PLANE_WAVES = ("free-space", "geometric", "siso-rt", "imported")
 """Rungs on which arrays see plane waves: H follows from the paths between their reference points."""
 
 
@@ -213,7 +214,8 @@ class Channel(Payload, frozen=True, kw_only=True, omit_defaults=True):
     sizes_from: ClassVar[dict[str, tuple[str, ...]]] = {"C": ("carriers",), "T": ("tx",), "R": ("rx",)}
 
     rung: str
-    """Step of the fidelity ladder: ``free-space``, ``geometric``, ``siso-rt``, ``spherical``, ``mimo-rt``."""
+    """Step of the fidelity ladder: ``free-space``, ``geometric``, ``siso-rt``, ``spherical``, ``mimo-rt``; of
+    paths that were read from another program's files ``imported``."""
     options: ChannelOptions = ChannelOptions()
     """What was modelled."""
     expected_error_db: Annotated[

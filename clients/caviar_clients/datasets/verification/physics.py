@@ -260,7 +260,7 @@ def _paths(pair: Pair) -> Iterator[Finding]:
         yield from check_geometry(pair)
         yield from check_gains(pair)
         yield from _line_of_sight(pair)
-    elif channel.rung != "geometric":  # which draws its paths
+    elif channel.rung not in ("geometric", "imported"):  # which draw paths, or round positions
         tau, (start, end) = channel.tau[pair.cut], (antenna.position for antenna in pair.ends)
         least = float(np.linalg.norm(end - start)) / SPEED_OF_LIGHT
         if len(tau) and tau.min() < least * (1 - DELAY):
