@@ -68,6 +68,8 @@ class Format:
     """Recorded arrays without which there is no export: ``channel.a``."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
+    frequency_hz: float | None = None
+    """Of the carrier, where the files that are read do not have it [Hz]."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -116,12 +118,11 @@ class Format:
         """
         return f"# {users.dataset.name}\n\n{type(self).__doc__ or ''}"
 
-    def read(self, path: Path, frequency_hz: float | None = None) -> Source:
+    def read(self, path: Path) -> Source:
         """Open files of the format, of which `import_dataset` makes a dataset.
 
         Args:
             path: File or folder.
-            frequency_hz: Of the carrier [Hz], where the files do not have it.
 
         Raises:
             RunError: They are damaged, or none of the format; names file and place. So does their iterator.
@@ -134,8 +135,10 @@ FORMATS: Mapping[str, str] = {
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "npz": "caviar_formats.npz:Npz",
+    "ns3-qd": "caviar_formats.traces:Ns3Qd",
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
+    "pcd": "caviar_formats.traces:Pcd",
     "sionna": "caviar_formats.npz:Sionna",
 }
 """Places of the formats that come with this distribution, by name."""

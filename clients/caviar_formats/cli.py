@@ -62,7 +62,9 @@ def import_command(
     console = Console()
     with progress_bar(console, "{task.completed}", transient=True) as bar:
         task = bar.add_task(f"{form}: episodes", total=None)
-        found = find_format(form, flavour, "--from").read(source, frequency_hz)
+        reader = find_format(form, flavour, "--from")
+        reader.frequency_hz = frequency_hz
+        found = reader.read(source)
         import_dataset(found, out, lambda done: bar.update(task, completed=done))
     for text in filter(None, (found.lacks, found.assumed)):
         print_line(console, text)

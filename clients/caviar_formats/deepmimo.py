@@ -317,8 +317,8 @@ and row i // columns, from below.
 The rotation of an array is (roll, pitch, yaw) in degrees of its quaternion.
 """
 
-    def read(self, path: Path, frequency_hz: float | None = None) -> Source:
-        if frequency_hz is not None:
+    def read(self, path: Path) -> Source:
+        if self.frequency_hz is not None:
             raise RunError("--frequency-hz: the files have it; leave it out")
         params = _json(path / "params.json")
         try:

@@ -275,8 +275,8 @@ which says nothing of the scene. SPLIT is `train` up to episode {self._last_trai
 {_ABOUT_PHASES[self.flavour]}
 """
 
-    def read(self, path: Path, frequency_hz: float | None = None) -> Source:
-        return read_itu(path, frequency_hz)
+    def read(self, path: Path) -> Source:
+        return read_itu(path, self.frequency_hz)
 
     def _raw(self, folder: Path) -> Path:
         return folder / "raw_data" if self.flavour == "baseline" else folder

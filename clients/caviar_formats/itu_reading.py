@@ -58,7 +58,7 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
     ghz = re.search(r"(\d+(?:\.\d+)?)GHz", next(iter(rays.values())).as_posix())
     if frequency_hz is None and ghz is None:
         raise damaged(
-            table.parent, "", "files of rays have no carrier, as 60GHz, in their names; give --frequency"
+            table.parent, "", "files of rays have no carrier, as 60GHz, in their names; give --frequency-hz"
         )
     hertz = frequency_hz or float(ghz[1]) * 1e9  # type: ignore[index]  # one of both is there
     scenes = max(scene for _, scene, _ in rows) + 1

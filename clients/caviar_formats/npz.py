@@ -61,11 +61,15 @@ class Sionna(Format):
         valid = part.users[part.users["valid"]]
         if not len(valid):
             return
-        a, tau = valid.cir(paths=self._shape["num_paths"]).block(valid)
+        cir = valid.cir(paths=self._shape["num_paths"])
+        a = np.empty((len(valid), *self._shape.values()), np.complex64)
+        tau = np.empty((len(valid), 1, 1, self._shape["num_paths"]))
+        for start in range(0, len(valid), 256):
+            cut = slice(start, start + 256)
+            found, tau[cut, 0, 0] = cir.block(valid[cut])
+            a[cut, 0, :, 0] = found
         columns = valid.read(["episode", "scene", "carrier", "tx", "rx"])
-        a = a[:, None, :, None].astype(np.complex64)
-        file = folder / f"cir-{part.number:05d}.npz"
-        np.savez(file, allow_pickle=False, a=a, tau=tau[:, None, None], **columns)
+        np.savez(folder / f"cir-{part.number:05d}.npz", allow_pickle=False, a=a, tau=tau, **columns)
 
     def readme(self, users: Users) -> str:
         sizes = "\n".join(f"    {name}={size}," for name, size in self._shape.items())

@@ -31,11 +31,11 @@ LENGTH_M = 0.05
 class P2m(Format):
     """Files of paths, or a folder of such files, one for each transmitter and set of receivers: a scene."""
 
-    def read(self, path: Path, frequency_hz: float | None = None) -> Source:
+    def read(self, path: Path) -> Source:
         files = sorted(path.glob("*.paths.*.p2m")) if path.is_dir() else [path]
         if not files:
             raise RunError(f"{path} has no file *.paths.*.p2m")
-        if frequency_hz is None:
+        if (frequency_hz := self.frequency_hz) is None:
             raise RunError(f"{path}: the files do not have the carrier's frequency; give --frequency-hz 60e9")
         devices: dict[str, AntennaDevice] = {}
         paths = [one for file in files for one in _File(file, frequency_hz).pairs(devices)]

@@ -26,30 +26,33 @@ CONVENTIONS = """Arrays are lists in C order; the metadata of a file has descrip
 row by the name of the column, as JSON, with sizes where all rows of the file share them. Complex arrays have
 two columns, `.real` and `.imag`. Angles are (zenith from +z, azimuth from +x) in world axes: x to the east, y
 to the north, z upwards. `channel.a` has the phase of the carrier."""
-PICTURES = ("camera", "depth", "segmentation")
-"""Topics without columns: a list of a million numbers a row is no table."""
+LEFT_OUT = ("camera", "depth", "segmentation", "channel.beam_gains")
+"""Topics without columns, as a list of a million numbers a row is no table; gains follow from H."""
 
 
 class Parquet(Format):
     """Tables ``users/part-NNNNN.parquet`` and ``scenes/part-NNNNN.parquet``."""
 
-    loses = f"{LOSES} Pictures, which `npz` has where a user has one camera."
+    loses = f"{LOSES} Pictures, which `npz` has where a user has one camera, and gains of beams."
 
     def begin(self, users: Users) -> None:
         require_installed("a format of Parquet", ["datasets"])
+        self._connection = _connected()  # takes as long as writing a dozen scenes
         found = users.readable().items()
-        self._names = {name: text for name, text in found if name.partition(".")[0] not in PICTURES}
+        self._names = {name: text for name, text in found if not name.startswith(LEFT_OUT)}
 
     def write(self, part: Part, folder: Path) -> None:
-        with _connected() as connection:
-            table = _Table(connection, len(part.users))
-            table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
-            for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
-                table.add_rows(name, rows)
-            table.save(_file(folder, "users", part.number))
-            table = _Table(connection, len(part.scenes))
-            table.add_columns(part.scenes, SCENE_COLUMNS)
-            table.save(_file(folder, "scenes", part.number))
+        table = _Table(self._connection, len(part.users))
+        table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
+        for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
+            table.add_rows(name, rows)
+        table.save(_file(folder, "users", part.number))
+        table = _Table(self._connection, len(part.scenes))
+        table.add_columns(part.scenes, SCENE_COLUMNS)
+        table.save(_file(folder, "scenes", part.number))
+
+    def finish(self, users: Users, folder: Path) -> None:
+        self._connection.close()
 
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} as Parquet
@@ -88,7 +91,8 @@ class _Table:
 
     def __init__(self, connection: DuckDBPyConnection, rows: int) -> None:
         self._connection, self._rows = connection, rows
-        self._select, self._join = list[str](), list[str]()
+        self._select = list[str]()
+        self._lists: dict[bytes, dict[str, NDArray[Any]]] = {}
         self._about: dict[str, str] = {}
         self._flat: dict[str, NDArray[Any]] = {"row": np.arange(rows)}
 
@@ -122,16 +126,12 @@ class _Table:
         self._note(name, text, unit, shape)
 
     def _add_lists(self, name: str, rows: Sequence[NDArray[Any]]) -> None:
-        table = f"t{len(self._select)}"
-        flat = {"row": np.repeat(np.arange(len(rows)), [row.size for row in rows])}
-        flat["x"] = np.concatenate([row.ravel() for row in rows])
-        self._connection.register(f"{table}_flat", flat)
-        self._connection.execute(
-            f"CREATE OR REPLACE TEMP TABLE {table} AS SELECT row, list(x) AS v FROM {table}_flat GROUP BY row"  # noqa: S608
-        )
-        self._connection.unregister(f"{table}_flat")
-        self._select.append(f'coalesce({table}.v, []) AS "{name}"')
-        self._join.append(f"LEFT JOIN {table} USING (row)")
+        # Columns of equal lengths become lists together.
+        sizes = np.array([row.size for row in rows])
+        group = self._lists.setdefault(sizes.tobytes(), {"row": np.repeat(np.arange(len(rows)), sizes)})
+        key = f"c{len(self._select)}"
+        group[key] = np.concatenate([row.ravel() for row in rows])
+        self._select.append(f'coalesce({key}, []) AS "{name}"')
 
     def _note(self, name: str, text: str, unit: str, shape: str) -> None:
         self._about[name] = json.dumps(
@@ -140,15 +140,24 @@ class _Table:
 
     def save(self, file: Path) -> None:
         """Write the table."""
-        self._connection.register("flat_rows", self._flat)
-        select = f"SELECT {', '.join(self._select)} FROM flat_rows {' '.join(self._join)} ORDER BY row"  # noqa: S608
+        joins = ""
+        for number, group in enumerate(self._lists.values()):
+            self._connection.register("flat", group)
+            lists = ", ".join(f"list({key}) AS {key}" for key in group if key != "row")
+            self._connection.execute(
+                f"CREATE OR REPLACE TEMP TABLE t{number} AS SELECT row, {lists} FROM flat GROUP BY row"  # noqa: S608
+            )
+            joins += f" LEFT JOIN t{number} USING (row)"
+        self._connection.register("flat", self._flat)
+        select = f"SELECT {', '.join(self._select)} FROM flat{joins} ORDER BY row"  # noqa: S608
         _copy(self._connection, select, file, self._about)
+        self._connection.unregister("flat")
 
 
 def _copy(connection: DuckDBPyConnection, select: str, file: Path, about: Mapping[str, str]) -> None:
     """Write rows to a Parquet file with metadata."""
     notes = ", ".join(f"{_text(key)}: {_text(value)}" for key, value in about.items())
-    options = f"FORMAT parquet, COMPRESSION zstd, KV_METADATA {{{notes}}}"
+    options = f"FORMAT parquet, COMPRESSION snappy, KV_METADATA {{{notes}}}"
     connection.execute(f"COPY ({select}) TO {_text(str(file))} ({options})")
 
 
@@ -176,6 +185,7 @@ class HuggingFace(Parquet):
     """Parquet, a dataset card as README, and a description in Croissant 1.0 with the SHA-256 of each file."""
 
     def finish(self, users: Users, folder: Path) -> None:
+        super().finish(users, folder)
         records, files = [], []
         for table in ("users", "scenes"):
             file = folder / f"{table}.parquet"

@@ -24,8 +24,9 @@ from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
 
 pytestmark = pytest.mark.slow
@@ -125,6 +126,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return generated(place / "data", place / "asymmetric.toml").directory.path
 
 
+LIDAR = """
+[services.lidar]
+role = "sensors"
+use = "lidar"
+budget_ms = 1000
+
+[[devices]]
+name = "lidar"
+kind = "lidar"
+position_m = [16.0, 10.0, 3.0]
+yaw_deg = 25.0
+pitch_deg = 4.0
+beams = 8
+azimuth_steps = 180
+"""
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with a LIDAR."""
+    place = tmp_path_factory.mktemp("clouds")
+    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "scene"') + LIDAR
+    (place / "lidar.toml").write_text(text)
+    return generated(place / "data", place / "lidar.toml").directory.path
+
+
 @pytest.fixture
 def data(folder: Path) -> Dataset:
     return Dataset(folder)
@@ -144,8 +171,8 @@ class TestConformance(FormatConformance):
         monkeypatch.setattr(type(self), "name", name, raising=False)
 
     @pytest.fixture
-    def dataset(self, data: Dataset) -> Dataset:
-        return data
+    def dataset(self, name: str, data: Dataset, request: pytest.FixtureRequest) -> Dataset:
+        return Dataset(request.getfixturevalue("clouds")) if name == "pcd" else data
 
 
 def response(a: Any, tau: Any) -> Any:
@@ -304,10 +331,15 @@ def test_an_import_that_fails_leaves_nothing(scenes: Any, said: str, tmp_path: P
 
 
 def described_channels(folder: Path, shapes: Any, quaternions: Any) -> Any:
-    """H by the description of DeepMIMO 4 alone, in our order of elements, Shape ``[N, Nr, Nt]``."""
+    """H by the description of DeepMIMO 4 alone (`channels_of`)."""
     end = "_t000_tx000_r001.npz"
     files = {file.name.removesuffix(end): np.load(file) for file in folder.glob(f"*{end}")}
     table = {name: file[name] for name, file in files.items() if name != "user"}
+    return channels_of(table, shapes, quaternions)
+
+
+def channels_of(table: dict[str, Any], shapes: Any, quaternions: Any) -> Any:
+    """H of paths with phases at first elements, in our order of elements, Shape ``[N, Nr, Nt]``."""
     gain = np.nan_to_num(10 ** (table["power"] / 20) * np.exp(1j * np.radians(table["phase"])))
     out = []
     for user, amplitudes in enumerate(gain):
@@ -460,6 +492,13 @@ Tx-R-Rx
 """
 
 
+def insite(path: Path) -> Source:
+    """Open files of paths at 60 GHz."""
+    form = find_format("p2m")
+    form.frequency_hz = 60e9
+    return form.read(path)
+
+
 def p2m(folder: Path, text: str) -> Path:
     """Write a file of paths."""
     file = folder / "street.paths.t001_05.r006.p2m"
@@ -471,7 +510,7 @@ def p2m(folder: Path, text: str) -> Path:
 def test_paths_of_wireless_insite_become_users_and_npz(
     phase: str, of_first: float | None, tmp_path: Path
 ) -> None:
-    source = find_format("p2m").read(p2m(tmp_path, P2M.format(phase=phase)), 60e9)
+    source = insite(p2m(tmp_path, P2M.format(phase=phase)))
     data = Dataset(import_dataset(source, tmp_path / "data"))
     assert list(verify(tmp_path / "data")) == []
     with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
@@ -522,14 +561,14 @@ def test_damaged_files_of_wireless_insite_are_named_with_the_line(
     assert before in text
     file = p2m(tmp_path, text.replace(before, after, 1))
     with pytest.raises(RunError, match=rf"r006.p2m, line {line}:" if line else "r006.p2m: is no file"):
-        import_dataset(find_format("p2m").read(file, 60e9), tmp_path / "data")
+        import_dataset(insite(file), tmp_path / "data")
     assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("content", ["", "\0" * 4096, "# only a comment\n", "1 2 3 4\n" * 9])
 def test_files_that_are_none_of_wireless_insite_are_refused(content: str, tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"r006.p2m, line"):
-        find_format("p2m").read(p2m(tmp_path, content), 60e9)
+        insite(p2m(tmp_path, content))
 
 
 def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
@@ -538,7 +577,76 @@ def test_files_of_wireless_insite_need_a_frequency(tmp_path: Path) -> None:
 
 
 def test_a_real_file_of_wireless_insite(shared_data: Path, tmp_path: Path) -> None:
-    import_dataset(find_format("p2m").read(shared_data / "insite-paths", 60e9), tmp_path / "data")
+    import_dataset(insite(shared_data / "insite-paths"), tmp_path / "data")
     users = Dataset(tmp_path / "data").users()
     assert (len(users), int(users["paths"].sum())) == (15, 375)
     assert list(verify(tmp_path / "data")) == []
+
+
+# --- traces and clouds --------------------------------------------------------------------------------------
+
+
+def test_a_reader_by_the_description_of_qd_traces_finds_h(data: Dataset, tmp_path: Path) -> None:
+    out, users = exported(data, "ns3-qd", tmp_path) / "episode-000001", data.select([1]).users()
+    settings = dict(line.split("\t") for line in (out / "Input/paraCfgCurrent.txt").read_text().splitlines())
+    frequency = float(settings["carrierFrequency"])
+    assert (settings["numberOfTimeDivisions"], settings["totalTimeDuration"]) == ("3", "0.3")
+    lines = iter((out / "Output/Ns3/QdFiles/Tx0Rx1.txt").read_text().splitlines())
+    places = np.loadtxt(out / "Output/Ns3/NodesPosition/NodesPosition.csv", delimiter=",")
+    assert np.allclose(places[0], [3.0, -40.0, 12.0])
+    assert (out / "nodes.txt").read_text().split() == ["bs", "car/rx"]
+    for scene in range(3):
+        count = int(next(lines))
+        tau, gain, phase, *degrees = (np.array(next(lines).split(","), float) for _ in range(7))
+        assert len(tau) == count
+        assert np.allclose(tau, users.rows(["channel.tau"])["channel.tau"][scene])
+        table = {
+            "power": gain[None], "phase": np.degrees(phase - 2 * np.pi * frequency * tau)[None],
+            **{name: degrees[at][None] for at, name in enumerate(("aod_el", "aod_az", "aoa_el", "aoa_az"))},
+        }  # fmt: skip
+        poses = [
+            [a.orientation for a in placed_antennas(users[scene : scene + 1], end)] for end in ("rx", "tx")
+        ]
+        found = channels_of(table, ((3, 1), (4, 2)), poses)
+        assert nmse_db(found[0], users["channel.h"][scene]) < -150
+    assert next(lines, None) is None
+
+
+def test_clouds_of_points_are_where_the_lidar_saw_them(clouds: Path, tmp_path: Path) -> None:
+    data = Dataset(clouds)
+    out = exported(data, "pcd", tmp_path) / "000001"
+    assert len(list(out.iterdir())) == SCENES
+    for scene in range(SCENES):
+        head, _, body = (out / f"{scene:06d}-lidar.pcd").read_bytes().partition(b"DATA binary\n")
+        header = dict(line.split(" ", 1) for line in head.decode().splitlines()[1:])
+        cloud = np.frombuffer(body, "<f4").reshape(int(header["POINTS"]), 4)
+        x, y, z, *q = map(float, header["VIEWPOINT"].split())
+        right = data.episode(1)["lidar"].select(frames=[scene])
+        assert len(cloud) == right.hits[0, 0] > 0
+        turned = cloud[:, :3].astype(float) @ rotation_matrix(q).T + [x, y, z]
+        assert np.allclose(turned, right.points_world[0, 0], atol=1e-4)
+        assert np.allclose(np.linalg.norm(cloud[:, :3], axis=1), cloud[:, 3], atol=1e-4)
+
+
+def test_an_export_without_its_topic_says_what_to_record(data: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r'without lidar\.points: write "lidar" into `record`'):
+        exported(data, "pcd", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the page -----------------------------------------------------------------------------------------------
+
+
+def test_the_ten_lines_of_the_page_make_a_link_in_sionna_phy(
+    folder: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sionna.phy")
+    page = (repository / "docs" / "howto" / "formats.md").read_text(encoding="utf-8")
+    code = page.partition("```py\nimport caviar\n")[2].partition("```")[0]
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "s008").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec("import caviar\n" + code, names)  # noqa: S102 - the page's
+    assert names["y"].shape == (64, 1, 3, 14, 64)
+    assert names["h"].shape == (64, 1, 3, 1, 8, 14, 64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,10 +12,12 @@ from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import RecordingError
 from caviar_protocol.space.antenna_arrays import steering_vector
 from caviar_protocol.space.coordinates import rotation_matrix, unit_vectors
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics.channel import PLANE_WAVES
 from caviar_protocol.topics.scene import AntennaArray, AntennaDevice
 
 if TYPE_CHECKING:
+    from caviar_clients.datasets.reader import Dataset
     from caviar_clients.datasets.user_rows import Users
 
 
@@ -97,18 +100,25 @@ class ImpulseResponses:
         """
         names = ("a", "tau", "aod", "aoa", "doppler")
         rows = users.read([f"channel.{name}" for name in names])
-        found, paths = np.nan_to_num(rows["channel.a"]), self.shape["num_paths"]
+        found = np.nan_to_num(rows["channel.a"])
         transmit, receive = (
             self._responses(users, end, rows[f"channel.{angles}"])
             for end, angles in (("tx", "aod"), ("rx", "aoa"))
         )
-        shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
-        a = np.einsum("up,upm,upn,ups->umnps", found, receive, transmit, shifts, optimize=True)
-        missing = paths - found.shape[1]
-        return (
-            np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)]),
-            np.pad(np.nan_to_num(rows["channel.tau"]), [(0, 0), (0, missing)]),
+        # Paths last in memory, along which the product is vectorised: a third of the time of an einsum.
+        receive, transmit = (
+            np.ascontiguousarray(np.swapaxes(phases, 1, 2))
+            for phases in (found[..., None] * receive, transmit)
         )
+        a = (receive[:, :, None] * transmit[:, None])[..., None]
+        if self._times.any():
+            shifts = np.exp(2j * np.pi * np.nan_to_num(rows["channel.doppler"])[..., None] * self._times)
+            a = a * shifts[:, None, None]
+        tau = np.nan_to_num(rows["channel.tau"])
+        if missing := self.shape["num_paths"] - found.shape[1]:
+            a = np.pad(a, [(0, 0)] * 3 + [(0, missing), (0, 0)])
+            tau = np.pad(tau, [(0, 0), (0, missing)])
+        return a, tau
 
     def _responses(self, users: Users, end: str, angles: Float64Array) -> Complex128Array:
         """Phases of the elements of one end, Shape ``[N, P, elements]``, by angles in world axes."""
@@ -139,19 +149,25 @@ def placed_antennas(users: Users, end: str) -> Iterator[PlacedAntenna]:
     Raises:
         RecordingError: There is no scene.
     """
-    scene, found = (-1, -1), dict[str, PlacedAntenna]()
-    for at in zip(users["episode"].tolist(), users["scene"].tolist(), users[end].tolist(), strict=True):
-        if at[:2] != scene:
-            scene = at[:2]
-            arrays = users.dataset.episode(scene[0])["scene"].select(episode=scene[0], frames=[scene[1]])
-            poses, devices = arrays.devices, arrays.devices.devices
-            rows = zip(poses.keys, poses.position[0], poses.orientation[0], strict=True)
-            found = {
-                name: PlacedAntenna(device.array, position, orientation, device.power_dbm)
-                for name, position, orientation in rows
-                if isinstance(device := devices[name], AntennaDevice)
-            }
-        yield found[at[2]]
+    columns = (users["episode"].tolist(), users["scene"].tolist(), users[end].tolist())
+    for episode, scene, name in zip(*columns, strict=True):
+        yield _antennas_of(users.dataset, episode, scene)[name]
+
+
+# Both ends of a user are asked for in turn, by parts of fewer scenes.
+@lru_cache(maxsize=256)
+def _antennas_of(dataset: Dataset, episode: int, scene: int) -> dict[str, PlacedAntenna]:
+    recording = dataset.episode(episode)
+    payload = recording["scene"][recording.place(episode, scene)]
+    if payload is None:
+        raise RecordingError(f"{recording.path}, scene {scene}: scene is absent")
+    found = {}
+    for device in payload.devices:
+        if isinstance(device, AntennaDevice):
+            pose = device_pose(payload, device)
+            place = np.array(pose.position), np.array(pose.orientation)
+            found[device.name] = PlacedAntenna(device.array, *place, device.power_dbm)
+    return found
 
 
 def only_array(users: Users, end: str) -> AntennaArray:

@@ -430,7 +430,7 @@ class Users:
         """Rows of recorded arrays of a topic, of users of one scene, whose payload is decoded once."""
         recording = self._dataset.episode(episode)
         arrays: TopicArrays[Any, Any] = recording[topic]
-        payload = arrays.select(episode=episode, frames=[scene])[0] if len(arrays) > 1 else arrays[0]
+        payload = arrays[recording.place(episode, scene)]
         place = f"{recording.path}, scene {scene}"
         if payload is None:
             raise RecordingError(f"{place}: {topic} is absent")

@@ -109,6 +109,7 @@ class Recording:
                     f"episode {earlier[0]}: segments of two runs are mixed"
                 )
         self._index = {key: index for index, key in enumerate(order)}
+        self._latest: tuple[int, dict[tuple[Channel, int], memoryview]] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Its files are mapped into the memory of this process: another one opens them itself.
@@ -242,13 +243,25 @@ class Recording:
             >>> Recording("runs/smoke-20261122-101500").frame(episode=0, frame=7).t_ns
             700000000
         """
+        return RecordedFrame(self, self.place(episode, frame))
+
+    def place(self, episode: int, frame: int) -> int:
+        """Find the place of a frame, as ``recording[topic][place]`` takes it.
+
+        Args:
+            episode: Number of the episode, from 0.
+            frame: Number of the frame in it, from 0.
+
+        Raises:
+            RecordingError: It was not recorded; the text says which frames are there.
+        """
         index = self._index.get((episode, frame))
         if index is None:
             has = f"frames {min(self._index)} to {max(self._index)}" if self._index else "no frame"
             raise RecordingError(
                 f"{self.path} has no frame {frame} of episode {episode}; it has {has} (episode, frame)"
             )
-        return RecordedFrame(self, index)
+        return index
 
     def product(self, episode: int, frame: int, topic: str, source: str) -> Payload:
         """The payload of one product, fresh or held.
@@ -395,8 +408,12 @@ class Recording:
 
     def _stored(self, index: int) -> dict[tuple[Channel, int], memoryview]:
         """The products in a frame's chunk, whose CRC is not looked at."""
-        segment, place = self.segment_of(index)
-        return {(m.channel, m.frame): m.data for m in segment.messages(segment.chunks[place])}
+        # The topics of a frame are read one after the other: its chunk is decompressed once.
+        if self._latest is None or self._latest[0] != index:
+            segment, place = self.segment_of(index)
+            messages = segment.messages(segment.chunks[place])
+            self._latest = index, {(m.channel, m.frame): m.data for m in messages}
+        return self._latest[1]
 
     @cached_property
     def _late(self) -> dict[tuple[int, Channel, int], int]:
