@@ -15,18 +15,26 @@ import time
 from pathlib import Path
 
 import pytest
+from forked import Forked
 from scenarios_support import SCENARIOS, running
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+PRELOAD = ("caviar", "caviar_clients.envs")
+"""What the programs import."""
 ENDPOINT = re.compile(r"waiting for .* at (tcp://[\w.:-]+\d)")
 
 
 def started(folder: Path, program: str, *arguments: str) -> str:
     """What a program prints that ends with status 0."""
     command = [sys.executable, str(EXAMPLES / program), *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    pipe = subprocess.PIPE
+    with Forked(command, PRELOAD, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
+        try:
+            output, errors = process.communicate(timeout=120)
+        finally:
+            process.kill()
+    assert process.returncode == 0, errors
+    return str(output)
 
 
 @pytest.mark.parametrize("program", sorted(path.name for path in EXAMPLES.glob("*.py")))
