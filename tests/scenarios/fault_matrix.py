@@ -122,6 +122,11 @@ def scenario(
     return path
 
 
+def told(result: Result, kind: str, service: str = "") -> list[str]:
+    """Texts of the notices of a kind about a service."""
+    return [n["text"] for n in result.notices if n["kind"] == kind and n["service"] == service]
+
+
 def assert_whole(result: Result, directory: Path, frames: int = FRAMES) -> Recording:
     """No hang, no process left; the recording has every frame, and the digest that the broker chained.
 
