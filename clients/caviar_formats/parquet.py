@@ -157,7 +157,8 @@ class _Table:
 def _copy(connection: DuckDBPyConnection, select: str, file: Path, about: Mapping[str, str]) -> None:
     """Write rows to a Parquet file with metadata."""
     notes = ", ".join(f"{_text(key)}: {_text(value)}" for key, value in about.items())
-    options = f"FORMAT parquet, COMPRESSION snappy, KV_METADATA {{{notes}}}"
+    # Rows of arrays are long: a group of the default size would take a gigabyte.
+    options = f"FORMAT parquet, COMPRESSION snappy, ROW_GROUP_SIZE 2048, KV_METADATA {{{notes}}}"
     connection.execute(f"COPY ({select}) TO {_text(str(file))} ({options})")
 
 
