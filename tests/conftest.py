@@ -21,7 +21,8 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 MARKER = "CAVIAR_TEST_SESSION"
 """Environment variable by which a process that a test started is known, also after its parent died."""
 
-hypothesis.settings.register_profile("ci", derandomize=True, deadline=None, database=None)
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None, database=None, max_examples=40)
+hypothesis.settings.register_profile("all", hypothesis.settings.get_profile("ci"), max_examples=100)
 hypothesis.settings.register_profile("explore", deadline=None, max_examples=5000)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
@@ -200,5 +201,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Watch for processes that outlive their test, and keep garbage collection short."""
+    if config.getoption("--all") and "HYPOTHESIS_PROFILE" not in os.environ:
+        hypothesis.settings.load_profile("all")
     config.pluginmanager.register(FrozenHeap(), "frozen-heap")
     config.pluginmanager.register(LeftoverProcesses(), "leftover-processes")

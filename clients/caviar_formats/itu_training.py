@@ -36,7 +36,7 @@ def picture_inputs(pictures: Sequence[Any]) -> Any:
     """
     found = []
     for rgb in pictures:
-        gray = np.round(rgb @ np.array(_GRAY))
+        gray = np.floor(rgb @ np.array(_GRAY) + 1e-9)  # libpng, through which OpenCV reads, cuts off
         means = np.round(_areas(gray.shape[0], INPUTS[0]) @ gray @ _areas(gray.shape[1], 27).T)
         beside = np.pad(means, 1)
         beside = beside[:-2, 1:-1] + beside[2:, 1:-1] + beside[1:-1, :-2] + beside[1:-1, 2:]

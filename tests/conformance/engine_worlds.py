@@ -22,7 +22,7 @@ from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
-from scenarios_support import ROOT, blocks, environment, eventually, recorded_below, running
+from scenarios_support import ROOT, blocks, caviar, environment, eventually, recorded_below, running
 from test_websocket_agent import WITHIN_S, WebRun
 from vector_files import FOLDER, Vector, all_vectors, array_of, load
 
@@ -445,11 +445,8 @@ def check_conformance(command: str, folder: Path) -> None:
         "--json",
         str(verdicts),
     ]
-    done = subprocess.run(
-        [sys.executable, "-m", "caviar_clients", "conform", *words, "--command", command],
-        env=environment("conform"), capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
-    assert verdicts.exists(), done.stdout + done.stderr
+    done = caviar("conform", *words, "--command", command, timeout=240)
+    assert verdicts.exists(), done.output
     found = {entry["case"]: entry for entry in json.loads(verdicts.read_text("utf-8"))["verdicts"]}
     failed = [entry for entry in found.values() if entry["outcome"] == "fail"]
     assert not failed, failed
@@ -458,7 +455,7 @@ def check_conformance(command: str, folder: Path) -> None:
         "run-time-meshes",
     }  # fmt: skip
     assert {case for case in played if found[case]["outcome"] == "pass"} == played
-    assert done.returncode == 0, done.stdout
+    assert done.status == 0, done.output
 
 
 @contextmanager
@@ -483,13 +480,10 @@ def light(scenario: Path, folder: Path) -> Path:
 
 def token_of(folder: Path) -> str:
     """Token of a world, in a new directory of keys."""
-    base = [sys.executable, "-m", "caviar_clients", "keys"]
     for words in (("new", "broker"), ("token", "world", "--role", "world")):
-        done = subprocess.run(
-            [*base, *words, "--directory", str(folder)], env=environment("keys"),
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    return done.stdout.strip()
+        done = caviar("keys", *words, "--directory", folder)
+        assert done.status == 0, done.output
+    return done.output.strip()
 
 
 def whole_run(scenario: Path, folder: Path, command: Sequence[str], *options: str) -> tuple[str, Path]:

@@ -76,7 +76,7 @@ def scene(*devices: Any) -> Scene:
 
 
 @pytest.mark.parametrize("cls", get_args(Message), ids=lambda cls: cls.__struct_config__.tag)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_a_message_survives_the_wire(cls: type[Message], data: st.DataObject) -> None:
     """Equal when decoded, the same bytes when encoded again, and readable by the msgpack package."""
@@ -91,7 +91,7 @@ def test_a_message_survives_the_wire(cls: type[Message], data: st.DataObject) ->
 
 
 @pytest.mark.parametrize("topic", PAYLOADS)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_a_payload_survives_the_wire(topic: str, data: st.DataObject) -> None:
     payload = data.draw(ps.payload(PAYLOADS[topic]))

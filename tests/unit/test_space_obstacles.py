@@ -218,7 +218,9 @@ def motion(rng: np.random.Generator) -> Motion:
     return Motion(velocity=place) if rng.random() < 0.5 else Motion(target=place, speed=12.0)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in range(2, 6))]
+)
 def test_the_acceleration_keeps_its_limit_at_walls_too(seed: int) -> None:
     """Seen in steps that are shorter than a sub-step."""
     made, rng, bounds = among_boxes(seed)
