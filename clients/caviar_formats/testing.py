@@ -71,7 +71,7 @@ class FormatConformance:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(base.shutil, "rmtree", remove_one)
+            patch.setattr("shutil.rmtree", remove_one)
             with pytest.raises(KeyboardInterrupt):
                 export_users(dataset.users(), find_format(self.name), cut)
         export_users(dataset.users(), find_format(self.name), cut)
