@@ -214,14 +214,14 @@ def export_users(
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         state = _continued(folder, _identity(users, to))
-        scenes = 0
+        scenes, of = 0, len(users.dataset.table("scenes"))
         for part in parts:
             if part.number >= state.done:
                 to.write(part, folder)
                 state.done = part.number + 1
                 replace_file(folder / STATE, msgspec.json.encode(state), durable=False)
             scenes += len(part.scenes)
-            on_part(scenes, len(users.dataset.table("scenes")))
+            on_part(scenes, of)
         if not state.finished:
             to.finish(users, folder)
             state.finished = True
@@ -229,8 +229,8 @@ def export_users(
         for name in to.temporary:
             shutil.rmtree(folder / name, ignore_errors=True)
         (folder / "README.md").write_text(_readme(users, to), encoding="utf-8")
-        (folder / STATE).unlink()
         folder.replace(out)
+        (out / STATE).unlink()
 
 
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:
