@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -68,6 +69,8 @@ class Format:
     """Recorded arrays without which there is no export: ``channel.a``."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
+    temporary: ClassVar[Sequence[str]] = ()
+    """Folders of the export that are removed once `finish` has made files of them."""
     frequency_hz: float | None = None
     """Of the carrier, where the files that are read do not have it [Hz]."""
     loses: ClassVar[str] = ""
@@ -172,6 +175,8 @@ class _State(msgspec.Struct):
 
     export: str
     done: int = 0
+    finished: bool = False
+    """Whether `Format.finish` is through, which is not to run on folders that are being removed."""
 
 
 def export_users(
@@ -209,18 +214,23 @@ def export_users(
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         state = _continued(folder, _identity(users, to))
-        scenes = 0
+        scenes, of = 0, len(users.dataset.table("scenes"))
         for part in parts:
             if part.number >= state.done:
                 to.write(part, folder)
                 state.done = part.number + 1
                 replace_file(folder / STATE, msgspec.json.encode(state), durable=False)
             scenes += len(part.scenes)
-            on_part(scenes, len(users.dataset.table("scenes")))
-        to.finish(users, folder)
+            on_part(scenes, of)
+        if not state.finished:
+            to.finish(users, folder)
+            state.finished = True
+            replace_file(folder / STATE, msgspec.json.encode(state), durable=False)
+        for name in to.temporary:
+            shutil.rmtree(folder / name, ignore_errors=True)
         (folder / "README.md").write_text(_readme(users, to), encoding="utf-8")
-        (folder / STATE).unlink()
         folder.replace(out)
+        (out / STATE).unlink()
 
 
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:

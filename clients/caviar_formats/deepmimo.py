@@ -52,6 +52,7 @@ class DeepMimo(Format):
         "channel.interactions",
         "channel.points",
     )
+    temporary = (".parts",)
     loses = (
         f"All but the {PATHS} strongest paths of a user, and paths of more than {POINTS} interactions; "
         "sensors, links, beams; patterns and polarizations of elements, which the powers contain; carriers "
@@ -101,12 +102,14 @@ class DeepMimo(Format):
             names = np.unique(users["rx"])
             scenes = part.scenes["scene"][part.scenes["episode"] == episode].tolist()
             for scene in scenes:
-                self._write_scene(
-                    users[users["scene"] == scene], names, scenario / f"scene_{scene:06d}", episode, scene
-                )
-            self._write_params(scenario, len(names), len(scenes))
+                here = users[users["scene"] == scene]
+                counts = self._write_scene(here, names, scenario / f"scene_{scene:06d}", episode, scene)
+            active = len(np.unique(users["rx"][users["valid"]]))
+            self._write_params(scenario, len(names), active, len(scenes), counts)
 
-    def _write_scene(self, users: Users, names: NDArray[Any], folder: Path, episode: int, scene: int) -> None:
+    def _write_scene(
+        self, users: Users, names: NDArray[Any], folder: Path, episode: int, scene: int
+    ) -> dict[str, int]:
         """Write a scene of a dynamic scenario: rows of users that are not there are NaN."""
         folder.mkdir(parents=True, exist_ok=True)
         for number, tx in enumerate(self._tx):
@@ -120,7 +123,7 @@ class DeepMimo(Format):
             found["user"] = np.array([f"{episode} {scene} {name}" for name in names])
             for name, values in (found | _tx_of(here, None)).items():
                 np.savez(folder / _file(name, number, len(self._tx)), allow_pickle=False, **{name: values})
-        self._write_objects(users, folder, episode, scene)
+        return self._write_objects(users, folder, episode, scene)
 
     def _tx_pose(self, folder: Path, number: int, users: Users) -> Any:
         """The pose of a transmitter, which has to stand still."""
@@ -175,7 +178,7 @@ class DeepMimo(Format):
             out["inter_pos"][at, cut, : points.shape[1]] = points
         return out
 
-    def _write_objects(self, users: Users, folder: Path, episode: int, scene: int) -> dict[str, int]:
+    def _write_objects(self, users: Users, folder: Path, episode: int = 0, scene: int = -1) -> dict[str, int]:
         """Write scenery and, of a scene, the boxes of its objects, as meshes."""
         meshes = [("scenery", "terrain", self._scenery)] if len(self._scenery) else []
         if scene >= 0:
@@ -223,16 +226,13 @@ class DeepMimo(Format):
             with np.load(files[0]) as tables:
                 for name in ("tx_pos", "tx_orientation"):
                     np.savez(scenario / _file(name, number, len(self._tx)), **{name: tables[name]})
-        self._write_params(scenario, len(users) // len(self._tx), 1)
-        for part in parts:
-            for file in part.iterdir():
-                file.unlink()
-            part.rmdir()
-        (folder / ".parts").rmdir()
+        points, active = (count // len(self._tx) for count in (len(users), int(users["valid"].sum())))
+        self._write_params(scenario, points, active, 1, self._write_objects(users, scenario))
 
-    def _write_params(self, folder: Path, users: int, scenes: int) -> None:
+    def _write_params(
+        self, folder: Path, users: int, active: int, scenes: int, counts: Mapping[str, int]
+    ) -> None:
         """Write ``params.json``, with all fields that the package's summary reads."""
-        counts = self._write_objects_of(folder, scenes)
         modelled = dict.fromkeys(
             ("max_path_depth", "max_reflections", "max_diffractions", "max_scattering", "max_transmissions"),
             POINTS,
@@ -242,9 +242,9 @@ class DeepMimo(Format):
             for end, a in self._arrays.items()
         }
         sets = {
-            f"txrx_set_{number}": _set(number, name, is_tx, points, self._arrays["tx" if is_tx else "rx"])
-            for number, (name, is_tx, points) in enumerate(
-                [*((name, True, 1) for name in self._tx), ("receivers", False, users)]
+            f"txrx_set_{number}": _set(number, *about)
+            for number, about in enumerate(
+                [*((name, True, 1, 1) for name in self._tx), ("receivers", False, users, active)]
             )
         }
         params = {
@@ -275,19 +275,6 @@ class DeepMimo(Format):
             "scene": {"num_scenes": scenes, **counts, "representation": "mesh"},
         }
         (folder / "params.json").write_text(json.dumps(params, indent=1))
-
-    def _write_objects_of(self, folder: Path, scenes: int) -> dict[str, int]:
-        if self.flavour == "static":
-            return self._write_objects(None, folder, 0, -1)  # type: ignore[arg-type]
-        about = json.loads((folder / "scene_000000" / "objects.json").read_text())
-        with np.load(folder / "scene_000000" / "vertices.npz") as file:
-            count = len(file["vertices"])
-        return {
-            "n_objects": len(about),
-            "n_vertices": count,
-            "n_faces": count // 3,
-            "n_triangular_faces": count // 3,
-        }
 
     def readme(self, users: Users) -> str:
         shapes = {end: [array.columns, array.rows] for end, array in self._arrays.items()}
@@ -389,7 +376,7 @@ def _array(raw: Mapping[str, Any] | None) -> AntennaArray:
     )  # fmt: skip
 
 
-def _set(number: int, name: str, is_tx: bool, points: int, array: AntennaArray) -> dict[str, Any]:
+def _set(number: int, name: str, is_tx: bool, points: int, active: int) -> dict[str, Any]:
     return {
         "name": name,
         "id_orig": number,
@@ -397,7 +384,7 @@ def _set(number: int, name: str, is_tx: bool, points: int, array: AntennaArray) 
         "is_tx": is_tx,
         "is_rx": not is_tx,
         "num_points": points,
-        "num_active_points": points,
+        "num_active_points": active,
         "num_ant": 1,
         "dual_pol": False,
         "ant_rel_positions": [[0, 0, 0]],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -51,6 +50,7 @@ class Itu(Format):
     packages = ("h5py", "PIL")
     needs = ("channel.a", "channel.interactions")
     whole_episodes = True
+    temporary = (SHARDS,)
     loses = (
         "Transmit power, Doppler shifts, velocities; element patterns by themselves (the power of a ray has "
         "them); roll and pitch of receivers; points of LIDARs; the weakest of more than 100 rays."
@@ -233,7 +233,6 @@ class Itu(Format):
                 rx, tx = np.divmod(best, ARRAYS[1])
                 file_of_best = folder / "baseline_data" / "beam_output" / f"best_pairs_{part}.npz"
                 np.savez(file_of_best, rx_times_32_plus_tx=best, tx_times_8_plus_rx=tx * ARRAYS[0] + rx)
-        shutil.rmtree(folder / SHARDS)
 
     def readme(self, users: Users) -> str:
         (scenes, receivers), slots = self._shape, self._slots

@@ -55,18 +55,18 @@ class Sionna(Format):
     loses = "Users without a path, sensors, positions, links and objects; instants between scenes."
 
     def begin(self, users: Users) -> None:
-        self._shape = users[users["valid"]].cir().shape
+        self._cir = users[users["valid"]].cir()
+        self._shape = self._cir.shape
 
     def write(self, part: Part, folder: Path) -> None:
         valid = part.users[part.users["valid"]]
         if not len(valid):
             return
-        cir = valid.cir(paths=self._shape["num_paths"])
         a = np.empty((len(valid), *self._shape.values()), np.complex64)
         tau = np.empty((len(valid), 1, 1, self._shape["num_paths"]))
         for start in range(0, len(valid), 256):
             cut = slice(start, start + 256)
-            found, tau[cut, 0, 0] = cir.block(valid[cut])
+            found, tau[cut, 0, 0] = self._cir.block(valid[cut])
             a[cut, 0, :, 0] = found
         columns = valid.read(["episode", "scene", "carrier", "tx", "rx"])
         np.savez(folder / f"cir-{part.number:05d}.npz", allow_pickle=False, a=a, tau=tau, **columns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,7 +156,8 @@ class _Table:
 def _copy(connection: DuckDBPyConnection, select: str, file: Path, about: Mapping[str, str]) -> None:
     """Write rows to a Parquet file with metadata."""
     notes = ", ".join(f"{_text(key)}: {_text(value)}" for key, value in about.items())
-    options = f"FORMAT parquet, COMPRESSION snappy, KV_METADATA {{{notes}}}"
+    # Rows of arrays are long: a group of the default size would take a gigabyte.
+    options = f"FORMAT parquet, COMPRESSION snappy, ROW_GROUP_SIZE 2048, KV_METADATA {{{notes}}}"
     connection.execute(f"COPY ({select}) TO {_text(str(file))} ({options})")
 
 
@@ -184,13 +184,14 @@ _CONTEXT: dict[str, Any] = {
 class HuggingFace(Parquet):
     """Parquet, a dataset card as README, and a description in Croissant 1.0 with the SHA-256 of each file."""
 
+    temporary = ("users", "scenes")
+
     def finish(self, users: Users, folder: Path) -> None:
         super().finish(users, folder)
         records, files = [], []
         for table in ("users", "scenes"):
             file = folder / f"{table}.parquet"
-            if (folder / table).exists():  # else a kill came between these tables
-                _join_parts(folder / table, file)
+            _join_parts(folder / table, file)
             records.append(_record_set(table, file))
             files.append(_file_object(file))
         described = {
@@ -236,7 +237,7 @@ def _about(connection: DuckDBPyConnection, file: Path) -> dict[str, str]:
 
 
 def _join_parts(parts: Path, file: Path) -> None:
-    """Join the parts of a table into one file, of which Croissant has the digest, and remove them.
+    """Join the parts of a table into one file, of which Croissant has the digest.
 
     Columns whose sizes differ from part to part have their names in the metadata.
     """
@@ -250,7 +251,6 @@ def _join_parts(parts: Path, file: Path) -> None:
             }
         paths = ", ".join(_text(str(part)) for part in sorted(parts.glob("*.parquet")))
         _copy(connection, f"SELECT * FROM read_parquet([{paths}])", file, about)  # noqa: S608
-    shutil.rmtree(parts)
 
 
 def _open(key: str, value: str) -> str:

@@ -21,7 +21,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 class FormatConformance:
-    """What every format that is written does; the fixture ``dataset`` has three scenes at least."""
+    """Duties of every format that is written; the fixture ``dataset`` has three scenes at least."""
 
     name: ClassVar[str]
     """Of the format."""
@@ -56,6 +56,25 @@ class FormatConformance:
         done = list[int]()
         export_users(dataset.users(), find_format(self.name), cut, lambda scenes, of: done.append(scenes))
         assert done[-1] == len(dataset.table("scenes"))
+        assert digests(cut) == digests(whole)
+
+    def test_an_export_that_is_cut_off_in_its_last_step_loses_nothing(
+        self, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        whole, cut = tmp_path / "whole", tmp_path / "cut"
+        export_users(dataset.users(), find_format(self.name), whole)
+        if not find_format(self.name).temporary:
+            return
+
+        def remove_one(folder: Path, **options: bool) -> None:
+            next(file for file in sorted(folder.rglob("*")) if file.is_file()).unlink()
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr("shutil.rmtree", remove_one)
+            with pytest.raises(KeyboardInterrupt):
+                export_users(dataset.users(), find_format(self.name), cut)
+        export_users(dataset.users(), find_format(self.name), cut)
         assert digests(cut) == digests(whole)
 
     def test_its_readme_says_what_the_files_are(self, dataset: Dataset, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from caviar_protocol.scenario import Carrier
 from caviar_protocol.topics import AntennaArray, AntennaDevice
 
 SCENES_OF_EPISODE, RECEIVERS, PATHS = 50, 10, 15
-FORMATS = ("npz", "parquet", "sionna", "huggingface", "deepmimo")
+FORMATS = ("npz", "parquet", "sionna", "huggingface", "deepmimo", "ns3-qd")
 
 
 def scenes(count: int) -> Iterator[ImportedScene]:
