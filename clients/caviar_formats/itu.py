@@ -322,7 +322,7 @@ def _numbers(users: Users) -> Int64Array:
 
 
 def _vehicles(users: Users) -> Columns:
-    """What carries each user: name, height [m], heading of the RX array [°], corners of its footprint [m]."""
+    """Vehicles of the users: name, height [m], yaw of the RX array [°], corners of the footprint [m]."""
     prefixes = [
         service["settings"].get("prefix", "")
         for service in users.dataset.settings["scenario"]["services"].values()
