@@ -270,7 +270,7 @@ class ChannelModel(Service[S]):
         """
         scene = frame.scene()
         wrong = "" if numbers_are_right(scene) else wrong_number(scene)
-        if not wrong and scene.devices is not self._devices:
+        if not wrong and scene.devices != self._devices:
             wrong, self._devices = wrong_device_number(scene), scene.devices
         if wrong:
             raise PayloadError(wrong)
