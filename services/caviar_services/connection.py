@@ -182,13 +182,14 @@ class Connection:
         self.send_parts([encode_message(message), *parts])
 
     def send_parts(self, parts: Sequence[Any]) -> None:
-        """Send what is encoded already; large parts are not copied."""
+        """Send what is encoded already; large parts are not copied. As of `send`."""
         send = self._socket.send
         try:
             for part in parts[:-1]:
                 send(part, _MORE, len(part) < COPIED)
             send(parts[-1], 0, len(parts[-1]) < COPIED)
         except zmq.Again as error:
+            self._handshake.check()  # a refused key leaves no connection to send on
             raise Disconnected(f"the broker at {self.endpoint} takes no messages") from error
 
     def receive(self, timeout_s: float | None = None) -> tuple[m.Message, Sequence[zmq.Frame]]:
