@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -11,15 +12,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from caviar_clients.datasets.impulse_responses import PlacedAntenna, placed_antennas
 from caviar_clients.datasets.user_rows import Columns, Users
 from caviar_formats.base import Format, Part, markdown_table
 from caviar_formats.imports import Source
-from caviar_formats.itu_reading import HEADER, LETTERS, read_itu
+from caviar_formats.itu_reading import ABOVE_M, ARRAYS, HEADER, TX_YAW_DEG, WORDS, read_itu
 from caviar_formats.itu_training import INPUTS, TRAINING, join_arrays, picture_inputs
 from caviar_protocol.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from caviar_protocol.errors import RunError
 from caviar_protocol.recording.scene import SceneArrays
-from caviar_protocol.space.coordinates import rotation_matrix
+from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 
 RAYS_FILE = "rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e{}.hdf5"
 """Name of a file of rays, by the number of its episode: readers open no other, whatever scene it is."""
@@ -27,7 +29,7 @@ SLOTS = (25, 100)
 """Rays of a receiver that a file has room for."""
 INTERACTIONS = 9
 """Interactions of a ray that a file has room for."""
-ARRAYS = (8, 32)
+SIZES = (ARRAYS["rx"].size, ARRAYS["tx"].size)
 """Elements of the challenge's arrays, of RX and TX."""
 GRID = (20, 200, 10)
 """Cells of the challenge's LIDAR grid."""
@@ -53,7 +55,8 @@ class Itu(Format):
     temporary = (SHARDS,)
     loses = (
         "Transmit power, Doppler shifts, velocities; element patterns by themselves (the power of a ray has "
-        "them); roll and pitch of receivers; points of LIDARs; the weakest of more than 100 rays."
+        "them); yaw of the transmitter, roll and pitch of receivers, and their heights: readers add 0.1 m to "
+        "that of the vehicle; points of LIDARs; the weakest of more than 100 rays."
     )
 
     def begin(self, users: Users) -> None:
@@ -74,16 +77,16 @@ class Itu(Format):
         self._cir = users.cir()
         self._slots = SLOTS[int(users["paths"].max() > SLOTS[0])]
         self._shape = int(users["scene"].max()) + 1, int(_numbers(users).max()) + 1
+        self._tx_yaw_deg = yaw_deg(next(placed_antennas(users[:1], "tx")))
         self._last_training = min(-(-3 * len(episodes) // 4) - 1, max(len(episodes) - 2, 0))  # 1564 of 2086
         self._set = str(scenario["run"]["name"])
         carriers = {c["name"]: c["frequency_hz"] for c in scenario["carriers"]}
         self._period_s = scenario["run"]["sampling_period_ns"] / 1e9
         self._ghz = f"{carriers[str(users['carrier'][0])] / 1e9:g}"
-        self._grid = next(
-            (s["settings"]["grid"] for s in scenario["services"].values() if s["use"] == "lidar"), None
-        )
-        if "lidar.grid" not in users.recorded():
-            self._grid = None
+        self._grid = None
+        if "lidar.grid" in users.recorded():
+            services = scenario["services"].values()
+            self._grid = next((s["settings"]["grid"] for s in services if "grid" in s["settings"]), None)
         topics = dataset.episode(dataset.episodes[0]).topics
         self._cameras = [
             device["name"]
@@ -96,7 +99,7 @@ class Itu(Format):
     def _require_baseline(self, users: Users) -> None:
         arrays = self._cir.shape["num_rx_ant"], self._cir.shape["num_tx_ant"]
         found: dict[str, tuple[object, object]] = {
-            "elements of RX and TX": (arrays, ARRAYS),
+            "elements of RX and TX": (arrays, SIZES),
             "scenes of an episode": (self._shape[0], 1),
         }
         if self._grid:
@@ -202,8 +205,8 @@ class Itu(Format):
         """Write shards of `baseline_data`, of valid users."""
         found = {"coord": np.stack([users["x_m"], users["y_m"]], axis=1), "lidar": grid}
         # Wᴴ H W with W[m, k] = exp(−j2πmk/N), not normalised, as the challenge has it.
-        h = users["channel.h"] if len(users) else np.zeros((0, *ARRAYS))
-        y = np.fft.fft(np.fft.ifft(h, axis=1), axis=2) * ARRAYS[0]
+        h = users["channel.h"] if len(users) else np.zeros((0, *SIZES))
+        y = np.fft.fft(np.fft.ifft(h, axis=1), axis=2) * SIZES[0]
         found["beams"] = np.abs(y).astype(np.complex128)
         if self._cameras:
             episodes, place = np.unique(users["episode"], return_inverse=True)
@@ -229,10 +232,10 @@ class Itu(Format):
                         join_arrays(shards, folder / "baseline_data" / place.format(part), key)
                 shards = _shards(folder, f"beams-{part}")
                 y = np.concatenate([np.abs(np.load(shard)) for shard in shards])
-                best = y.reshape(-1, ARRAYS[0] * ARRAYS[1]).argmax(axis=1)
-                rx, tx = np.divmod(best, ARRAYS[1])
+                best = y.reshape(-1, SIZES[0] * SIZES[1]).argmax(axis=1)
+                rx, tx = np.divmod(best, SIZES[1])
                 file_of_best = folder / "baseline_data" / "beam_output" / f"best_pairs_{part}.npz"
-                np.savez(file_of_best, rx_times_32_plus_tx=best, tx_times_8_plus_rx=tx * ARRAYS[0] + rx)
+                np.savez(file_of_best, rx_times_32_plus_tx=best, tx_times_8_plus_rx=tx * SIZES[0] + rx)
 
     def readme(self, users: Users) -> str:
         (scenes, receivers), slots = self._shape, self._slots
@@ -240,7 +243,8 @@ class Itu(Format):
         about = {
             f"CoordVehiclesRxPerScene_{self._set}.csv": "a row for each receiver of a scene: Val is V where "
             "a ray reaches it and, with a LIDAR, its vehicle lies in the area of the grid; x, y of it, z the "
-            " height of its vehicle [m]; the number of rays; whether one is straight",
+            "height of its vehicle, or 0.1 m below one that stands [m]; the number of rays; whether one is "
+            "straight",
             rays: f"`allEpisodeData`, float32 [{scenes} scenes, {receivers} receivers, {slots} rays, 9], "
             "strongest first, NaN where there is none: power [dBm] of 0 dBm sent, delay [s], zenith and "
             "azimuth of departure, then of arrival [°], 1 for the straight ray, phase [°], RxAngle [°]",
@@ -269,7 +273,8 @@ N is the number of the episode. Rows of all files are sorted by episode, scene a
 east, y to the north, z upwards; azimuth is from x to y, zenith from z. RxAngle is the yaw of the RX array's
 boresight: its elements follow each other along RxAngle + 90°. The phase is that of the gain between the
 first elements of both arrays, exp(+j·phase), with the carrier's. Readers open files of rays by this name,
-which says nothing of the scene. SPLIT is `train` up to episode {self._last_training}, then `validation`.
+which says nothing of the scene; they take the TX array to lie along x, at a yaw of {TX_YAW_DEG:g}°: here it
+is {self._tx_yaw_deg:g}°. SPLIT is `train` up to episode {self._last_training}, then `validation`.
 
 {_ABOUT_PHASES[self.flavour]}
 """
@@ -327,23 +332,20 @@ def _vehicles(users: Users) -> Columns:
         service["settings"].get("prefix", "")
         for service in users.dataset.settings["scenario"]["services"].values()
     ]
-    names, heights, yaws, corners = [], [], [], []
+    names, heights, corners = [], [], []
+    yaws = [yaw_deg(antenna) for antenna in placed_antennas(users, "rx")]
     for rows, scene in _scenes(users):
-        devices = scene.devices
-        turns = devices.orientation[0, devices.index(users["rx"][rows])]
-        forwards = np.stack([rotation_matrix(q)[:, 0] for q in turns])
-        yaws += (np.degrees(np.arctan2(forwards[:, 1], forwards[:, 0])) % 360).tolist()
         for name, x, y, z in zip(
             *(users[c][rows].tolist() for c in ("object", "x_m", "y_m", "z_m")), strict=True
         ):
-            if name:  # one that stands is no vehicle, and has a height of its own
+            if name:
                 (at,) = scene.index([name])
                 x, y, _ = scene.position[0, at]
                 length, width, z = scene.dimensions[0, at]
                 half = np.array([[i * length, j * width, 0] for i in (-0.5, 0.5) for j in (-0.5, 0.5)])
                 footprint = (half @ rotation_matrix(scene.orientation[0, at]).T)[:, :2] + (x, y)
             else:
-                footprint = np.tile((x, y), (4, 1))
+                footprint, z = np.tile((x, y), (4, 1)), z - ABOVE_M
             corners.append(footprint)
             heights.append(z)
             names.append(next((name.removeprefix(p) for p in prefixes if p and name.startswith(p)), name))
@@ -355,6 +357,11 @@ def _vehicles(users: Users) -> Columns:
             "corners": np.array(corners),
         }
     )
+
+
+def yaw_deg(antenna: PlacedAntenna) -> float:
+    """Yaw of an antenna's boresight, counter-clockwise from x [°], from 0 to 360."""
+    return math.degrees(euler_from_quaternion(antenna.orientation.tolist())[0]) % 360
 
 
 def _scenes(users: Users) -> Iterator[tuple[Int64Array, SceneArrays]]:
@@ -408,8 +415,7 @@ def _interactions(users: Users, order: Int64Array, slots: int, valid: BoolArray)
     codes = np.full((count, slots, INTERACTIONS, 2), -1, np.int64)
     places = np.full((count, slots, INTERACTIONS, 3), -1, np.float32)
     numbers = np.full((count, slots), -1, np.int64)
-    letters = np.array([[*map(ord, letter), -1, -1][:2] for letter in LETTERS])
-    letters[0] = -1
+    letters = np.array([[*map(ord, word), -1, -1][:2] for word in WORDS])
     codes[:, :paths, :depth] = letters[kinds]
     places[:, :paths, :depth] = np.where(kinds[..., None] > 0, points, -1)
     numbers[:, :paths] = np.where(absent, -1, np.count_nonzero(kinds, axis=2))
@@ -473,7 +479,7 @@ def _write_database(
                 insert("receivers", receiver, total, mean, place.tobytes(), on)
                 for k, (power, delay, *angles, straight, phase, _) in enumerate(mine.tolist()):
                     kind = kinds[user, k][kinds[user, k] > 0]
-                    letters = [LETTERS[i] for i in kind]
+                    letters = [WORDS[i] for i in kind]
                     # Two words are a straight ray to readers: interactions that nobody recorded are a third.
                     text = "-".join(["Tx", *(letters or ([] if straight else ["?"])), "Rx"])
                     met = points[user, k][: len(kind)].tobytes()

@@ -12,22 +12,26 @@ from typing import Any
 import numpy as np
 
 from caviar_formats.imports import ImportedScene, Paths, Source, damaged
+from caviar_formats.p2m import LETTERS
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.space.antenna_arrays import steering_vector
-from caviar_protocol.space.coordinates import quaternion_from_euler, rotation_matrix, unit_vectors
+from caviar_protocol.space.coordinates import (
+    SPEED_OF_LIGHT,
+    quaternion_from_euler,
+    rotation_matrix,
+    unit_vectors,
+)
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Carrier
 
 HEADER = ("Val", "EpisodeID", "SceneID", "VehicleArrayID", "VehicleName", "x", "y", "z", "rays", "LOS")
-LETTERS = ("\0", "R", "D", "DS", "T")
-"""Interactions by their codes in `Channel`, as Wireless InSite writes them."""
+WORDS = ("", "R", "D", "DS", "T")
+"""Interactions by their codes in `Channel`, as they are written; `LETTERS` has all that are read."""
 ARRAYS = {"tx": AntennaArray(columns=32), "rx": AntennaArray(columns=8)}
 """Arrays of the challenge, of which the files say nothing."""
 TX_YAW_DEG = 90.0
 """Yaw of its transmitter: azimuths are measured to the axis of the array."""
 ABOVE_M = 0.1
 """Height of an antenna above the vehicle whose height is the z of its row."""
-LIGHT = 299_792_458.0
-"""Speed of light in a vacuum [m/s]."""
 
 Key = tuple[int, int, int]
 
@@ -129,7 +133,10 @@ def _rays(file: Path, rows: Mapping[Key, Mapping[str, str]]) -> dict[Key, Float6
         if scene >= every.shape[0] or receiver >= every.shape[1]:
             raise damaged(file, place, f"is not there: the shape is {every.shape}, and the CSV has the row")
         rays = every[scene, receiver]
-        rays = rays[~np.isnan(rays[:, 0])]
+        padding = np.isnan(rays[:, 0])
+        if (padding[:-1] & ~padding[1:]).any():
+            raise damaged(file, place, "has a ray after padding")
+        rays = rays[~padding]
         # The column of RxAngle is missing in the first sets, where arrays keep their heading.
         rays = np.pad(rays, [(0, 0), (0, 9 - rays.shape[1])])
         if not np.isfinite(np.delete(rays, 7, axis=1)).all():
@@ -151,21 +158,20 @@ def _interactions(file: Path) -> list[Any]:
     beside = file.with_name(f"{file.stem}_interactions.hdf5")
     if not beside.exists():
         return []
-    kinds = np.zeros(256, np.uint8)
-    for code, letter in enumerate(LETTERS):
-        kinds[ord(letter[0])] = code
-    kinds[ord("d")] = LETTERS.index("D")
     try:
         with h5py.File(beside) as data:
             codes = np.asarray(data["allInteractionsDescriptions"][()], np.int64)
             points = np.asarray(data["allInteractionsPositions"][()], np.float64)
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise damaged(beside, "", f"has no arrays of interactions: {error}") from error
-    if codes.ndim != 5 or points.shape[:4] != codes.shape[:4] or points.shape[4:] != (3,):
+    if codes.shape[4:] != (2,) or points.shape != (*codes.shape[:4], 3):
         raise damaged(beside, "", f"has arrays of the shapes {codes.shape} and {points.shape}")
-    # D is diffraction, and DS, as one word, scattering.
-    found = kinds[np.where((codes[..., 0] >= 0) & (codes[..., 0] < 256), codes[..., 0], 0)]
-    found[(codes[..., 0] == ord("D")) & (codes[..., 1:] == ord("S")).any(axis=-1)] = LETTERS.index("DS")
+    found = np.zeros(codes.shape[:4], np.uint8)
+    for word, kind in LETTERS.items():
+        found[(codes == [*map(ord, word), -1, -1][:2]).all(axis=-1)] = kind
+    if (unknown := (codes[..., 0] > 0) & (found == 0)).any():
+        at = [int(i) for i in np.argwhere(unknown)[0]]
+        raise damaged(beside, f"allInteractionsDescriptions{at}", f"{codes[tuple(at)]} is no interaction")
     return [found, points]
 
 
@@ -187,7 +193,7 @@ def _transmitter(rows: Mapping[Key, dict[str, str]], rays: Mapping[int, Path]) -
         for key, found in _rays(rays[episode], mine).items():
             phases |= bool(np.isfinite(found[:, 7]).all())
             for ray in found[found[:, 6] == 1]:
-                way = unit_vectors(np.radians(ray[2:4])) * ray[1] * LIGHT
+                way = unit_vectors(np.radians(ray[2:4])) * ray[1] * SPEED_OF_LIGHT
                 begins.append(_receiver(mine[key]) - way)
         if len(begins) >= 100:
             break

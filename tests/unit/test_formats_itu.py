@@ -189,7 +189,8 @@ def rays_of(folder: Path, row: dict[str, str]) -> Any:
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "CoordVehiclesRxPerScene_s008.csv").open(encoding="utf-8") as file:
+    (table,) = folder.glob("CoordVehiclesRxPerScene_*.csv")
+    with table.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
@@ -284,6 +285,16 @@ def test_database_has_the_rays_of_the_arrays(paired: Dataset, tmp_path: Path) ->
     assert [len(r[3].split("-")) == 2 for r in found] == rays_of(folder, row)[:, 6].astype(bool).tolist()
 
 
+def test_scans_without_a_grid_are_left_out(
+    poses: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    services = poses.settings["scenario"]["services"]
+    monkeypatch.setitem(services, "lidar", {"use": "lidar", "settings": {}})
+    folder = exported(poses, "compat", tmp_path / "out")
+    assert not (folder / "lidar_data_s008").exists()
+    assert {row["Val"] for row in rows_of(folder)} == {"V"}
+
+
 def test_a_dataset_that_the_baseline_cannot_hold_is_refused(poses: Dataset, tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"scenes of an episode.* 50, .* 1"):
         exported(poses, "baseline", tmp_path / "out")
@@ -304,6 +315,8 @@ def test_the_full_flavour_comes_back_as_it_went(paired: Dataset, tmp_path: Path)
     assert (theirs["tx_beam"] == ours["tx_beam"]).all()
     assert (theirs["rx_beam"] == ours["rx_beam"]).all()
     again = exported(back, "full", tmp_path / "again")
+    heights = [row["z"] for row in rows_of(folder) if row["Val"] == "V"]
+    assert [row["z"] for row in rows_of(again)] == heights, "receivers that stand have their own below them"
     for row in rows_of(folder):
         if row["Val"] == "V":
             np.testing.assert_allclose(rays_of(again, row), rays_of(folder, row), rtol=1e-4, atol=1e-2)
@@ -325,6 +338,11 @@ def _in_rays(folder: Path, change: Callable[[Any], Any]) -> None:
         rays = change(data["allEpisodeData"][()])
         del data["allEpisodeData"]
         data["allEpisodeData"] = rays
+
+
+def _in_words(folder: Path) -> None:
+    with h5py.File(_first(folder).with_name(f"{_first(folder).stem}_interactions.hdf5"), "r+") as data:
+        data["allInteractionsDescriptions"][0, 1, 0, 0] = (ord("X"), -1)
 
 
 def _with(place: tuple[int, ...], value: float) -> Callable[[Any], Any]:
@@ -367,6 +385,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "delay": (lambda f: _in_rays(f, _with((0, 0, 0, 1), -1e-9)), r"\[0, 0\].*delay"),
     "zenith": (lambda f: _in_rays(f, _with((0, 1, 0, 2), 181.0)), r"\[0, 1\].*zenith"),
     "infinite": (lambda f: _in_rays(f, _with((0, 1, 0, 0), np.inf)), r"\[0, 1\]"),
+    "padding": (lambda f: _in_rays(f, _with((0, 1, 0, 0), np.nan)), r"\[0, 1\]"),
+    "word": (lambda f: _in_words(f), r"e0_interactions.hdf5, allInteractionsDescriptions\[0, 1, 0, 0\].*88"),
     "interactions": (
         lambda f: _first(f).with_name(f"{_first(f).stem}_interactions.hdf5").write_bytes(b"HDF"),
         "e0_interactions.hdf5",
