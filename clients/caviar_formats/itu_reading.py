@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -55,7 +54,7 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
         if found := re.fullmatch(r".*_e(\d+)\.hdf5", file.name):
             rays[int(found[1])] = file
     rows = _rows(table)
-    if missing := sorted({episode for episode, _, _ in rows} - set(rays)):
+    if missing := sorted(set(rows) - set(rays)):
         raise damaged(
             table.parent, "", f"has no file of rays *_e{missing[0]}.hdf5, an episode of {table.name}"
         )
@@ -65,7 +64,7 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
             table.parent, "", "files of rays have no carrier, as 60GHz, in their names; give --frequency-hz"
         )
     hertz = frequency_hz or float(ghz[1]) * 1e9  # type: ignore[index]  # one of both is there
-    scenes = max(scene for _, scene, _ in rows) + 1
+    scenes = max(scene for mine in rows.values() for _, scene, _ in mine) + 1
     position, phases = _transmitter(rows, rays)
     return Source(
         path=path,
@@ -79,8 +78,8 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
     )
 
 
-def _rows(table: Path) -> dict[Key, dict[str, str]]:
-    """Valid rows of the CSV by episode, scene and receiver."""
+def _rows(table: Path) -> dict[int, dict[Key, dict[str, str]]]:
+    """Valid rows of the CSV by episode, then by episode, scene and receiver; an episode may have none."""
     found: dict[Key, dict[str, str]] = {}
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
@@ -107,8 +106,11 @@ def _rows(table: Path) -> dict[Key, dict[str, str]]:
                 found[key] = row
     except (UnicodeDecodeError, csv.Error) as error:
         raise damaged(table, "", f"is no CSV in UTF-8: {error}") from error
-    valid = {key: row for key, row in found.items() if row["Val"] == "V"}
-    if not valid:
+    valid: dict[int, dict[Key, dict[str, str]]] = {key[0]: {} for key in found}
+    for key, row in found.items():
+        if row["Val"] == "V":
+            valid[key[0]][key] = row
+    if not any(valid.values()):
         raise damaged(table, "", "has no valid row")
     return valid
 
@@ -175,21 +177,16 @@ def _interactions(file: Path) -> list[Any]:
     return [found, points]
 
 
-def _by_episode(rows: Mapping[Key, dict[str, str]]) -> dict[int, dict[Key, dict[str, str]]]:
-    found: dict[int, dict[Key, dict[str, str]]] = defaultdict(dict)
-    for key, row in rows.items():
-        found[key[0]][key] = row
-    return found
-
-
 def _receiver(row: Mapping[str, str]) -> Float64Array:
     return np.array([float(row["x"]), float(row["y"]), float(row["z"]) + ABOVE_M])
 
 
-def _transmitter(rows: Mapping[Key, dict[str, str]], rays: Mapping[int, Path]) -> tuple[Float64Array, bool]:
+def _transmitter(
+    rows: Mapping[int, dict[Key, dict[str, str]]], rays: Mapping[int, Path]
+) -> tuple[Float64Array, bool]:
     """Position of the transmitter: the median of where straight rays begin; and whether rays have phases."""
     begins, phases = [], False
-    for episode, mine in _by_episode(rows).items():
+    for episode, mine in rows.items():
         for key, found in _rays(rays[episode], mine).items():
             phases |= bool(np.isfinite(found[:, 7]).all())
             for ray in found[found[:, 6] == 1]:
@@ -207,7 +204,7 @@ def _transmitter(rows: Mapping[Key, dict[str, str]], rays: Mapping[int, Path]) -
 
 def _scenes(
     table: Path,
-    rows: Mapping[Key, dict[str, str]],
+    rows: Mapping[int, dict[Key, dict[str, str]]],
     rays: Mapping[int, Path],
     scenes: int,
     place: Float64Array,
@@ -220,7 +217,7 @@ def _scenes(
         orientation=quaternion_from_euler(np.radians(TX_YAW_DEG)),
         array=ARRAYS["tx"],
     )
-    for episode, mine in _by_episode(rows).items():
+    for episode, mine in rows.items():
         found = _rays(rays[episode], mine)
         met = _interactions(rays[episode])
         for scene in range(scenes):

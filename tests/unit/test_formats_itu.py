@@ -322,6 +322,15 @@ def test_the_full_flavour_comes_back_as_it_went(paired: Dataset, tmp_path: Path)
             np.testing.assert_allclose(rays_of(again, row), rays_of(folder, row), rtol=1e-4, atol=1e-2)
 
 
+def test_an_episode_without_valid_receivers_keeps_its_number(whole: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(whole, tmp_path / "in")
+    table = folder / "CoordVehiclesRxPerScene_s008.csv"
+    table.write_text(table.read_text().replace("V,1,", "I,1,"))
+    back = Dataset(import_dataset(find_format("itu").read(folder), tmp_path / "back"))
+    assert back.episodes == (0, 1, 2, 3)
+    assert np.unique(back.users()["episode"]).tolist() == [0, 2, 3]
+
+
 def _first(folder: Path) -> Path:
     return folder / "ray_tracing_data_s008_carrier60GHz/rosslyn_mobile_60GHz_ts0.1s_V_Lidar_e0.hdf5"
 
