@@ -196,6 +196,10 @@ class Statistics:
         except OSError:
             path.unlink(missing_ok=True)
 
+    def granted(self, service: str) -> int:
+        """Number of a service's grants that were answered, or overdue."""
+        return len(self._latencies[service])
+
     def answers(self, service: str, first: int = 0) -> Int64Array:
         """Grants of a service in the order of their answers, from the ``first``-th on.
 
