@@ -20,7 +20,7 @@ import zmq
 
 from caviar_broker.control.socket import ControlSocket
 from caviar_broker.core import events as ev
-from caviar_broker.server import BrokerServer, Observer
+from caviar_broker.server import BrokerServer, Listener
 from caviar_broker.statistics import Statistics
 from caviar_protocol.errors import AssetError
 from caviar_protocol.policies import PolicyFolder
@@ -47,21 +47,21 @@ Answer = dict[str, Any]
 class ControlServer:
     """Answers questions about one broker.
 
-    It is the server's observer, in front of the one that it is given, so it knows the last blame.
+    It is the server's listener, in front of the one that it is given, so it knows the last blame.
 
     Args:
         directory: Directory of the run; the socket is made there.
-        observer: Gets everything too.
+        listener: Gets everything too.
 
     Raises:
         RunError: Another broker serves that directory, or no socket can be made.
     """
 
-    def __init__(self, directory: Path, observer: Observer) -> None:
+    def __init__(self, directory: Path, listener: Listener) -> None:
         # Before the broker itself exists: a second broker is refused before it touches anything of the run.
         self._place = ControlSocket(directory)
         self._given = PolicyFolder(directory)
-        self._observer = observer
+        self._listener = listener
         self._server: BrokerServer | None = None
         self._callers: dict[int, _Caller] = {}
         self._last_blame: Answer | None = None
@@ -119,11 +119,11 @@ class ControlServer:
             # The wall clock, which a user compares with logs; everything else here is monotonic.
             self._last_blame = {**fields, "at": time.time()}
         self._tell({"event": "notice", **fields})
-        self._observer.notice(notice)
+        self._listener.notice(notice)
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
         """Pass a frame on; subscribers get one in 50 ms at most, which is as often as a person reads."""
-        self._observer.frame(frame, statistics)
+        self._listener.frame(frame, statistics)
         # The frame path: without a client it costs this one look.
         if not self._callers:
             return
