@@ -179,7 +179,7 @@ class BrokerServer:
             m.AssetData: self._assets.handle_data,
         }
         self._performers: dict[type, Callable[[Any], None]] = {
-            ev.Latency: lambda a: self.statistics.latency(a.service, a.elapsed_ns, a.missed),
+            ev.Latency: self._latency,
             ev.Overdue: lambda a: self.statistics.decision(time.monotonic_ns() - a.due_ns),
             ev.Notice: self._observer.notice,
             ev.FrameFinished: self._frame_finished,
@@ -194,6 +194,12 @@ class BrokerServer:
         """Give the clock an event from outside, and do what it wants."""
         self.clock.receive(event, time.monotonic_ns())
         self._perform()
+
+    def _latency(self, action: ev.Latency) -> None:
+        now = time.monotonic_ns()
+        self.statistics.latency(
+            action.service, action.elapsed_ns, action.missed, action.episode, action.frame, now
+        )
 
     def run(self, begin: Callable[[], object] = lambda: None) -> ev.Finished:
         """Serve until the run is over, in threads that call ``begin`` first."""

@@ -119,7 +119,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
     """
     from caviar_broker.http.app import make_app
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
-    from caviar_broker.http.server import http_server, listening_socket
+    from caviar_broker.http.server import http_server, listening_socket, place_of
 
     # Everything is asked over the control socket, which only the broker's user can reach.
     ask = functools.partial(ask_in_thread, run)
@@ -151,7 +151,7 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
 
     # Before the address is announced: a broker that ends in between must not leave this process behind.
     call_at_end(connect(run), end)
-    await ask(do="serving", http=f"http://{_place(host, listening)}")
+    await ask(do="serving", http=f"http://{place_of(host, listening)}")
     try:
         await server.serve(sockets=[listening])
     finally:
@@ -178,12 +178,6 @@ def _reachable(endpoint: str) -> str:
     return endpoint.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
 
 
-def _place(host: str, listening: socket.socket) -> str:
-    """``HOST:PORT`` of a listening socket, as it stands in a URL."""
-    shown = f"[{host}]" if ":" in host else host
-    return f"{shown}:{listening.getsockname()[1]}"
-
-
 @contextlib.contextmanager
 def gateway_in_front(endpoint: str, address: str, notify: Callable[[str], None]) -> Iterator[str]:
     """Serve WebSockets for a ROUTER that is no broker's, such as that of the conformance kit, without tokens.
@@ -203,7 +197,7 @@ def gateway_in_front(endpoint: str, address: str, notify: Callable[[str], None])
     from uvicorn import Server
 
     from caviar_broker.http.gateway import Gateway
-    from caviar_broker.http.server import http_server, listening_socket
+    from caviar_broker.http.server import http_server, listening_socket, place_of
 
     host, port = http_address(address, None)
     listening = listening_socket(host, port)
@@ -223,7 +217,7 @@ def gateway_in_front(endpoint: str, address: str, notify: Callable[[str], None])
     thread = threading.Thread(target=asyncio.run, args=(serve(),), name="gateway", daemon=True)
     thread.start()
     try:
-        yield f"ws://{_place(host, listening)}/ws"
+        yield f"ws://{place_of(host, listening)}/ws"
     finally:
         for server in servers:
             server.should_exit = True
