@@ -101,6 +101,7 @@ export class App {
       this.runs.map(({ view }) => view.load((text) => this.report(text)).catch((error: Error) => this.report(error.message))),
     );
     this.stage.setViews(this.runs.map(({ view }) => view));
+    this.stage.setCovered(this.layers.element.offsetWidth + 10);
     for (const line of this.about.damage) this.report(line);
     await this.show(this.n);
     if (state.cam) this.stage.setPlace(state.cam);

@@ -57,6 +57,12 @@ export function isSaved(): boolean {
   return saved !== null;
 }
 
+/** Place of an answer in a saved page: lobes are those of all frames, and users have curves of their own. */
+function savedKey(path: string, query: Query): string {
+  if (path.endsWith("/lobes")) return `lobes/${query.device}/${query.beam}`;
+  return path === "curves" ? `curves/${query.user ?? 0}` : path;
+}
+
 export class Source {
   /**
    * @param base relative to the page: `data/`, or `beside/data/` of a second run
@@ -70,7 +76,7 @@ export class Source {
   /** Content of `path` as bytes. */
   async bytes(path: string, query: Query = {}, signal?: AbortSignal): Promise<ArrayBuffer> {
     if (isSaved()) {
-      const text = saved?.[this.base.replace(/data\/$/, "") + path];
+      const text = saved?.[this.base.replace(/data\/$/, "") + savedKey(path, query)];
       if (text === undefined) throw new RequestError(path, 404, "not in this saved page");
       return await unpacked(text);
     }

@@ -11,6 +11,7 @@ import {
   LineSegments,
   Mesh,
   MeshLambertMaterial,
+  type PerspectiveCamera,
   SphereGeometry,
   Vector3,
 } from "three";
@@ -33,6 +34,9 @@ interface Shown {
   pose: Pose;
   size: Vector;
 }
+
+/** Size that flying objects have at least in the picture. */
+const LEAST_PIXELS = 30;
 
 /** Position further apart than this is another one [m]. */
 export const SAME_PLACE_M = 1e-6;
@@ -127,6 +131,23 @@ export class Objects {
     return new Vector3(x - this.origin[0], y - this.origin[1], z - this.origin[2]);
   }
 
+  /**
+   * Draw what flies at least so large that it is seen: a UAV of half a metre is no pixel of a city.
+   *
+   * @param height of the picture [px]
+   */
+  enlarge(camera: PerspectiveCamera, height: number): void {
+    for (const { mesh, asset, size, pose } of this.shown.values()) {
+      if (!asset.includes("uav")) continue;
+      const perPixel = (2 * Math.tan((camera.fov * Math.PI) / 360) * camera.position.distanceTo(mesh.position)) / height;
+      const factor = Math.max(1, (LEAST_PIXELS * perPixel) / Math.max(...size));
+      mesh.scale.set(size[0] * factor, size[1] * factor, size[2] * factor);
+      mesh.position.copy(this.local(pose.position));
+    }
+    const selected = this.selected ? this.shown.get(this.selected)?.mesh : undefined;
+    if (selected) this.outline.scale.copy(selected.scale);
+  }
+
   /** Draw where objects were: positions in the world of each, oldest first. */
   setTrails(trails: Map<string, Vector[]>): void {
     const places: number[] = [];
@@ -183,7 +204,11 @@ export class Objects {
   }
 
   private paint(): void {
-    for (const [name, { mesh }] of this.shown) mesh.material.color.set(this.color(name));
+    for (const [name, { mesh }] of this.shown) {
+      mesh.material.color.set(this.color(name));
+      // They stand out in shadows, too.
+      mesh.material.emissive.set(this.color(name)).multiplyScalar(0.15);
+    }
     const mesh = this.selected ? this.shown.get(this.selected)?.mesh : undefined;
     this.outline.visible = mesh !== undefined;
     if (!mesh) return;

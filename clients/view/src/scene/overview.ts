@@ -1,5 +1,5 @@
 // The first camera: it looks at what moves and transmits, from where buildings hide the least of it.
-import { Vector3 } from "three";
+import { Box3, Vector3 } from "three";
 import type { Vector } from "../types";
 import type { RunView } from "./view";
 
@@ -20,17 +20,18 @@ export function overview(view: RunView, origin: Vector, aspect: number): { posit
   ];
   if (!places.length) places = [local(low), local(high), local([low[0], high[1], low[2]]), local([high[0], low[1], low[2]])];
   const centre = mean(places);
-  // What strays far off, as on another road, does not make the rest small.
+  // Of many, what strays far off, as on another road, does not make the rest small.
   const distances = places.map((place) => place.distanceTo(centre)).sort((a, b) => a - b);
-  const radius = Math.max(30, 1.1 * distances[Math.floor(0.85 * (distances.length - 1))]);
+  const counted = places.length > 8 ? Math.floor(0.85 * (places.length - 1)) : places.length - 1;
+  const radius = Math.max(30, 1.02 * distances[counted]);
   const near = places.filter((place) => place.distanceTo(centre) <= radius);
-  const target = mean(near);
-  const distance = (radius / Math.tan((25 * Math.PI) / 180)) * Math.max(0.95, 1.5 / aspect);
+  const target = middle(near);
   const heights = new Heights(view, origin);
   let best = { score: -Infinity, position: new Vector3() };
   for (const elevation of [22, 30, 40, 52, 65]) {
     for (let azimuth = -90; azimuth < 270; azimuth += 10) {
-      const position = along(azimuth, elevation).multiplyScalar(distance).add(target);
+      const away = along(azimuth, elevation);
+      const position = away.clone().multiplyScalar(distanceFor(near, target, away, aspect)).add(target);
       if (heights.hides(position, position.clone().setZ(position.z + 1))) continue;
       const seen = near.filter((place) => !heights.hides(position, place)).length;
       // A low camera shows heights, and walls in the south-east are lit.
@@ -42,8 +43,27 @@ export function overview(view: RunView, origin: Vector, aspect: number): { posit
   return { position: world(best.position), target: world(target) };
 }
 
+/** Distance from the target at which all places are in the picture [m], but 25 m at least. */
+function distanceFor(places: Vector3[], target: Vector3, away: Vector3, aspect: number): number {
+  const tall = 0.72 * Math.tan((25 * Math.PI) / 180);
+  const right = new Vector3(-away.y, away.x, 0).normalize();
+  const up = away.clone().cross(right);
+  const needed = places.map((place) => {
+    const from = place.clone().sub(target);
+    const [x, y] = [Math.abs(from.dot(right)), Math.abs(from.dot(up))];
+    return Math.max(x / (tall * aspect * 0.85), y / tall) + from.dot(away);
+  });
+  return Math.max(25, ...needed);
+}
+
 function mean(places: Vector3[]): Vector3 {
   return places.reduce((sum, place) => sum.add(place), new Vector3()).divideScalar(Math.max(1, places.length));
+}
+
+/** Middle of the box around places. */
+function middle(places: Vector3[]): Vector3 {
+  const box = new Box3().setFromPoints(places);
+  return box.getCenter(new Vector3());
 }
 
 /** Unit vector of an azimuth from east and an elevation [°]. */

@@ -142,6 +142,13 @@ export class Stage {
     const { clientWidth: width, clientHeight: height } = this.element;
     if (!width || !height || !this.state) return;
     const each = width / Math.max(1, this.views.length);
+    // Depth buffers resolve little far from a camera whose nearest place is very near.
+    const near = Math.max(0.15, Math.min(5, 0.004 * this.camera.position.distanceTo(this.controls.target)));
+    if (near !== this.camera.near) {
+      this.camera.near = near;
+      this.camera.updateProjectionMatrix();
+    }
+    for (const { objects } of this.views) objects.enlarge(this.camera, height);
     this.renderer.setScissorTest(this.views.length > 1);
     let used = 0;
     this.views.forEach((view, i) => {
@@ -154,11 +161,20 @@ export class Stage {
     this.drawn++;
   }
 
+  /** Middle of the picture: right of panels that cover so much of its left [px]. */
+  setCovered(left: number): void {
+    this.covered = left;
+    this.resize();
+  }
+  private covered = 0;
+
   private resize(): void {
     const { clientWidth: width, clientHeight: height } = this.element;
     if (!width || !height) return;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / Math.max(1, this.views.length) / height;
+    if (this.views.length === 1) this.camera.setViewOffset(width, height, -this.covered / 2, 0, width, height);
+    else this.camera.clearViewOffset();
     this.camera.updateProjectionMatrix();
     this.draw();
   }

@@ -34,8 +34,8 @@ export const LIGHT: Theme = {
   sky: "#dfeafb",
   bounce: "#a89f90",
   sun: "#fff3dd",
-  ambient: 1.75,
-  sunlight: 2.0,
+  ambient: 2.0,
+  sunlight: 2.45,
 };
 
 export const DARK: Theme = {

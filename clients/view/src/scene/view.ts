@@ -146,20 +146,20 @@ export class RunView {
   }
   private readonly projected = this.sun.position.clone();
 
-  /** A sun in the south-east whose shadows reach over the bounds. */
+  /** A sun in the east-south-east whose shadows reach over the bounds. */
   private placeSun(origin: Vector): void {
     const { low, high } = this.about.bounds;
     const centre = low.map((value, i) => (value + high[i]) / 2 - origin[i]) as Vector;
     const radius = Math.min(0.5 * Math.hypot(...low.map((value, i) => high[i] - value)) + 5, 900);
     this.sun.target.position.set(...centre);
-    this.sun.position.set(centre[0] + 0.55 * radius, centre[1] - 0.95 * radius, centre[2] + 1.5 * radius);
+    this.sun.position.set(centre[0] + 0.95 * radius, centre[1] - 0.6 * radius, centre[2] + 1.6 * radius);
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(4096, 4096);
     Object.assign(this.sun.shadow.camera, { left: -radius, right: radius, top: radius, bottom: -radius });
     Object.assign(this.sun.shadow.camera, { near: 0.1 * radius, far: 4 * radius });
     this.sun.shadow.autoUpdate = false;
     this.sun.shadow.normalBias = radius / 1500;
-    this.sun.shadow.bias = -0.0004;
+    this.sun.shadow.bias = -0.0012;
     this.sun.shadow.radius = 2.5;
   }
 }

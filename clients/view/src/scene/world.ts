@@ -74,6 +74,9 @@ export class World {
       low[2] - origin[2] - 0.05,
     );
     this.ground.receiveShadow = true;
+    // Below all else, whatever the precision of the depth buffer is at a distance.
+    this.ground.material.depthWrite = false;
+    this.ground.renderOrder = -5;
     this.group.add(this.sky, this.ground, this.edges);
   }
 
