@@ -80,17 +80,20 @@ class Statistics:
         self._slips = self._worst_slip = self._lag = 0
         self._lag_of_episode = (0, 0)
 
-    def latency(self, service: str, elapsed_ns: int, missed: bool, *answer: int) -> None:
+    def latency(
+        self, service: str, elapsed_ns: int, missed: bool, episode: int = 0, frame: int = 0, now: int = 0
+    ) -> None:
         """A grant was answered, or its deadline passed.
 
         Args:
             service: Which was granted.
             elapsed_ns: From GRANT to answer or deadline [ns].
             missed: Whether its budget was up.
-            answer: Episode and frame of the grant, and when it was answered [ns].
+            episode, frame: Of the grant.
+            now: The time [ns].
         """
         self._latencies[service].append(elapsed_ns)
-        self._answers[service].extend(answer)
+        self._answers[service].extend((episode, frame, now))
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
 
