@@ -117,9 +117,13 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         address: ``HOST:PORT`` to serve at.
         keys: Keys directory; None: that of the broker, if any.
     """
-    from caviar_broker.http.app import make_app
+    from fastapi import Depends
+
+    from caviar_broker.http.app import make_app, may
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.http.server import http_server, listening_socket, place_of
+    from caviar_broker.http.view import LiveView, view_router
+    from caviar_protocol.keys import VIEWER
 
     # Everything is asked over the control socket, which only the broker's user can reach.
     ask = functools.partial(ask_in_thread, run)
@@ -144,7 +148,10 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         notices.add(task)
         task.add_done_callback(notices.discard)
 
-    server = http_server(make_app(ask, run, tokens, gateway), notify_soon, own_process=True)
+    app = make_app(ask, run, tokens, gateway)
+    live = LiveView(ask, run, _reachable(status["endpoint"]), credentials)
+    app.include_router(view_router({"": live.answers}, [Depends(may(VIEWER, tokens))], live))
+    server = http_server(app, notify_soon, own_process=True)
 
     def end() -> None:
         server.should_exit = True

@@ -62,11 +62,11 @@ def view(
         thin = "" if every == 1 else f", every {every} frames one"
         print_line(console, f"{save}: {len(content) / 1e6:.1f} MB{thin}; it opens without a server")
         return
-    from caviar_broker.http.view import serve_views
+    from caviar_broker.http.view import serve_views, standing
 
-    views = {"": Answers(_frames(source, episode), beside=beside is not None)}
+    views = {"": standing(Answers(_frames(source, episode), beside=beside is not None))}
     if beside is not None:
-        views["beside/"] = Answers(_frames(beside, episode))
+        views["beside/"] = standing(Answers(_frames(beside, episode)))
 
     def announce(url: str) -> None:
         print_line(console, f"{url} shows {source}; Ctrl-C ends it")

@@ -35,7 +35,7 @@ CHUNK = 700
 EPOCH, ATTEMPT = 3, 2
 """Neither is 1, so that a client that sends constants instead of WELCOME's values is found."""
 SEED = 11
-VERSION = (1, 6)
+VERSION = (1, 7)
 """Version of the protocol that the kit plays."""
 CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "parts")
 """Capabilities of a broker of that version."""
