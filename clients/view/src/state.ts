@@ -26,6 +26,8 @@ export const MODES = { free: "Free", follow: "Follow", board: "On board" } as co
 export type Mode = keyof typeof MODES;
 export const DOCKS = { none: "None", clock: "Clock", curves: "Curves" } as const;
 export type Dock = keyof typeof DOCKS;
+export const PICTURES = ["camera", "depth", "segmentation"] as const;
+export type PictureTopic = (typeof PICTURES)[number];
 export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10] as const;
 
 export interface ViewState {
@@ -44,6 +46,8 @@ export interface ViewState {
   /** Rays of all pairs, or of the user alone. */
   rays: "all" | "user";
   layers: ReadonlySet<Layer>;
+  /** Topic of the pictures in the corner; null: the first that there is. */
+  pics: PictureTopic | null;
   dock: Dock;
   speed: number;
   loop: boolean;
@@ -60,6 +64,7 @@ export const INITIAL: Readonly<ViewState> = {
   min: null,
   rays: "all",
   layers: new Set(DEFAULT_LAYERS),
+  pics: null,
   dock: "none",
   speed: 1,
   loop: false,
@@ -85,6 +90,7 @@ export function toFragment(state: ViewState): string {
   put("rays", state.rays, INITIAL.rays);
   const layers = ALL.filter((layer) => state.layers.has(layer)).join(",");
   put("layers", layers, DEFAULT_LAYERS.join(","));
+  put("pics", state.pics, INITIAL.pics);
   put("dock", state.dock, INITIAL.dock);
   put("speed", state.speed, INITIAL.speed);
   put("loop", state.loop ? 1 : 0, 0);
@@ -128,6 +134,7 @@ export function fromFragment(fragment: string): ViewState {
     min: number("min"),
     rays: one("rays", ["all", "user"], INITIAL.rays),
     layers: layers ? new Set(ALL.filter((layer) => layers.includes(layer))) : INITIAL.layers,
+    pics: PICTURES.find((topic) => topic === given.get("pics")) ?? null,
     dock: one("dock", Object.keys(DOCKS) as Dock[], INITIAL.dock),
     speed: SPEEDS.find((value) => value === speed) ?? INITIAL.speed,
     loop: given.get("loop") === "1",

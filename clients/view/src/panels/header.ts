@@ -8,20 +8,23 @@ const KINDS = { recording: "Recording", run: "Live run", scenario: "Scenario, no
 export class Header {
   readonly element: HTMLElement;
 
-  constructor(store: Store, abouts: About[], goHome: () => void) {
+  constructor(store: Store, abouts: About[], saved: boolean, goHome: () => void, help: () => void) {
     const [about] = abouts;
-    const names = abouts.map(({ name, run }) => run || name).join(" | ");
-    document.title = `${about.name || about.run} – CAVIAR`;
-    const badge = KINDS[about.kind] + (about.complete || about.kind !== "recording" ? "" : ", breaks off");
+    const title = about.name || about.run;
+    document.title = `${title} – CAVIAR`;
+    const breaks = about.kind === "recording" && !about.complete ? ", breaks off" : "";
+    const every = about.every > 1 ? `, every ${about.every} frames one` : "";
+    const names = abouts.map(({ run }) => run).filter(Boolean);
     this.element = el(
       "header",
       { class: "bar" },
-      el("h1", {}, about.name || about.run),
-      el("span", { class: "badge" }, badge),
-      el("span", { class: "run" }, names === about.name ? "" : names),
+      el("h1", {}, title),
+      el("span", { class: "badge" }, `${saved ? "Saved recording" : KINDS[about.kind]}${breaks}${every}`),
+      el("span", { class: "run" }, names.length > 1 ? `left ${names[0]}, right ${names[1]}` : (names[0] ?? "")),
       el("span", { class: "grow" }),
       button("home", "Show all (H)", goHome),
       button("theme", "Light or dark (D)", () => toggleTheme(store)),
+      button(null, "Help (?)", help, "?"),
     );
   }
 }

@@ -14,7 +14,9 @@ export interface LayersInput {
   of: number;
   points: [number, number] | null;
   gridSize: number;
-  hasDifferences: boolean;
+  names: { objects: string[]; devices: string[] };
+  /** What differs between two runs. */
+  different: { objects: ReadonlySet<string>; receivers: ReadonlySet<string> } | null;
   absent: { topic: string; source: string; reason: string }[];
 }
 
@@ -23,6 +25,7 @@ export const userKey = ({ tx, rx, carrier }: User): string => `${tx}|${rx}|${car
 export class LayersPanel {
   readonly element: HTMLElement;
   private readonly users = el("select", { "aria-label": "User whose beams are shown", id: "user" });
+  private readonly selection = el("select", { "aria-label": "Selected object or device", id: "selection" });
   private readonly shown = new Map<string, HTMLInputElement>();
   private readonly coloring: HTMLSelectElement;
   private readonly mode: HTMLSelectElement;
@@ -43,6 +46,7 @@ export class LayersPanel {
     this.users.addEventListener("change", () => store.set({ user: this.users.value }));
     this.coloring = choice("Colour of rays", COLORINGS, state.color, (color: Coloring) => store.set({ color }));
     this.mode = choice("Camera", MODES, state.mode, (mode: Mode) => store.set({ mode }));
+    this.selection.addEventListener("change", () => store.set({ sel: this.selection.value || null }));
     this.only.addEventListener("change", () => store.set({ rays: this.only.checked ? "user" : "all" }));
     this.slider.addEventListener("input", () => {
       const value = Number(this.slider.value);
@@ -59,6 +63,7 @@ export class LayersPanel {
       "aside",
       { class: "card left", "aria-label": "View" },
       el("div", { class: "field" }, el("span", {}, "Camera"), this.mode),
+      el("div", { class: "field" }, el("label", { for: "selection" }, "Select"), this.selection),
       parts.link && el("div", { class: "field" }, el("label", { for: "user" }, "User"), this.users),
       parts.channel && el("div", { class: "field" }, el("span", {}, "Rays by"), this.coloring),
       parts.channel && el("label", { class: "check" }, this.only, "only those of the user"),
@@ -77,6 +82,7 @@ export class LayersPanel {
     this.mode.value = state.mode;
     this.only.checked = state.rays === "user";
     this.listUsers(input);
+    this.listNames(state.sel, input);
     const [low, high] = input.range;
     this.slider.min = String(low);
     this.slider.max = String(high);
@@ -86,7 +92,9 @@ export class LayersPanel {
     fill(this.legend, ...this.legendOf(state.color, input.range));
     const kept = input.of > input.paths ? `, the strongest of ${input.of}` : "";
     const points = input.points ? ` · ${input.points[0]} of ${input.points[1]} points` : "";
-    this.counts.textContent = this.about.topics.channel ? `${input.drawn} of ${input.paths} paths${kept}${points}` : "";
+    const paths = this.about.topics.channel ? `${input.drawn} of ${input.paths} paths${kept}${points} · ` : "";
+    const differ = input.different ? ` · ${input.different.objects.size} objects and the beams of ${input.different.receivers.size} receivers differ` : "";
+    this.counts.textContent = `${paths}grid ${input.gridSize} m${differ}`;
     fill(
       this.absent,
       ...input.absent.map(({ topic, source, reason }) =>
@@ -109,6 +117,19 @@ export class LayersPanel {
     }
     if (user) this.users.value = userKey(user);
   }
+
+  private listNames(selected: string | null, { names }: LayersInput): void {
+    const key = `${names.objects.join("\n")}\n\n${names.devices.join("\n")}`;
+    if (key !== this.named) {
+      this.named = key;
+      const group = (label: string, list: string[]) =>
+        el("optgroup", { label }, ...list.map((name) => el("option", { value: name }, name)));
+      fill(this.selection, el("option", { value: "" }, "nothing"), group("Objects", names.objects), group("Devices", names.devices));
+    }
+    // A path or a building is selected, and none of the list.
+    this.selection.value = selected !== null && (names.objects.includes(selected) || names.devices.includes(selected)) ? selected : "";
+  }
+  private named = "";
 
   private legendOf(coloring: Coloring, [low, high]: [number, number]): HTMLElement[] {
     if (!this.about.topics.channel) return [];

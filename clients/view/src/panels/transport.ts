@@ -24,6 +24,7 @@ export class Transport {
     store: Store,
     private readonly timeline: Timeline,
     isLive: boolean,
+    tabs: HTMLElement[],
     actions: TransportActions,
   ) {
     this.play = button("play", "Play (space)", actions.togglePlay);
@@ -37,7 +38,7 @@ export class Transport {
     fill(this.speed, ...SPEEDS.map((value) => el("option", { value }, `${value}×`)));
     this.element = el(
       "footer",
-      { class: "transport", role: "group", "aria-label": "Time" },
+      { class: "transport", "aria-label": "Time" },
       button("first", "First frame (Home)", () => actions.go(timeline.first)),
       button("back", "One frame back (←)", () => actions.step(-1)),
       this.play,
@@ -48,6 +49,7 @@ export class Transport {
       this.speed,
       this.loop,
       this.live,
+      ...tabs,
     );
   }
 

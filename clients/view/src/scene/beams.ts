@@ -1,16 +1,16 @@
-// Beams as lobes: the amplitude of the array factor in each direction is the distance from the array.
+// Beams as lobes: the distance from the array is the power gain in that direction, |array factor|².
 import { BufferAttribute, BufferGeometry, DoubleSide, Group, Mesh, MeshLambertMaterial } from "three";
 import { BEST, CHOSEN } from "../colors";
 import type { Lobe, Vector } from "../types";
 import type { Pose } from "./pose";
 
-/** Below this amplitude nothing is drawn: a hedge of side lobes would hide the array. */
-const LEAST = 0.04;
+/** Below this gain, 18 dB under the strongest direction, nothing is drawn. */
+const LEAST = 0.016;
 
 export interface ShownBeam {
   lobe: Lobe;
   pose: Pose;
-  /** Distance of the amplitude 1 [m]. */
+  /** Distance of the strongest direction [m]. */
   radius: number;
   best: boolean;
 }
@@ -35,7 +35,7 @@ export class Beams {
         emissive: color,
         emissiveIntensity: 0.35,
         transparent: true,
-        opacity: best ? 0.38 : 0.5,
+        opacity: best ? 0.34 : 0.42,
         side: DoubleSide,
         depthWrite: false,
       });
@@ -58,12 +58,12 @@ export function lobeMesh(lobe: Lobe, radius: number): { places: Float32Array; tr
   elevations.forEach((elevation, i) =>
     azimuths.forEach((azimuth, j) => {
       const at = i * wide + j;
-      const r = radius * gain[i][j];
+      const r = radius * gain[i][j] ** 2;
       places[3 * at] = r * Math.cos(elevation) * Math.cos(azimuth);
       places[3 * at + 1] = r * Math.cos(elevation) * Math.sin(azimuth);
       places[3 * at + 2] = r * Math.sin(elevation);
       if (i + 1 >= elevations.length || j + 1 >= wide) return;
-      if (Math.max(gain[i][j], gain[i + 1][j], gain[i][j + 1], gain[i + 1][j + 1]) < LEAST) return;
+      if (Math.max(gain[i][j], gain[i + 1][j], gain[i][j + 1], gain[i + 1][j + 1]) ** 2 < LEAST) return;
       triangles.push(at, at + 1, at + wide, at + 1, at + wide + 1, at + wide);
     }),
   );
