@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -140,16 +141,34 @@ yaw_deg = 25.0
 pitch_deg = 4.0
 beams = 8
 azimuth_steps = 180
+
+[services.camera]
+role = "sensors"
+use = "camera"
+budget_ms = 1000
+
+[[devices]]
+name = "camera"
+kind = "camera"
+position_m = [3.0, -40.0, 12.0]
+yaw_deg = 45.0
+pitch_deg = 15.0
+size_px = [32, 24]
 """
 
 
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset with a LIDAR."""
+    """A dataset with a LIDAR and a camera beside the road, of a world that knows its place on the Earth."""
     place = tmp_path_factory.mktemp("clouds")
-    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "scene"') + LIDAR
+    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "camera", "scene"') + LIDAR
     (place / "lidar.toml").write_text(text)
-    return generated(place / "data", place / "lidar.toml").directory.path
+    data = generated(place / "data", place / "lidar.toml")
+    (data.assets / "scenery").mkdir(parents=True)
+    (data.assets / "scenery" / "town.json").write_text(
+        '{"origin": {"latitude_deg": -33.4, "longitude_deg": -70.6}}'
+    )
+    return data.directory.path
 
 
 @pytest.fixture
@@ -172,7 +191,7 @@ class TestConformance(FormatConformance):
 
     @pytest.fixture
     def dataset(self, name: str, data: Dataset, request: pytest.FixtureRequest) -> Dataset:
-        return Dataset(request.getfixturevalue("clouds")) if name == "pcd" else data
+        return Dataset(request.getfixturevalue("clouds")) if name in ("pcd", "deepsense") else data
 
 
 def response(a: Any, tau: Any) -> Any:
@@ -464,6 +483,82 @@ def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path
     np.savez(file, **{name: change(table)})
     with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
         import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+
+
+# --- DeepSense ----------------------------------------------------------------------------------------------
+
+
+def circle(azimuths_deg: Any) -> Iterator[ImportedScene]:
+    """A receiver on a circle around an array that looks to the north-north-west, seen on a straight path."""
+    turn = np.radians(110.0)
+    tx = AntennaDevice(
+        name="bs", role="tx", position=(5.0, 3.0, 1.5), array=AntennaArray(rows=2, columns=32),
+        orientation=(np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)), power_dbm=10.0,
+    )  # fmt: skip
+    for number, azimuth in enumerate(azimuths_deg):
+        phi = turn + np.radians(azimuth)
+        place = (5.0 + 80 * np.cos(phi), 3.0 + 80 * np.sin(phi), 1.5)
+        rx = AntennaDevice(name="u", role="rx", position=place, array=AntennaArray(columns=2))
+        paths = Paths(
+            tx="bs", rx="u", los=True, a=np.array([[1e-4j]]), tau=np.array([80 / 299792458]),
+            aod=np.array([[np.pi / 2, phi]]), aoa=np.array([[np.pi / 2, phi + np.pi]]),
+            interactions=np.zeros((1, 1), np.uint8),
+        )  # fmt: skip
+        yield ImportedScene(episode=number // 2, scene=number % 2, devices=(tx, rx), paths=[paths])
+
+
+def test_beams_of_deepsense_turn_counter_clockwise(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj")
+    azimuths = np.arange(-44.0, 45.0, 4.0)[:-1]
+    data = Dataset(import_dataset(source_of(tmp_path / "files", circle(azimuths)), tmp_path / "data"))
+    form = find_format("deepsense")
+    with pytest.raises(RunError, match="--origin"):
+        export_users(data.users(), form, tmp_path / "out")
+    form.origin = (38.8907, -77.0787)
+    export_users(data.users(), form, tmp_path / "out")
+    with (tmp_path / "out" / "scenario00.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    found = {name: [row[name] for row in rows] for name in rows[0]}
+    assert list(found) == [
+        "index", "unit1_pwr_60ghz", "unit1_loc", "unit2_loc", "unit1_beam", "seq_index", "time_stamp[UTC]",
+    ]  # fmt: skip
+    assert found["index"] == [str(1 + at) for at in range(22)]
+    assert found["seq_index"] == [str(1 + at // 2) for at in range(22)]
+    assert found["time_stamp[UTC]"][1].startswith("['00-00-0")
+    arrays = {name: np.array([np.loadtxt(tmp_path / "out" / path) for path in found[name]])
+              for name in ("unit1_pwr_60ghz", "unit1_loc", "unit2_loc")}  # fmt: skip
+    beams = np.array(found["unit1_beam"], int)
+    assert (arrays["unit1_pwr_60ghz"].argmax(axis=1) == beams - 1).all()
+    assert np.abs((beams - 1) * 90 / 63 - 45 - azimuths).max() < 0.5 * 90 / 63 + 1e-6
+    # |a|² of 10 mW by a gain of 64; a path between two beams has less.
+    assert arrays["unit1_pwr_60ghz"].max() == pytest.approx(1e-8 * 10 * 64, rel=0.01)
+    # On the sphere that osculates WGS84 there, within 1 cm of 80 m.
+    sine2 = np.sin(np.radians(38.8907)) ** 2
+    prime = 6378137.0 / np.sqrt(1 - 6.69437999014e-3 * sine2)
+    meridian = prime * (1 - 6.69437999014e-3) / (1 - 6.69437999014e-3 * sine2)
+    north, east = np.radians(arrays["unit2_loc"] - arrays["unit1_loc"]).T
+    turn = np.radians(110.0 + azimuths)
+    assert np.allclose(north * meridian, 80 * np.sin(turn), atol=0.01)
+    assert np.allclose(east * prime * np.cos(np.radians(38.8907)), 80 * np.cos(turn), atol=0.01)
+
+
+def test_samples_of_deepsense_have_what_sensors_beside_the_road_saw(clouds: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    pytest.importorskip("pyproj")
+    data = Dataset(clouds)
+    out = exported(data, "deepsense", tmp_path)
+    with (out / "scenario00.csv").open() as file:
+        row = list(csv.DictReader(file))[4]
+    recording = data.episode(1)
+    assert np.array_equal(np.asarray(Image.open(out / row["unit1_rgb"])), recording["camera"].rgb[1, 0])
+    header, _, points = (out / row["unit1_lidar"]).read_bytes().partition(b"end_header\n")
+    hits = recording["lidar"].hits[1, 0]
+    assert f"element vertex {hits}\n".encode() in header
+    right = recording["lidar"].points[1, 0, :hits]
+    assert np.array_equal(np.frombuffer(points, "<f4").reshape(-1, 3), right)
+    latitude, longitude = np.loadtxt(out / row["unit1_loc"])
+    assert (latitude, longitude) == pytest.approx((-33.4 - 40 / 110.9e3, -70.6 + 3 / 93.1e3), abs=1e-6)
 
 
 # --- Wireless InSite ----------------------------------------------------------------------------------------
