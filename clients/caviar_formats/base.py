@@ -140,6 +140,7 @@ FORMATS: Mapping[str, str] = {
     "deepsense": "caviar_formats.deepsense:DeepSense",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
+    "minari": "caviar_formats.minari:Minari",
     "npz": "caviar_formats.npz:Npz",
     "ns3-qd": "caviar_formats.traces:Ns3Qd",
     "p2m": "caviar_formats.p2m:P2m",

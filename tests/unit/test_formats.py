@@ -20,6 +20,8 @@ from caviar_clients.datasets.impulse_responses import placed_antennas
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.verification.verify import verify
+from caviar_clients.envs.base import BeamSelectionEnv
+from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
@@ -56,7 +58,7 @@ SCENARIO = """
 name = "asymmetric"
 frames = 3
 sampling_period_ns = 100_000_000
-record = ["scene", "channel", "channel.h", "channel.hf", "link"]
+record = ["scene", "channel", "channel.h", "channel.hf", "action", "link"]
 
 [[carriers]]
 name = "mm"
@@ -559,6 +561,107 @@ def test_samples_of_deepsense_have_what_sensors_beside_the_road_saw(clouds: Path
     assert np.array_equal(np.frombuffer(points, "<f4").reshape(-1, 3), right)
     latitude, longitude = np.loadtxt(out / row["unit1_loc"])
     assert (latitude, longitude) == pytest.approx((-33.4 - 40 / 110.9e3, -70.6 + 3 / 93.1e3), abs=1e-6)
+
+
+# --- Minari -------------------------------------------------------------------------------------------------
+
+
+def equal(found: Any, right: Any) -> bool:
+    """Compare trees of arrays bit by bit."""
+    if isinstance(right, dict):
+        return set(found) == set(right) and all(equal(found[name], right[name]) for name in right)
+    return np.asarray(found[()]).dtype == right.dtype and np.asarray(found[()]).tobytes() == right.tobytes()
+
+
+def stacked(steps: list[Any]) -> Any:
+    """Steps as a tree of arrays."""
+    if isinstance(steps[0], dict):
+        return {name: stacked([step[name] for step in steps]) for name in steps[0]}
+    return np.array(steps)
+
+
+OBSERVED = ("aoa", "aod", "departure", "position", "velocity", "last_abs_y", "last_rate", "last_beam")
+
+
+def played(env: Any, episodes: int, **options: Any) -> list[dict[str, Any]]:
+    """Play episodes of random actions, and keep what an environment gives."""
+    found = []
+    env.action_space.seed(3)
+    for _ in range(episodes):
+        observation, _ = env.reset(**options)
+        steps = []
+        while not steps or not steps[-1][-1]:
+            action = env.action_space.sample()
+            before = observation
+            observation, reward, over, cut, _ = env.step(action)
+            steps.append((before, action, reward, over, cut))
+        columns = [*zip(*steps, strict=True)]
+        names = ("observations", "actions", "rewards", "terminations", "truncations")
+        found.append(dict(zip(names, (stacked([*column]) for column in columns), strict=True)))
+        found[-1]["observations"] = stacked([*columns[0], observation])
+    env.close()
+    return found
+
+
+def minari_file(run: Path, out: Path, flavour: str = "") -> Path:
+    """Export a run; the folder of the one dataset in it."""
+    with open_source(str(run)) as data:
+        (folder,) = (path for path in exported(data, "minari", out, flavour).iterdir() if path.is_dir())
+    return folder
+
+
+def test_minari_has_what_the_environment_gave(folder: Path, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    scenario = folder.parent / "asymmetric.toml"
+    env = BeamSelectionEnv(scenario, observe=OBSERVED, reward="normalised", directory=tmp_path / "run")
+    right = played(env, 2)
+    out = minari_file(tmp_path / "run", tmp_path, "normalised")
+    with h5py.File(out / "data" / "main_data.hdf5") as file:
+        assert list(file) == ["episode_0", "episode_1"]
+        for number, episode in enumerate(right):
+            group = file[f"episode_{number}"]
+            assert all(equal(group[name], values) for name, values in episode.items())
+            assert (group.attrs["id"], group.attrs["total_steps"]) == (number, SCENES)
+    about = json.loads((out / "data" / "metadata.json").read_text())
+    assert (about["total_episodes"], about["total_steps"], about["jpeg_encoding"]) == (2, 2 * SCENES, False)
+
+
+def test_minari_itself_finds_what_the_environment_gave(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    scenario = folder.parent / "asymmetric.toml"
+    env = BeamSelectionEnv(scenario, observe=OBSERVED, directory=tmp_path / "run")
+    right = played(env, 2)
+    out = minari_file(tmp_path / "run", tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
+    data = minari.load_dataset(out.name)
+    assert data.observation_space == env.observation_space
+    assert data.action_space == env.action_space
+    assert (data.total_episodes, data.total_steps) == (2, 2 * SCENES)
+    for found, episode in zip(data, right, strict=True):
+        assert all(equal(getattr(found, name), values) for name, values in episode.items())
+        assert found.observations["aod"][0] in env.observation_space["aod"]
+
+
+def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    shipped = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "uav-path.toml"
+    head, _, tail = shipped.read_text().partition("[services.channel.settings]")
+    text = (head + tail[tail.index("[services.link]") :]).replace('"sionna-rt"', '"free-space"')
+    text = text.replace("frames = 60", "frames = 6", 1)
+    scenario = tmp_path / "flight.toml"
+    scenario.write_text("\n".join(line for line in text.splitlines() if not line.startswith("scenery")))
+    env = UavPathEnv(scenario, directory=tmp_path / "run")
+    right = played(env, 1, seed=5)[0]
+    out = minari_file(tmp_path / "run", tmp_path)
+    with h5py.File(out / "data" / "main_data.hdf5") as file:
+        group = file["episode_0"]
+        velocity = group["actions/velocity"][:, 0]
+        share = right["actions"].astype(np.float64)
+        speed = env._max_speed / np.maximum(1.0, np.linalg.norm(share, axis=1, keepdims=True))
+        assert np.allclose(velocity, share * speed)
+        assert len(group["rewards"]) == len(right["rewards"])
 
 
 # --- Wireless InSite ----------------------------------------------------------------------------------------
