@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 
 from caviar_clients.datasets.user_rows import Users
-from caviar_clients.envs.base import KINDS, Reward
+from caviar_clients.envs.base import KINDS, OF_PACKETS, Reward
 from caviar_formats.base import Format, Part, markdown_table
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError, RunError
-from caviar_protocol.observations import FAR, OBSERVATION_PARTS, Moment, Observer
+from caviar_protocol.observations import FAR, OBSERVATION_PARTS, Moment, Observer, require_packets
 from caviar_protocol.observations import Users as Places
 from caviar_protocol.recording import RecordedFrame, Recording
 from caviar_protocol.scenario import Scenario
@@ -24,9 +24,11 @@ from caviar_protocol.topics import Action, Link, VelocityCommand
 
 VERSION = "0.5.4"
 """Of Minari, whose files these are."""
-OF_PACKETS = ("last_throughput", "buffered", "waiting")
+PACKET_PARTS = ("last_throughput", "buffered", "waiting")
 OF_SENSORS = {"camera": "camera.rgb", "depth": "depth.depth", "lidar_grid": "lidar.grid"}
 """Recorded array of each part of the observation that is of a sensor."""
+LARGE_B = 2**16
+"""Size of an array above which it is compressed, without losses."""
 _PARTS = ".parts"
 
 
@@ -47,19 +49,28 @@ class Minari(Format):
         dataset = users.dataset
         if len(users) != len(dataset.users()):
             raise RunError("a decision is for all users: leave --carrier, --tx and --object-class out")
+        scenario = msgspec.convert(dataset.settings["scenario"], Scenario)
+        self._flown = [
+            str(spec.settings.get("prefix") or "") + flown["name"]
+            for spec in scenario.services.values()
+            if spec.role == "world"
+            for flown in spec.settings.get("flown", ())
+        ]
         first: Recording = dataset.episode(dataset.episodes[0])
-        if lacking := [topic for topic in ("scene", "action") if topic not in first.topics]:
+        needed = ("scene", "action") if self._flown else ("scene",)
+        if lacking := [topic for topic in needed if topic not in first.topics]:
             raise RecordingError(
                 f'{dataset.location} was recorded without {lacking[0]}: write "{lacking[0]}" into `record` '
                 "below [run] of the scenario, and generate it again"
             )
-        scenario = msgspec.convert(dataset.settings["scenario"], Scenario)
+        if self.flavour in OF_PACKETS:
+            require_packets(scenario, f"the reward {self.flavour!r}")
         self._places, self._reward = Places(scenario, ("*",)), Reward(self.flavour)  # type: ignore[arg-type]
         recorded = users.recorded()
         names = [
             name
             for name, part in OBSERVATION_PARTS.items()
-            if not part.needs_sensor and (name not in OF_PACKETS or "link.throughput" in recorded)
+            if not part.needs_sensor and (name not in PACKET_PARTS or "link.throughput" in recorded)
         ]
         for name, array in OF_SENSORS.items():
             kind = OBSERVATION_PARTS[name].needs_sensor
@@ -67,12 +78,6 @@ class Minari(Format):
                 own = device.count == 1 or self._places.on_objects_of(device)
                 names += [f"{name}:{device.name}"] if device.kind == kind and own else []
         self._observer = Observer(scenario, self._places, names)
-        self._flown = [
-            str(spec.settings.get("prefix") or "") + flown["name"]
-            for spec in scenario.services.values()
-            if spec.role == "world"
-            for flown in spec.settings.get("flown", ())
-        ]
         numbers = np.unique(dataset.table("scenes")["episode"]).tolist()
         self._ids = {number: at for at, number in enumerate(numbers)}
         self._name = re.sub(r"[^A-Za-z0-9_-]", "-", dataset.name) + "-v0"
@@ -246,7 +251,11 @@ def _box(low: float, high: float, shape: tuple[int, ...], dtype: Any) -> dict[st
 def _write_tree(group: Any, name: str, steps: list[Any]) -> None:
     """Write values of steps, or a dictionary of them by name."""
     if not isinstance(steps[0], dict):
-        group[name] = np.stack(steps)
+        values = np.stack(steps)
+        large: dict[str, Any] = (
+            {"compression": "gzip", "compression_opts": 1} if values.nbytes > LARGE_B else {}
+        )
+        group.create_dataset(name, data=values, **large)
         return
     for key in steps[0]:
         _write_tree(group.require_group(name), key, [step[key] for step in steps])

@@ -155,7 +155,7 @@ kind = "camera"
 position_m = [3.0, -40.0, 12.0]
 yaw_deg = 45.0
 pitch_deg = 15.0
-size_px = [32, 24]
+size_px = [40, 32]
 """
 
 
@@ -627,11 +627,11 @@ def test_minari_has_what_the_environment_gave(folder: Path, tmp_path: Path) -> N
 
 
 def test_minari_itself_finds_what_the_environment_gave(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
-    scenario = folder.parent / "asymmetric.toml"
-    env = BeamSelectionEnv(scenario, observe=OBSERVED, directory=tmp_path / "run")
+    scenario = clouds.parent / "lidar.toml"
+    env = BeamSelectionEnv(scenario, observe=(*OBSERVED, "camera:camera"), directory=tmp_path / "run")
     right = played(env, 2)
     out = minari_file(tmp_path / "run", tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
