@@ -23,6 +23,8 @@ class Npz(Format):
         self._names = users.readable()
 
     def write(self, part: Part, folder: Path) -> None:
+        if not len(part.users):  # which --tx and the like narrow
+            return
         columns = part.users.read([*USER_COLUMNS, *self._names])
         np.savez(folder / f"users-{part.number:05d}.npz", allow_pickle=False, **columns)
 

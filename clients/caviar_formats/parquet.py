@@ -40,11 +40,12 @@ class Parquet(Format):
         self._names = {name: text for name, text in found if not name.startswith(LEFT_OUT)}
 
     def write(self, part: Part, folder: Path) -> None:
-        table = _Table(self._connection, len(part.users))
-        table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
-        for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
-            table.add_rows(name, rows)
-        table.save(_file(folder, "users", part.number))
+        if len(part.users):  # which --tx and the like narrow
+            table = _Table(self._connection, len(part.users))
+            table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
+            for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
+                table.add_rows(name, rows)
+            table.save(_file(folder, "users", part.number))
         table = _Table(self._connection, len(part.scenes))
         table.add_columns(part.scenes, SCENE_COLUMNS)
         table.save(_file(folder, "scenes", part.number))
@@ -126,11 +127,12 @@ class _Table:
     def _add_lists(self, name: str, rows: Sequence[NDArray[Any]]) -> None:
         import nanoarrow
 
-        values = nanoarrow.c_array(np.concatenate([row.ravel() for row in rows]))
-        kind = nanoarrow.large_list(nanoarrow.Schema(values.schema))
-        buffers = [None, np.cumsum([0, *(row.size for row in rows)])]
+        values = np.concatenate([row.ravel() for row in rows])
+        kind = getattr(nanoarrow, values.dtype.name)()
+        items = nanoarrow.c_array_from_buffers(kind, len(values), [None, values], null_count=0)
+        cuts = np.cumsum([0, *(row.size for row in rows)], dtype=np.int64)
         self._lists[name] = nanoarrow.c_array_from_buffers(
-            kind, len(rows), buffers, null_count=0, children=[values]
+            nanoarrow.large_list(kind), len(rows), [None, cuts], null_count=0, children=[items]
         )
         self._select.append(f'"{name}"')
 

@@ -192,6 +192,33 @@ def test_npz_has_each_user_in_its_row(data: Dataset, tmp_path: Path) -> None:
             assert np.array_equal(rows[name], users[name], equal_nan=rows[name].dtype.kind in "fc"), name
 
 
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("npz", "users-*.npz"),
+        ("sionna", "cir-*.npz"),
+        ("parquet", "users/*.parquet"),
+        ("huggingface", "users.parquet"),
+    ],
+)
+def test_scenes_without_chosen_users_have_no_rows(
+    name: str, files: str, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import duckdb
+
+    users = data.users()
+    monkeypatch.setattr("caviar_formats.base.SCENES", 1)
+    late = users[users["scene"] > 0]
+    export_users(late, find_format(name), tmp_path / name)
+    found = [
+        duckdb.read_parquet(str(file)).fetchnumpy()["rx"]
+        if file.suffix == ".parquet"
+        else np.load(file)["rx"]
+        for file in sorted((tmp_path / name).glob(files))
+    ]
+    assert np.concatenate(found).tolist() == late["rx"].tolist()
+
+
 def test_impulse_responses_make_the_recorded_wideband_channel(data: Dataset, tmp_path: Path) -> None:
     users = data.users()
     cir = users.cir()
