@@ -50,30 +50,11 @@ def generated(out: Path, scenario: str | Path, episodes: int = EPISODES, scenes:
     return Dataset(out)
 
 
-SCENARIO = """
-[run]
-name = "asymmetric"
-frames = 3
-sampling_period_ns = 100_000_000
-record = ["scene", "channel", "channel.h", "channel.hf", "link"]
-
-[[carriers]]
-name = "mm"
-frequency_hz = 28e9
-bandwidth_hz = 100e6
-subcarriers = 8
-subcarrier_spacing_hz = 1e6
-
+SERVICES = """
 [services.world]
 role = "world"
 use = "trajectory"
 budget_ms = 20
-
-[[services.world.settings.objects]]
-name = "car"
-kind = "car"
-dimensions_m = [4.5, 1.8, 1.5]
-waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [services.channel]
 role = "channel"
@@ -81,7 +62,7 @@ use = "geometric"
 budget_ms = 100
 
 [services.channel.settings]
-components = 4
+components = 5
 
 [services.link]
 role = "link"
@@ -97,6 +78,29 @@ budget_ms = 20
 role = "recorder"
 use = "mcap"
 budget_ms = 100
+"""
+
+SCENARIO = (
+    SERVICES
+    + """
+[run]
+name = "asymmetric"
+frames = 3
+sampling_period_ns = 100_000_000
+record = ["scene", "channel", "channel.h", "channel.hf", "link"]
+
+[[carriers]]
+name = "mm"
+frequency_hz = 28e9
+bandwidth_hz = 100e6
+subcarriers = 8
+subcarrier_spacing_hz = 1e6
+
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [[devices]]
 name = "bs"
@@ -117,6 +121,7 @@ position_m = [0.3, 0.2, 1.0]
 yaw_deg = -35.0
 array = { rows = 1, columns = 3 }
 """
+)
 
 
 @pytest.fixture(scope="module")
