@@ -103,7 +103,9 @@ class DeepMimo(Format):
             scenes = part.scenes["scene"][part.scenes["episode"] == episode].tolist()
             for scene in scenes:
                 here = users[users["scene"] == scene]
-                counts = self._write_scene(here, names, scenario / f"scene_{scene:06d}", episode, scene)
+                # The package looks for folders of scenes where there are several.
+                place = scenario / f"scene_{scene:06d}" if len(scenes) > 1 else scenario
+                counts = self._write_scene(here, names, place, episode, scene)
             active = len(np.unique(users["rx"][users["valid"]]))
             self._write_params(scenario, len(names), active, len(scenes), counts)
 

@@ -454,6 +454,13 @@ def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset
     assert list(verify(tmp_path / "back")) == []
 
 
+def test_episodes_of_one_scene_come_back_from_scenarios_of_deepmimo(folder: Path, tmp_path: Path) -> None:
+    data = generated(tmp_path / "data", folder.parent / "asymmetric.toml", episodes=1, scenes=1)
+    scenario = exported(data, "deepmimo", tmp_path, "dynamic") / "data_e000000"
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert nmse_db(Dataset(tmp_path / "back").users()["channel.h"], data.users()["channel.h"]) < -100
+
+
 def broken(content: bytes, how: str) -> bytes:
     """Damage a file."""
     return {
