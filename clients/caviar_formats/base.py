@@ -240,16 +240,14 @@ def export_users(
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:
     """Cut users into those of `SCENES` scenes each; both are sorted by episode and scene."""
     scenes = users.dataset.table("scenes")
-    numbers = np.stack([scenes["episode"], scenes["scene"]], axis=1)
-    of_user = np.stack([users["episode"], users["scene"]], axis=1)
-    place = {key: at for at, key in enumerate(map(tuple, numbers.tolist()))}
-    at = np.array([place[key] for key in map(tuple, of_user.tolist())])
+    span = scenes["scene"].max() + 1
+    of_scene, of_user = (table["episode"] * span + table["scene"] for table in (scenes, users))
     starts = np.arange(0, len(scenes), SCENES)
     if whole_episodes:
         starts = np.unique(np.searchsorted(scenes["episode"], scenes["episode"][starts]))
     for number, (start, stop) in enumerate(pairwise([*starts.tolist(), len(scenes)])):
-        in_part = np.flatnonzero((at >= start) & (at < stop))
-        yield Part(number, users[in_part], scenes.where(np.arange(start, stop)))
+        low, high = np.searchsorted(of_user, of_scene[[start, stop - 1]] + [0, 1]).tolist()
+        yield Part(number, users[low:high], scenes.where(np.arange(start, stop)))
 
 
 def _identity(users: Users, to: Format) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_clients.datasets.impulse_responses import only_array, placed_antennas
+from caviar_clients.datasets.impulse_responses import antennas_of, only_array, placed_antennas
 from caviar_clients.datasets.user_rows import Users
 from caviar_formats.base import Format, Part, only_one
 from caviar_formats.deepmimo import first_element
@@ -47,14 +47,14 @@ class Ns3Qd(Format):
         )
         for made in (traces, settings, places):
             made.mkdir(parents=True, exist_ok=True)
+        columns = ("a", "tau", "aod", "aoa")
+        rows = users.rows([f"channel.{name}" for name in columns], beside=antennas_of)
         ends = {end: list(placed_antennas(users, end)) for end in ("tx", "rx")}
         nodes: dict[str, tuple[float, ...]] = {}
         for end in ("tx", "rx"):
             for name, antenna in zip(users[end].tolist(), ends[end], strict=True):
                 nodes.setdefault(name, tuple(antenna.position.tolist()))
         order = list(nodes)
-        columns = ("a", "tau", "aod", "aoa")
-        rows = users.rows([f"channel.{name}" for name in columns])
         texts: dict[tuple[str, str], dict[int, str]] = {}
         for at, (tx, rx) in enumerate(zip(users["tx"].tolist(), users["rx"].tolist(), strict=True)):
             a, tau, aod, aoa = (rows[f"channel.{name}"][at] for name in columns)

@@ -53,30 +53,11 @@ def generated(out: Path, scenario: str | Path, episodes: int = EPISODES, scenes:
     return Dataset(out)
 
 
-SCENARIO = """
-[run]
-name = "asymmetric"
-frames = 3
-sampling_period_ns = 100_000_000
-record = ["scene", "channel", "channel.h", "channel.hf", "action", "link"]
-
-[[carriers]]
-name = "mm"
-frequency_hz = 28e9
-bandwidth_hz = 100e6
-subcarriers = 8
-subcarrier_spacing_hz = 1e6
-
+SERVICES = """
 [services.world]
 role = "world"
 use = "trajectory"
 budget_ms = 20
-
-[[services.world.settings.objects]]
-name = "car"
-kind = "car"
-dimensions_m = [4.5, 1.8, 1.5]
-waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [services.channel]
 role = "channel"
@@ -84,7 +65,7 @@ use = "geometric"
 budget_ms = 100
 
 [services.channel.settings]
-components = 4
+components = 5
 
 [services.link]
 role = "link"
@@ -100,6 +81,29 @@ budget_ms = 20
 role = "recorder"
 use = "mcap"
 budget_ms = 100
+"""
+
+SCENARIO = (
+    SERVICES
+    + """
+[run]
+name = "asymmetric"
+frames = 3
+sampling_period_ns = 100_000_000
+record = ["scene", "channel", "channel.h", "channel.hf", "action", "link"]
+
+[[carriers]]
+name = "mm"
+frequency_hz = 28e9
+bandwidth_hz = 100e6
+subcarriers = 8
+subcarrier_spacing_hz = 1e6
+
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [[devices]]
 name = "bs"
@@ -120,6 +124,7 @@ position_m = [0.3, 0.2, 1.0]
 yaw_deg = -35.0
 array = { rows = 1, columns = 3 }
 """
+)
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +216,33 @@ def test_npz_has_each_user_in_its_row(data: Dataset, tmp_path: Path) -> None:
         users = data.users()
         for name in (*users.recorded(), "x_m", "rx", "gain_db"):
             assert np.array_equal(rows[name], users[name], equal_nan=rows[name].dtype.kind in "fc"), name
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("npz", "users-*.npz"),
+        ("sionna", "cir-*.npz"),
+        ("parquet", "users/*.parquet"),
+        ("huggingface", "users.parquet"),
+    ],
+)
+def test_scenes_without_chosen_users_have_no_rows(
+    name: str, files: str, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import duckdb
+
+    users = data.users()
+    monkeypatch.setattr("caviar_formats.base.SCENES", 1)
+    late = users[users["scene"] > 0]
+    export_users(late, find_format(name), tmp_path / name)
+    found = [
+        duckdb.read_parquet(str(file)).fetchnumpy()["rx"]
+        if file.suffix == ".parquet"
+        else np.load(file)["rx"]
+        for file in sorted((tmp_path / name).glob(files))
+    ]
+    assert np.concatenate(found).tolist() == late["rx"].tolist()
 
 
 def test_impulse_responses_make_the_recorded_wideband_channel(data: Dataset, tmp_path: Path) -> None:
@@ -441,6 +473,13 @@ def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset
     poses = [[a.orientation for a in placed_antennas(users, "rx")] for users in (found, right)]
     assert np.allclose(*poses)
     assert list(verify(tmp_path / "back")) == []
+
+
+def test_episodes_of_one_scene_come_back_from_scenarios_of_deepmimo(folder: Path, tmp_path: Path) -> None:
+    data = generated(tmp_path / "data", folder.parent / "asymmetric.toml", episodes=1, scenes=1)
+    scenario = exported(data, "deepmimo", tmp_path, "dynamic") / "data_e000000"
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert nmse_db(Dataset(tmp_path / "back").users()["channel.h"], data.users()["channel.h"]) < -100
 
 
 def broken(content: bytes, how: str) -> bytes:
