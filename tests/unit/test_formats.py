@@ -27,7 +27,7 @@ from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RecordingError, RunError
+from caviar_protocol.errors import RecordingError, RunError, ScenarioError
 from caviar_protocol.scenario import Carrier, load_scenario
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
@@ -681,6 +681,16 @@ def test_minari_itself_finds_what_the_environment_gave(
     for found, episode in zip(data, right, strict=True):
         assert all(equal(getattr(found, name), values) for name, values in episode.items())
         assert found.observations["aod"][0] in env.observation_space["aod"]
+
+
+def test_minari_needs_decisions(clouds: Path, tmp_path: Path) -> None:
+    data = Dataset(import_dataset(source_of(tmp_path / "files", imported_scenes()), tmp_path / "data"))
+    with pytest.raises(RunError, match="no agent"):
+        exported(data, "minari", tmp_path)
+    with pytest.raises(ScenarioError, match="which sends none"):
+        exported(Dataset(clouds), "minari", tmp_path, "delay")
+    with pytest.raises(RunError, match="leave --carrier"):
+        export_users(Dataset(clouds).users()[:2], find_format("minari"), tmp_path / "out")
 
 
 def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
