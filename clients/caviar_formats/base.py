@@ -147,6 +147,7 @@ FORMATS: Mapping[str, str] = {
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
     "pcd": "caviar_formats.traces:Pcd",
+    "rerun": "caviar_formats.viewers:Rerun",
     "ros2": "caviar_formats.viewers:Ros2",
     "sionna": "caviar_formats.npz:Sionna",
 }

@@ -19,8 +19,8 @@ def export_command(
         str,
         typer.Option(
             metavar="NAME",
-            help="npz, parquet, huggingface, sionna, itu, deepmimo, ns3-qd, pcd, foxglove, ros2, rerun, or an "
-            "installed package's",
+            help="npz, parquet, huggingface, sionna, itu, deepmimo, ns3-qd, pcd, foxglove, ros2, rerun, or "
+            "that of an installed package",
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder that is made")],

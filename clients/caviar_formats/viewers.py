@@ -29,7 +29,7 @@ from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import RecordedFrame
 from caviar_protocol.space.coordinates import Pose, compose, unit_vectors
-from caviar_protocol.space.scene import object_pose
+from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import (
     AntennaArray,
     AntennaDevice,
@@ -40,7 +40,7 @@ from caviar_protocol.topics import (
     Link,
 )
 from caviar_protocol.topics.sensors import CameraImage, DepthImage, LidarScan
-from caviar_space.meshes import Mesh
+from caviar_space.meshes import Mesh, joined, placed
 from caviar_view.answers import SERIES
 from caviar_view.world import World
 
@@ -68,8 +68,8 @@ class Moment:
     """Parent, name and pose in the parent's axes of devices and, with x right and y down, of pictures."""
     rays: list[tuple[Float64Array, float, list[float]]]
     """Points [m], Shape ``[N, 3]``, gain [dB], and colour by it, of the strongest paths of each pair."""
-    beams: list[tuple[AntennaDevice, int]]
-    """Arrays, and the beams that were chosen for them."""
+    beams: list[tuple[AntennaDevice, Pose, int]]
+    """Arrays of several elements, their poses in the world, and beams that were chosen for them."""
     users: dict[str, dict[str, float]]
     """Values of `SERIES`, and both chosen beams, by ``RX/TX/CARRIER``."""
     scans: list[LidarScan]
@@ -101,12 +101,17 @@ def moment(frame: RecordedFrame) -> Moment:
             row = {name: float(column[at]) for name, column in columns.items() if column is not None}
             users[f"{rx}/{tx}/{carrier}"] = {name: x for name, x in row.items() if np.isfinite(x)}
             beams |= {(tx, int(link.tx_beam[at])): None, (rx, int(link.rx_beam[at])): None}
-    antennas = dict[str, AntennaDevice]()
+    chosen = list[tuple[AntennaDevice, Pose, int]]()
     if scene is not None:
         poses = (object_pose(scene, at) for at in range(len(scene.names)))
         objects = list(zip(scene.names, scene.classes, poses, scene.dimensions.tolist(), strict=True))
         mounts += [(d.parent or WORLD, d.name, Pose(d.position, d.orientation)) for d in scene.devices]
-        antennas = {device.name: device for device in scene.devices if isinstance(device, AntennaDevice)}
+        arrays = {d.name: d for d in scene.devices if isinstance(d, AntennaDevice) and d.array.size > 1}
+        chosen = [
+            (arrays[name], device_pose(scene, arrays[name]), beam)
+            for name, beam in beams
+            if beam >= 0 and name in arrays
+        ]
         found = rays(scene, next(iter(frame.payloads("channel", Channel).values()), None))
         top = found.all_gains.max(initial=-np.inf)
         for lines, gains in ((found.lines, found.gains), (found.ticks(TICK_M), found.tick_gains)):
@@ -119,11 +124,7 @@ def moment(frame: RecordedFrame) -> Moment:
         objects=objects,
         mounts=mounts,
         rays=drawn,
-        beams=[
-            (antennas[name], beam)
-            for name, beam in beams
-            if beam >= 0 and name in antennas and antennas[name].array.size > 1
-        ],
+        beams=chosen,
         users=users,
         scans=[scan for p in fresh if isinstance(p.payload, Lidar) for scan in p.payload.scans],
         images=images,
@@ -168,8 +169,8 @@ def lobe(array: AntennaArray, beam: int) -> Mesh:
 def picture(image: CameraImage | DepthImage) -> tuple[str, str, NDArray[Any]]:
     """Name of the topic of a picture, encoding as ROS and Foxglove name it, and pixels."""
     if isinstance(image, DepthImage):
-        return "depth", "32FC1", np.ascontiguousarray(image.depth, "<f4")
-    return "image", "rgb8", np.ascontiguousarray(image.rgb)
+        return "depth", "32FC1", np.array(image.depth)
+    return "image", "rgb8", np.array(image.rgb)
 
 
 def projections(image: CameraImage | DepthImage) -> tuple[list[float], list[float]]:
@@ -319,10 +320,10 @@ class _FoxgloveFile:
             )
             lines.append(self._entity(f"path {number}", {"gain_db": f"{gain:.2f}"}, lines=[line]))
         self._update("/rays", lines)
-        beams = [(device.name, beam) for device, beam in now.beams]
+        beams = [(device.name, beam) for device, _, beam in now.beams]
         if beams != self._beams:
             self._beams, lobes = beams, []
-            for device, beam in now.beams:
+            for device, _, beam in now.beams:
                 surface = self._surface(lobe(device.array, beam), rgb(VERMILION), 0.4)
                 name = f"beam {beam} of {device.name}"
                 lobes.append(
@@ -584,3 +585,98 @@ class _Bag:
 
     def _color(self, color: Sequence[float]) -> Any:
         return self._new("std_msgs/ColorRGBA", *color, 1.0)
+
+
+class Rerun(_Viewer):
+    """Recordings of Rerun."""
+
+    packages = ("rerun",)
+    extra = "rerun"
+
+    def write_episode(self, place: Path, world: World, moments: Iterator[Moment]) -> None:
+        import rerun as rr
+
+        name = f"{place.parent.name.removesuffix('.part')} {place.name}"
+        # By size alone: by default what is logged in 0.2 s is a chunk, each of two kilobytes for a number.
+        batches = rr.ChunkBatcherConfig(flush_tick=3600.0)
+        stream = rr.RecordingStream(
+            "caviar", recording_id=name, send_properties=False, batcher_config=batches
+        )
+        stream.save(place.with_suffix(".rrd"))
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for group in world.groups:
+            stream.log(
+                ["world", "scenery", f"{group.kind} of {group.material}"],
+                _rerun_mesh(group.mesh, rgb(group.color)),
+                static=True,
+            )
+        for now in moments:
+            stream.set_time("time", duration=np.timedelta64(now.t_ns, "ns"))
+            boxes = rr.Boxes3D(
+                centers=[pose.position for _, _, pose, _ in now.objects],
+                quaternions=[_rerun_turned(pose) for _, _, pose, _ in now.objects],
+                sizes=[size for *_, size in now.objects],
+                labels=[name for name, *_ in now.objects],
+                colors=[rgb(SKY)] * len(now.objects),
+            )
+            stream.log("world/objects", boxes)
+            strips, colors = [points for points, _, _ in now.rays], [color for *_, color in now.rays]
+            stream.log("world/rays", rr.LineStrips3D(strips, colors=colors, radii=0.08))
+            lobes = [
+                Mesh(placed(lobe(device.array, beam), np.ones(3), pose), lobe(device.array, beam).faces)
+                for device, pose, beam in now.beams
+            ]
+            stream.log("world/beams", _rerun_mesh(joined(lobes), [*rgb(VERMILION), 0.4]))
+            for scan in now.scans:
+                pose = Pose(scan.position, scan.orientation)
+                points = np.array(scan.points)  # a copy: Rerun ends the process where memory is not aligned
+                stream.log(["world", "lidar", scan.sensor], _rerun_pose(pose), rr.Points3D(points))
+            for image in now.images:
+                topic, _, pixels = picture(image)
+                optics, (height, width) = image.intrinsics, pixels.shape[:2]
+                # Pixel centres are at +½ there, too.
+                pinhole = rr.Pinhole(
+                    focal_length=(optics.fx, optics.fy),
+                    principal_point=(optics.cx, optics.cy),
+                    resolution=(width, height),
+                )
+                camera = ["world", "camera", image.sensor]
+                stream.log(camera, _rerun_pose(camera_pose(image)), pinhole)
+                shown = rr.DepthImage(pixels, meter=1.0) if topic == "depth" else rr.Image(pixels)
+                stream.log([*camera, topic], shown)
+            for user, values in now.users.items():
+                for name, value in values.items():
+                    stream.log(["users", *user.split("/"), name], rr.Scalars(value))
+        stream.disconnect()
+
+    def readme(self, users: Users) -> str:
+        return f"""# {users.dataset.name} for Rerun
+
+`episode-N.rrd`: an episode, with times since its first frame on the timeline `time`. {_FRAMES}
+
+- `world/scenery`: meshes by material.
+- `world/objects`: boxes, with names.
+- `world/rays`: paths, yellow for the strongest. One whose route is not known has a tick of {TICK_M:g} m at
+  either end.
+- `world/beams`: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m at the most.
+- `world/lidar/SENSOR`: points. `world/camera/CAMERA`: `image`, and `depth` [m].
+- `users/RX/TX/CARRIER/NAME`: for plots, without what is not finite,
+{_series()}
+"""
+
+
+def _rerun_turned(pose: Pose) -> list[float]:
+    w, *xyz = pose.orientation
+    return [*xyz, w]
+
+
+def _rerun_pose(pose: Pose) -> Any:
+    import rerun as rr
+
+    return rr.Transform3D(translation=pose.position, quaternion=_rerun_turned(pose))
+
+
+def _rerun_mesh(mesh: Mesh, color: list[float]) -> Any:
+    import rerun as rr
+
+    return rr.Mesh3D(vertex_positions=mesh.vertices, triangle_indices=mesh.faces, albedo_factor=color)

@@ -192,6 +192,8 @@ class TestConformance(FormatConformance):
             pytest.skip(str(error))
         if found.write.__func__ is Format.write:  # type: ignore[attr-defined]
             pytest.skip("is imported alone")
+        if name == "rerun":
+            pytest.skip("Rerun numbers rows at random")
         monkeypatch.setattr(type(self), "name", name, raising=False)
 
     @pytest.fixture
