@@ -112,11 +112,7 @@ export class App {
     else this.goHome(state.mode);
     this.track();
     this.stage.draw();
-    // After the first picture: it takes longer than all else.
-    setTimeout(() => {
-      for (const { view } of this.runs) view.world.addEdges();
-      this.stage.refresh();
-    }, 30);
+    void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.refresh());
     void this.live?.listen();
   }
 

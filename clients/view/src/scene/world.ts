@@ -108,11 +108,12 @@ export class World {
     if (this.theme) this.setTheme(this.theme);
   }
 
-  /** Add the edges of buildings; after the first picture, since it takes longer than all else. */
-  addEdges(): void {
+  /** Add the edges of buildings, with pauses in which the page answers: it takes longer than all else. */
+  async addEdges(): Promise<void> {
     for (const { info, mesh } of this.pieces) {
       if (info.kind !== "building" && info.kind !== "other") continue;
       if (info.triangles > MOST_EDGED) continue;
+      await new Promise((resolve) => setTimeout(resolve));
       const lines = new LineSegments(
         new EdgesGeometry(mesh.geometry, 20),
         new LineBasicMaterial({ transparent: true, depthWrite: false }),
