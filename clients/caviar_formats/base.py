@@ -147,6 +147,7 @@ FORMATS: Mapping[str, str] = {
     "parquet": "caviar_formats.parquet:Parquet",
     "pcd": "caviar_formats.traces:Pcd",
     "sionna": "caviar_formats.npz:Sionna",
+    "viwi": "caviar_formats.viwi:ViWi",
 }
 """Places of the formats that come with this distribution, by name."""
 

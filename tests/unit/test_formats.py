@@ -183,6 +183,9 @@ def exported(data: Dataset, name: str, out: Path, flavour: str = "") -> Path:
     return out / name
 
 
+WITH_SENSORS = ("deepsense", "pcd", "viwi")
+
+
 @pytest.mark.parametrize("name", FORMATS)
 class TestConformance(FormatConformance):
     @pytest.fixture(autouse=True)
@@ -193,7 +196,7 @@ class TestConformance(FormatConformance):
 
     @pytest.fixture
     def dataset(self, name: str, data: Dataset, request: pytest.FixtureRequest) -> Dataset:
-        return Dataset(request.getfixturevalue("clouds")) if name in ("pcd", "deepsense") else data
+        return Dataset(request.getfixturevalue("clouds")) if name in WITH_SENSORS else data
 
 
 def response(a: Any, tau: Any) -> Any:
@@ -672,6 +675,42 @@ def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
         speed = env._max_speed / np.maximum(1.0, np.linalg.norm(share, axis=1, keepdims=True))
         assert np.allclose(velocity, share * speed)
         assert len(group["rewards"]) == len(right["rewards"])
+
+
+# --- ViWi ---------------------------------------------------------------------------------------------------
+
+
+def test_readers_of_viwi_find_channels_places_and_pictures(
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from PIL import Image
+
+    from caviar_formats import viwi
+
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.setattr(viwi, "LENGTH", SCENES)
+    data = Dataset(clouds)
+    users, out = data.users(), exported(data, "viwi", tmp_path)
+    with h5py.File(out / "raw_data.mat") as file:
+        struct = file[list(file)[1]]
+        channel, loc = (struct[name][:] for name in struct)
+    found = channel.view(np.double).reshape(*channel.shape, 2) @ [1, 1j]
+    assert found.shape == (1, len(users), 8, 8)  # transmitters, users, subcarriers, elements
+    right = users["channel.hf"][:, 0, :, 0]
+    order = [2 * y + 1 - z for z in range(2) for y in range(4)]  # of columns from +z to −z
+    assert np.array_equal(found[0], right[..., order])
+    assert np.array_equal(loc, np.stack([users[f"{axis}_m"] for axis in "xyz"], axis=1))
+    for picture in (out / "rgb").iterdir():
+        _, number, x, y = picture.stem.split("_")
+        at = int(np.abs(loc[:, :2] - [float(x), float(y)]).sum(axis=1).argmin())
+        rgb = data.episode(users["episode"][at])["camera"].rgb[users["scene"][at], 0]
+        assert (number, np.asarray(Image.open(picture)).tolist()) == ("1", rgb.tolist())
+    turns = [np.exp(-2j * np.pi * np.outer(np.arange(n), np.arange(n)) / n) for n in (2, 4)]
+    best = 1 + (np.abs(found[0] @ np.kron(*turns).conj()) ** 2).sum(axis=1).argmax(axis=1)
+    with (out / "beams.csv").open() as table:
+        rows = list(csv.reader(table))[1:]
+    assert [[int(beam) for beam in row[:SCENES]] for row in rows] == best.reshape(-1, SCENES).tolist()
+    assert all((out / name).is_file() for row in rows for name in row[SCENES:] if name)
 
 
 # --- Wireless InSite ----------------------------------------------------------------------------------------
