@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import zmq
@@ -180,7 +181,7 @@ class BrokerServer:
             m.AssetData: self._assets.handle_data,
         }
         self._performers: dict[type, Callable[[Any], None]] = {
-            ev.Latency: lambda a: self.statistics.latency(a.service, a.elapsed_ns, a.missed),
+            ev.Latency: self._latency,
             ev.Overdue: lambda a: self.statistics.decision(time.monotonic_ns() - a.due_ns),
             ev.Notice: self._listener.notice,
             ev.FrameFinished: self._frame_finished,
@@ -196,6 +197,12 @@ class BrokerServer:
         self.clock.receive(event, time.monotonic_ns())
         self._perform()
 
+    def _latency(self, action: ev.Latency) -> None:
+        now = time.monotonic_ns()
+        self.statistics.latency(
+            action.service, action.elapsed_ns, action.missed, action.episode, action.frame, now
+        )
+
     def run(self, begin: Callable[[], object] = lambda: None) -> ev.Finished:
         """Serve until the run is over, in threads that call ``begin`` first."""
         try:
@@ -209,6 +216,11 @@ class BrokerServer:
         if self.outcome is None:
             raise AssertionError("the loop ended before the run")
         return self.outcome
+
+    def scenery(self) -> dict[str, Path]:
+        """Files of the run's scenery by asset name; those that are on their way are left out."""
+        store = self._assets.store
+        return {asset.name: store.path(asset.digest) for asset in self.clock.scenery if store.holds(asset)}
 
     @property
     def cpu_s(self) -> float:

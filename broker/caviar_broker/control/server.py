@@ -34,6 +34,8 @@ MAX_CONNECTIONS = 32
 FRAME_EVENT_NS = 50_000_000
 """[ns] between ``frame`` events at least."""
 MAX_STEPS = 1_000_000_000
+MAX_ANSWERS = 200
+"""Answers to grants of a service that a client gets at once, the newest ones."""
 NOTED = ("note", "refused")
 """Kinds of notices that a client may give."""
 BLAMES = frozenset({"miss", "lost", "away", "fault", "skipped"})
@@ -75,6 +77,8 @@ class ControlServer:
             "stop": self._stop,
             "policies": self._policies,
             "swap": self._swap,
+            "scenery": self._scenery,
+            "answers": self._answers,
             "gateway": self._gateway,
             "serving": self._note_serving,
             "note": self._note,
@@ -212,6 +216,22 @@ class ControlServer:
             name: msgspec.to_builtins(figures)
             for name, figures in self.server.statistics.recent_services().items()
         }
+
+    def _scenery(self, _: Mapping[str, Any]) -> Answer:
+        files = self.server.scenery()
+        return {"ok": True, "assets": {name: str(path) for name, path in files.items()}}
+
+    def _answers(self, request: Mapping[str, Any]) -> Answer:
+        """Answers to grants that came after the first so many of each service."""
+        known = request.get("known", {})
+        statistics = self.server.statistics
+        found = {}
+        for service in self.server.clock.plan.services:
+            first = known.get(service.name, 0) if isinstance(known, dict) else 0
+            newest = statistics.granted(service.name) - MAX_ANSWERS
+            first = max(first if type(first) is int else 0, newest, 0)
+            found[service.name] = {"first": first, "rows": statistics.answers(service.name, first).tolist()}
+        return {"ok": True, "answers": found}
 
     # --- orders ---------------------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ from caviar_broker.core.status import RunStatus, status_of
 from caviar_broker.core.tasks import FinishedFrame
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
+from caviar_protocol.fields import Asset
 
 
 class FrameClock:
@@ -77,6 +78,11 @@ class FrameClock:
         }
 
     # --- the interface of a shell ----------------------------------------------------------------
+
+    @property
+    def scenery(self) -> tuple[Asset, ...]:
+        """The scenery of all worlds that have announced it."""
+        return self._run.scenery()
 
     def receive(self, event: ev.Event, now: int) -> None:
         """Take in one event.
