@@ -10,6 +10,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from caviar_protocol.arrays import Int64Array
+
 
 class ServiceStatistics(msgspec.Struct, frozen=True, kw_only=True):
     """Statistics of how a service kept its budget."""
@@ -60,7 +62,7 @@ class PaceStatistics(msgspec.Struct, frozen=True, kw_only=True):
 class Statistics:
     """Collects latencies [ns] and frame times, and sums them up.
 
-    A frame costs 8 bytes a service and 8 for itself. A latency counts from the GRANT that is sent
+    A frame costs 32 bytes a service and 8 for itself. A latency counts from the GRANT that is sent
     to the DONE that is received, or to the deadline where the frame went on without it.
     """
 
@@ -68,6 +70,7 @@ class Statistics:
         self._budgets = budgets_ns
         # Arrays of machine integers: a list would take 32 B more a figure, in runs of millions of frames.
         self._latencies = {name: array("q") for name in budgets_ns}
+        self._answers = {name: array("q") for name in budgets_ns}
         self._misses = dict.fromkeys(budgets_ns, 0)
         self._totals = dict.fromkeys(budgets_ns, 0)
         self._finished_at = array("q")
@@ -77,15 +80,20 @@ class Statistics:
         self._slips = self._worst_slip = self._lag = 0
         self._lag_of_episode = (0, 0)
 
-    def latency(self, service: str, elapsed_ns: int, missed: bool) -> None:
+    def latency(
+        self, service: str, elapsed_ns: int, missed: bool, episode: int = 0, frame: int = 0, now: int = 0
+    ) -> None:
         """A grant was answered, or its deadline passed.
 
         Args:
             service: Which was granted.
             elapsed_ns: From GRANT to answer or deadline [ns].
             missed: Whether its budget was up.
+            episode, frame: Of the grant.
+            now: The time [ns].
         """
         self._latencies[service].append(elapsed_ns)
+        self._answers[service].extend((episode, frame, now))
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
 
@@ -178,17 +186,31 @@ class Statistics:
 
     def save(self, path: Path) -> None:
         """Write every figure as a NumPy archive: ``finished_ns`` by frame, ``latency_ns/NAME`` by grant,
-        ``decision_lateness_ns`` by deadline that was missed.
+        ``decision_lateness_ns`` by deadline that was missed; `answers` of each service, ``answers/NAME``.
 
         A disk that is full costs the record, not the run's result.
         """
         figures: dict[str, Any] = {"finished_ns": np.asarray(self._finished_at, np.int64)}
         figures["decision_lateness_ns"] = np.asarray(self._lateness, np.int64)
         figures |= {f"latency_ns/{n}": np.asarray(v, np.int64) for n, v in self._latencies.items()}
+        figures |= {f"answers/{name}": self.answers(name) for name in self._answers}
         try:
             np.savez_compressed(path, **figures)
         except OSError:
             path.unlink(missing_ok=True)
+
+    def granted(self, service: str) -> int:
+        """Number of a service's grants that were answered, or overdue."""
+        return len(self._latencies[service])
+
+    def answers(self, service: str, first: int = 0) -> Int64Array:
+        """Grants of a service in the order of their answers, from the ``first``-th on.
+
+        Returns:
+            Episode, frame, when it was answered and latency [ns], Shape ``[grants, 4]``.
+        """
+        known = np.asarray(self._answers[service][3 * first :], np.int64).reshape(-1, 3)
+        return np.column_stack([known, np.asarray(self._latencies[service][first:], np.int64)])
 
     def figures(self) -> dict[str, Any]:
         """The figures of the event ``finished``, as plain values."""

@@ -64,15 +64,21 @@ class Format:
     flavours: ClassVar[Mapping[str, str]] = {}
     """Variants of the format by name, with what each is; the first is the default."""
     packages: ClassVar[Sequence[str]] = ()
-    """Modules beyond the base installation that it imports; extra `formats` brings those of `FORMATS`."""
+    """Modules beyond the base installation that it imports."""
+    extra: ClassVar[str] = "formats"
+    """Extra that brings them."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
+    needs_users: ClassVar[bool] = True
+    """Whether there is no export of scenes without users."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
     temporary: ClassVar[Sequence[str]] = ()
     """Folders of the export that are removed once `finish` has made files of them."""
     frequency_hz: float | None = None
     """Of the carrier, where the files that are read do not have it [Hz]."""
+    origin: tuple[float, float] | None = None
+    """Latitude and longitude of the origin of the world [°], where the dataset does not have them."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -135,14 +141,20 @@ class Format:
 
 FORMATS: Mapping[str, str] = {
     "deepmimo": "caviar_formats.deepmimo:DeepMimo",
+    "deepsense": "caviar_formats.deepsense:DeepSense",
+    "foxglove": "caviar_formats.viewers:Foxglove",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
+    "minari": "caviar_formats.minari:Minari",
     "npz": "caviar_formats.npz:Npz",
     "ns3-qd": "caviar_formats.traces:Ns3Qd",
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
     "pcd": "caviar_formats.traces:Pcd",
+    "rerun": "caviar_formats.viewers:Rerun",
+    "ros2": "caviar_formats.viewers:Ros2",
     "sionna": "caviar_formats.npz:Sionna",
+    "viwi": "caviar_formats.viwi:ViWi",
 }
 """Places of the formats that come with this distribution, by name."""
 
@@ -165,7 +177,7 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     if cls is None:
         raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
     if lacking := [module for module in cls.packages if find_spec(module) is None]:
-        raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command('formats')}")
+        raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command(cls.extra)}")
     found: Format = cls(flavour)
     return found
 
@@ -199,7 +211,7 @@ def export_users(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there and not empty; choose another folder with --out")
-    if not len(users):
+    if not len(users) and to.needs_users:
         raise RunError(f"{users.dataset.location} has no such users to export; record scene and channel")
     if lacking := [name for name in to.needs if name not in users.recorded()]:
         users.check_names(lacking)
@@ -251,7 +263,8 @@ def _identity(users: Users, to: Format) -> str:
     keys = [users[name].tolist() for name in ("episode", "scene", "carrier", "tx", "rx")]
     digests = users.dataset.table("episodes")["digest"].tolist()
     content = hashlib.sha256(msgspec.json.encode([digests, keys])).hexdigest()
-    return f"{type(to).__module__}:{type(to).__qualname__}:{to.flavour}:{content}"
+    origin = ":{},{}".format(*to.origin) if to.origin else ""
+    return f"{type(to).__module__}:{type(to).__qualname__}:{to.flavour}{origin}:{content}"
 
 
 def _continued(folder: Path, export: str) -> _State:
@@ -277,6 +290,25 @@ def _readme(users: Users, to: Format) -> str:
     made = ", ".join(f"{name} {version}" for name, version in dataset.settings["versions"].items())
     counts = f"{len(dataset):,} episodes, {len(users):,} users"
     return f"{text}{lost}\n\n## Origin\n\nDataset `{dataset.name}` of CAVIAR: {counts}; {made}.\n"
+
+
+def only_one(users: Users, column: str) -> str:
+    """Find the one carrier, or transmitter, that a format has room for.
+
+    Args:
+        users: All users of the export.
+        column: ``carrier`` or ``tx``.
+
+    Raises:
+        RunError: There are several.
+    """
+    names: list[str] = np.unique(users[column]).tolist()
+    if len(names) > 1:
+        raise RunError(
+            f"{users.dataset.location} has {', '.join(names)} as {column}, and this format holds one; choose "
+            f"with --{column} {names[0]}"
+        )
+    return names[0]
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

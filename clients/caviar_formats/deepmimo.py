@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from caviar_clients.datasets.impulse_responses import antennas_of, only_array, placed_antennas
 from caviar_clients.datasets.user_rows import Users
-from caviar_formats.base import Format, Part
+from caviar_formats.base import Format, Part, only_one
 from caviar_formats.imports import ImportedScene, Paths, Source, damaged
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError, RunError
@@ -64,11 +64,7 @@ class DeepMimo(Format):
         self.whole_episodes = self.flavour == "dynamic"
 
     def begin(self, users: Users) -> None:
-        if len(carriers := np.unique(users["carrier"]).tolist()) > 1:
-            raise RecordingError(
-                f"{users.dataset.location} has {len(carriers)} carriers, and a scenario of DeepMIMO one: "
-                f"choose with --carrier {carriers[0]}"
-            )
+        self._carrier = only_one(users, "carrier")
         self._arrays = {end: only_array(users, end) for end in ("tx", "rx")}
         for end, array in self._arrays.items():
             if array.rows > 1 and array.columns > 1 and array.vertical_spacing != array.horizontal_spacing:
@@ -77,7 +73,6 @@ class DeepMimo(Format):
                     f"wavelengths between columns and {array.vertical_spacing} between rows, and arrays of "
                     "DeepMIMO one spacing; use equal ones"
                 )
-        self._carrier = carriers[0]
         specs = users.dataset.settings["scenario"]["carriers"]
         self._frequency = next(c["frequency_hz"] for c in specs if c["name"] == self._carrier)
         self._name = "".join(c if c.isalnum() else "_" for c in users.dataset.name.lower())

@@ -9,9 +9,8 @@ import numpy as np
 
 from caviar_clients.datasets.impulse_responses import antennas_of, only_array, placed_antennas
 from caviar_clients.datasets.user_rows import Users
-from caviar_formats.base import Format, Part
+from caviar_formats.base import Format, Part, only_one
 from caviar_formats.deepmimo import first_element
-from caviar_protocol.errors import RecordingError
 
 
 class Ns3Qd(Format):
@@ -26,15 +25,10 @@ class Ns3Qd(Format):
     )
 
     def begin(self, users: Users) -> None:
-        carriers = np.unique(users["carrier"]).tolist()
-        if len(carriers) > 1:
-            raise RecordingError(
-                f"{users.dataset.location} has {len(carriers)} carriers, and a trace one: choose with "
-                f"--carrier {carriers[0]}"
-            )
+        carrier = only_one(users, "carrier")
         self._arrays = {end: only_array(users, end) for end in ("tx", "rx")}
         scenario = users.dataset.settings["scenario"]
-        self._frequency = next(c["frequency_hz"] for c in scenario["carriers"] if c["name"] == carriers[0])
+        self._frequency = next(c["frequency_hz"] for c in scenario["carriers"] if c["name"] == carrier)
         self._period_s = scenario["run"]["sampling_period_ns"] * 1e-9
 
     def write(self, part: Part, folder: Path) -> None:
@@ -110,6 +104,7 @@ class Pcd(Format):
     """Files ``EPISODE/SCENE-SENSOR.pcd`` of the Point Cloud Library, binary, of each scan of each LIDAR."""
 
     needs = ("lidar.points",)
+    needs_users = False
     loses = "All but points of LIDARs, and of these rays, objects and grids."
 
     def write(self, part: Part, folder: Path) -> None:

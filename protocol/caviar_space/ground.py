@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import transformed_mesh
 
 # A face is a wall where the vertical part of its unit normal is smaller.
@@ -44,19 +45,29 @@ def ground(meshes: Iterable[tuple[Path, Float64Array]]) -> list[Float64Array]:
 def ground_and_buildings(
     meshes: Iterable[tuple[Path, Float64Array]],
 ) -> tuple[list[Piece], list[Piece]]:
-    shapes = [_piece(file, to_world) for file, to_world in meshes]
+    shapes = [_piece(transformed_mesh(file, to_world)) for file, to_world in meshes]
     shapes = [shape for shape in shapes if len(shape.faces)]
-    lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
-    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
-    level = [_is_ground(shape, lowest, walls) for shape in shapes]
+    level = _ground_of(shapes)
     return (
         [shape for shape, is_ground in zip(shapes, level, strict=True) if is_ground],
         [shape for shape, is_ground in zip(shapes, level, strict=True) if not is_ground],
     )
 
 
-def _piece(file: Path, to_world: Float64Array) -> Piece:
-    mesh = transformed_mesh(file, to_world)
+def are_ground(meshes: Sequence[Mesh]) -> list[bool]:
+    """Tell which meshes in the world are ground; one without area is not."""
+    shapes = [_piece(mesh) for mesh in meshes]
+    level = iter(_ground_of([shape for shape in shapes if len(shape.faces)]))
+    return [bool(len(shape.faces)) and next(level) for shape in shapes]
+
+
+def _ground_of(shapes: Sequence[Piece]) -> list[bool]:
+    lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
+    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
+    return [_is_ground(shape, lowest, walls) for shape in shapes]
+
+
+def _piece(mesh: Mesh) -> Piece:
     vertices, faces = mesh.vertices, mesh.faces
     # Exporters repeat a vertex for each face; a grid of 1 cm makes them one again.
     _, same = np.unique(np.round(vertices * 100), axis=0, return_inverse=True)

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 PACKAGES = (
     "caviar_protocol",
     "caviar_space",
+    "caviar_view",
     "caviar_broker",
     "caviar_services",
     "caviar_bridges",
@@ -27,7 +28,7 @@ PACKAGES = (
 )
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
-    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "PIL", "pyproj",
+    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "nanoarrow", "PIL", "pyproj",
 )  # fmt: skip
 
 IMPORT_EVERYTHING = f"""

@@ -166,8 +166,8 @@ def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> Fas
     app.add_middleware(LocalOnly, tokens=tokens)
     app.add_exception_handler(RequestRefusedError, _refused)
     app.add_exception_handler(RunError, _no_broker)
-    viewer = [Depends(_bearer), Depends(_may(VIEWER, tokens))]
-    operator = [Depends(_bearer), Depends(_may(OPERATOR, tokens))]
+    viewer = [Depends(_bearer), Depends(may(VIEWER, tokens))]
+    operator = [Depends(_bearer), Depends(may(OPERATOR, tokens))]
 
     # A function that makes each handler: one made in the loop would answer with the loop's last name.
     def answers(name: str) -> Callable[[], Awaitable[Any]]:
@@ -188,7 +188,7 @@ def make_app(ask: Ask, directory: Path, tokens: Tokens, gateway: Gateway) -> Fas
         return PlainTextResponse(metrics(found, gateway.connections), media_type=CONTENT_TYPE)
 
     _orders(app, ask, operator)
-    _policies(app, directory, [Depends(_bearer), Depends(_may(TRAINER, tokens))])
+    _policies(app, directory, [Depends(_bearer), Depends(may(TRAINER, tokens))])
 
     @app.get("/healthz", responses=_example("healthz") | _unready("the broker does not answer"))
     async def healthz() -> Any:
@@ -260,8 +260,13 @@ def _policies(app: FastAPI, directory: Path, trainer: list[Any]) -> None:
         return {"agent": name, "sha256": digest, "state": found["state"], "frame": found["frame"]}
 
 
-def _may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:
-    """Make a dependency that checks a request's token for a role."""
+def may(role: str, tokens: Tokens) -> Callable[[Request], Awaitable[None]]:
+    """Make a dependency that checks a request's token for a role.
+
+    Args:
+        role: The least role.
+        tokens: Those that hold; without any, all of this machine may.
+    """
 
     async def check(request: Request) -> None:
         # Without tokens `LocalOnly` has refused what a page of elsewhere sends.

@@ -260,3 +260,14 @@ def listening_socket(host: str, port: int) -> socket.socket:
             f"cannot serve HTTP at {host}:{port}: {error.strerror}; choose another --http HOST:PORT (0: any)"
         ) from error
     return found
+
+
+def place_of(host: str, listening: socket.socket) -> str:
+    """``HOST:PORT`` of a listening socket, as it stands in a URL.
+
+    Args:
+        host: As it was given to `listening_socket`.
+        listening: The socket.
+    """
+    shown = f"[{host}]" if ":" in host else host
+    return f"{shown}:{listening.getsockname()[1]}"

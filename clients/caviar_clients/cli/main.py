@@ -34,6 +34,7 @@ from caviar_clients.cli.shared import (
     Seed,
     Set,
     SummaryFile,
+    complete_scenario,
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
@@ -112,6 +113,9 @@ def run(
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
+    view: Annotated[
+        bool, typer.Option("--view", help="show the run in 3D: print the page's address, open a browser")
+    ] = False,
     attach: Attach = None,
     resume: Resume = None,
     force: Force = False,
@@ -129,9 +133,40 @@ def run(
     else:
         ended = run_scenario(
             source, out, _console, frames, seed, json, bind, embedded, keys, http, pace,
-            attach or (), keys_given,
+            attach or (), keys_given, view,
         )  # fmt: skip
     raise typer.Exit(ended.status)
+
+
+@app.command(rich_help_panel=LOOK)
+def view(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="directory of a run, dataset, or scenario by name or file",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
+    ],
+    beside: Annotated[
+        Path | None, typer.Option(help="a second run, at the same time and from the same place")
+    ] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="write one HTML file that opens without a server, and serve nothing")
+    ] = None,
+    limit: Annotated[
+        float,
+        typer.Option(min=0.5, help="MB of that file: fewer frames, points and pixels where it needs them"),
+    ] = 25.0,
+    episode: Annotated[int | None, typer.Option(min=0, help="of a dataset; default: its first")] = None,
+    http: Annotated[str, typer.Option(help="HOST:PORT to serve at; port 0: any free one")] = "127.0.0.1:0",
+    keys: Keys = None,
+    browser: Annotated[bool, typer.Option(help="open a browser, where there is one")] = True,
+) -> None:
+    """Show a run, an episode or a scenario in 3D in a browser: rays, beams, sensors, clock and curves."""
+    from caviar_clients.cli import view as viewer
+
+    viewer.view(source, beside, http, keys, save, limit, episode, browser)
 
 
 @app.command(rich_help_panel=RUN)

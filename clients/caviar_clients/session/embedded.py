@@ -317,11 +317,12 @@ class EmbeddedRun:
             session.report(failure, phase, episode, frame)
         self.at_work = None
         if self._encodes and type(order.message) is m.Grant:
-            elapsed, plan = time.monotonic_ns() - began, self._services[order.service]
+            now, plan = time.monotonic_ns(), self._services[order.service]
+            elapsed = now - began
             grant = order.message
             missed = elapsed > plan.budget_ns
             missed = missed and not self._plan.is_warm_up(plan, grant.episode, grant.frame)
-            self.statistics.latency(order.service, elapsed, missed)
+            self.statistics.latency(order.service, elapsed, missed, grant.episode, grant.frame, now)
 
     def _close(self, session: ServiceSession) -> None:
         self._direct, self.at_work = None, (session.name, None)

@@ -1,0 +1,135 @@
+"""Frames that a viewer shows: of a recording, of a run as it goes on, or the first scene of a scenario."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from caviar_protocol.arrays import Payload
+from caviar_protocol.errors import RecordingError
+from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.recording import FrameEntry
+from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.topics import Scene
+
+# The reader loads the arrays of every topic, which a run as it goes on does without.
+if TYPE_CHECKING:
+    from caviar_protocol.recording import Recording
+
+
+class Frames(ABC):
+    """Frames by their place: ``first`` to ``end`` − 1, in the order of (episode, frame)."""
+
+    kind: str
+    """``recording``, ``run`` or ``scenario``."""
+    scenario: Mapping[str, Any]
+    """As it was resolved."""
+    run: str
+    seed: int
+    assets: Mapping[str, Path]
+    """Files of scenery and meshes by asset name."""
+    topics: Mapping[str, Sequence[str]]
+    """Topics and their sources."""
+    damage: Sequence[str]
+    """What cannot be shown, a line each."""
+    complete: bool
+    first: int
+    """Place of the oldest frame that is held."""
+    end: int
+    """Place after the newest frame."""
+
+    @abstractmethod
+    def entry(self, place: int) -> FrameEntry:
+        """Record of a frame."""
+
+    @abstractmethod
+    def payload(self, place: int, item: GrantInput) -> Payload:
+        """Payload of one of a frame's inputs that is not absent.
+
+        Raises:
+            RecordingError: Its bytes are damaged or missing.
+        """
+
+    def answers(self) -> Mapping[str, Any]:
+        """Grants that were answered, ``answers/SERVICE`` (`caviar_broker.statistics.Statistics.answers`)."""
+        return {}
+
+
+class RecordedFrames(Frames):
+    """The frames of a recording.
+
+    Args:
+        recording: The recording.
+        assets: Files of its scenery by asset name; None: those in its own directory.
+
+    Raises:
+        RecordingError: It has no frame.
+    """
+
+    kind = "recording"
+    first = 0
+
+    def __init__(self, recording: Recording, assets: Mapping[str, Path] | None = None) -> None:
+        self._recording = recording
+        if not len(recording):
+            raise RecordingError(f"{recording.path} has no frame to show")
+        metadata = recording.metadata
+        self.scenario, self.run, self.seed = metadata.scenario, metadata.run, metadata.seed
+        self.assets, self.topics = recording.assets if assets is None else assets, recording.topics
+        self.damage, self.complete = recording.damage, recording.complete
+        self.end = len(recording)
+
+    def entry(self, place: int) -> FrameEntry:
+        """Record of a frame."""
+        return self._recording.entry(place)
+
+    def payload(self, place: int, item: GrantInput) -> Payload:
+        """Payload of one of a frame's inputs, of which the digest is checked."""
+        return self._recording.recorded_product(place, item).payload
+
+    def answers(self) -> Mapping[str, Any]:
+        """Of ``latency.npz``; none where the run did not end, or an earlier version wrote it."""
+        return self._answers
+
+    @cached_property
+    def _answers(self) -> Mapping[str, Any]:
+        try:
+            with np.load(RunDirectory(self._recording.directory).latencies) as found:
+                return {name: found[name].tolist() for name in found if name.startswith("answers/")}
+        except (OSError, ValueError):
+            return {}
+
+
+class FirstScene(Frames):
+    """The scene that a scenario begins with, as its only frame.
+
+    Args:
+        scenario: As it was resolved.
+        scene: The scene.
+        assets: Files of scenery and meshes by asset name.
+        seed: Of the run that would be.
+    """
+
+    kind, run, complete = "scenario", "", True
+    first, end = 0, 1
+    damage = ()
+
+    def __init__(
+        self, scenario: Mapping[str, Any], scene: Scene, assets: Mapping[str, Path], seed: int
+    ) -> None:
+        self.scenario, self._scene, self.assets, self.seed = scenario, scene, assets, seed
+        self.topics = {"scene": ("world",)}
+
+    def entry(self, place: int) -> FrameEntry:
+        """Record of the frame."""
+        item = GrantInput(topic="scene", source="world", status=Status.FRESH)
+        return FrameEntry(episode=0, frame=0, t_ns=0, seed=self.seed, inputs=(item,))
+
+    def payload(self, place: int, item: GrantInput) -> Payload:
+        """The scene."""
+        return self._scene
