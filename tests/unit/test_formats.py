@@ -23,6 +23,9 @@ from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.verification.verify import verify
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
+from caviar_clients.learning.recorded import RecordedBeamsEnv
+from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
+from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
@@ -30,7 +33,7 @@ from caviar_formats.testing import FormatConformance
 from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, Ros2, lobe
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError, SetupError
-from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
 from caviar_view.world import World
@@ -404,6 +407,14 @@ def test_an_imported_dataset_is_one_that_everything_takes(tmp_path: Path) -> Non
     assert "channel" in data.episode(0).topics
     assert "camera" not in data.episode(0).topics
     assert data.episode(0).metadata.notes == ("no sensors",)
+    recording = data.directory.episode(0)
+    run = RecordedRun(data.episode(0))
+    replay = plan_replay(run, request_of(run.scenario.services))
+    assert parse_scenario(scenario_text(replay.scenario)).run.frames == 2
+    training = RecordedBeamsEnv([recording], observe=("position",))
+    training.reset(seed=1)
+    info = training.step(training.action_space.sample())[-1]
+    assert info["best_abs_y"] == pytest.approx(users["link.top_abs_y"][0, :1])
 
 
 @pytest.mark.parametrize(
