@@ -721,7 +721,8 @@ def test_minari_itself_finds_what_the_environment_gave(
 ) -> None:
     minari = pytest.importorskip("minari")
     scenario = roadside.parent / "lidar.toml"
-    env = BeamSelectionEnv(scenario, observe=(*OBSERVED, "camera:camera"), directory=tmp_path / "run")
+    observe = (*OBSERVED, "camera:camera", "depth:camera")
+    env = BeamSelectionEnv(scenario, observe=observe, directory=tmp_path / "run")
     right = played(env, 2)
     out = minari_file(tmp_path / "run", tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
