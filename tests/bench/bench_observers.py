@@ -94,9 +94,7 @@ def main() -> int:
         sys.stdout.write(f"{figures[0]};{figures[1]}; {pairs[-1][0]:.3f}, {pairs[-1][1]:.3f}; {seen}\n")
         sys.stdout.flush()
     speed, cpu = (statistics.median(ratios) for ratios in zip(*pairs, strict=True))
-    text = (
-        f"{arguments.scenario}, {arguments.observers} observers: median {speed:.3f} of the frames a second, "
-    )
+    text = f"{arguments.scenario}, {arguments.observers} observers: median {speed:.3f} of the frames a second"
     text += f", {cpu:.3f} of the processor time; digests {'equal' if len(digests) == 1 else 'DIFFER'}"
     sys.stdout.write(f"{text}\n")
     if arguments.json:
