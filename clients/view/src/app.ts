@@ -16,7 +16,7 @@ import { Player } from "./player";
 import { differences, Run, usersOf } from "./run";
 import { overview } from "./scene/overview";
 import type { Pose } from "./scene/pose";
-import { Stage } from "./scene/stage";
+import { isSoftware, Stage } from "./scene/stage";
 import { DARK, LIGHT } from "./scene/theme";
 import type { Hit } from "./scene/view";
 import { isSaved, type Source } from "./source";
@@ -60,7 +60,9 @@ export class App {
     this.timeline = this.runs[0].timeline;
     this.n = this.placeOf(store.state);
     this.player = new Player(this.timeline, store, (n) => this.go(n), () => this.updateTransport());
-    this.stage = new Stage(this.origin, () => this.keepCamera(), (hit) => this.pick(hit));
+    const { quality } = store.state;
+    const isFine = quality === "fine" || (quality === "auto" && !isSoftware());
+    this.stage = new Stage(this.origin, isFine, () => this.keepCamera(), (hit) => this.pick(hit));
     this.layers = new LayersPanel(store, about);
     this.inspector = new Inspector(() => store.set({ sel: null }));
     this.pictures = new Pictures(store, about);
@@ -111,8 +113,8 @@ export class App {
     if (state.cam) this.stage.setPlace(state.cam);
     else this.goHome(state.mode);
     this.track();
-    this.stage.draw();
-    void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.refresh());
+    this.stage.start();
+    void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.render());
     void this.live?.listen();
   }
 

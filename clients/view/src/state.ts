@@ -52,6 +52,8 @@ export interface ViewState {
   speed: number;
   loop: boolean;
   theme: "auto" | "light" | "dark";
+  /** Shadows and smooth edges: as the machine can, or in any case. */
+  quality: "auto" | "fine" | "plain";
 }
 
 export const INITIAL: Readonly<ViewState> = {
@@ -69,6 +71,7 @@ export const INITIAL: Readonly<ViewState> = {
   speed: 1,
   loop: false,
   theme: "auto",
+  quality: "auto",
 };
 
 /** Write what differs from the initial view as a fragment, without `#`. */
@@ -95,6 +98,7 @@ export function toFragment(state: ViewState): string {
   put("speed", state.speed, INITIAL.speed);
   put("loop", state.loop ? 1 : 0, 0);
   put("theme", state.theme, INITIAL.theme);
+  put("quality", state.quality, INITIAL.quality);
   // Commas, slashes and colons stay readable: a fragment may hold them.
   const coded = (text: string) => encodeURIComponent(text).replace(/%(2C|2F|3A)/g, decodeURIComponent);
   return parts.map(([name, value]) => `${name}=${coded(value)}`).join("&");
@@ -139,6 +143,7 @@ export function fromFragment(fragment: string): ViewState {
     speed: SPEEDS.find((value) => value === speed) ?? INITIAL.speed,
     loop: given.get("loop") === "1",
     theme: one("theme", ["auto", "light", "dark"], INITIAL.theme),
+    quality: one("quality", ["auto", "fine", "plain"], INITIAL.quality),
   };
 }
 
