@@ -134,8 +134,10 @@ class Observers:
         return True
 
     def end(self, reason: str) -> None:
-        """Send SHUTDOWN to all: the run is over."""
-        for route in self.known:
+        """Send the last frame to all, whatever is under way, and SHUTDOWN."""
+        for route, observer in [*self.known.items()]:
+            observer.sent_at = None
+            self._offer(route, observer, time.monotonic_ns())
             self.send(route, encode_message(m.Shutdown(reason=reason)), [])
 
     # --- what comes ------------------------------------------------------------------------------------

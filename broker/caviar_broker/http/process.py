@@ -109,13 +109,16 @@ def _refuse_taken(host: str, port: int) -> None:
         ) from None
 
 
-async def serve(run: Path, address: str, keys: Path | None) -> None:
+async def serve(
+    run: Path, address: str, keys: Path | None, announce: Callable[[str], None] = lambda url: None
+) -> None:
     """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken.
 
     Args:
         run: Directory of the run.
         address: ``HOST:PORT`` to serve at.
         keys: Keys directory; None: that of the broker, if any.
+        announce: Called with the URL, once it is served.
     """
     from fastapi import Depends
 
@@ -158,7 +161,9 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
 
     # Before the address is announced: a broker that ends in between must not leave this process behind.
     call_at_end(connect(run), end)
-    await ask(do="serving", http=f"http://{place_of(host, listening)}")
+    url = f"http://{place_of(host, listening)}"
+    await ask(do="serving", http=url)
+    announce(url)
     try:
         await server.serve(sockets=[listening])
     finally:

@@ -37,7 +37,7 @@ EPOCH, ATTEMPT = 3, 2
 SEED = 11
 VERSION = (1, 7)
 """Version of the protocol that the kit plays."""
-CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "parts")
+CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "observe", "parts")
 """Capabilities of a broker of that version."""
 LEFT_OVER = 100_000
 """Messages of a life that are discarded before the next one, at most."""
