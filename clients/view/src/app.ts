@@ -308,12 +308,16 @@ export class App {
 
   /** A live run went on. */
   private async hear(news: News): Promise<void> {
-    const before = this.timeline.last;
-    this.timeline.grow(news.first, news.frames);
+    this.timeline.grow(news.first, news.added);
     this.dock.setNews(news);
-    if (this.timeline.last !== before && this.store.state.n === null) await this.show(this.timeline.last);
-    else this.redraw();
+    if (this.catchingUp) return;
+    // One frame after the other: each newer one would break off the one before, and none would be shown.
+    this.catchingUp = true;
+    while (this.store.state.n === null && this.n !== this.timeline.last) await this.show(this.timeline.last);
+    this.catchingUp = false;
+    this.redraw();
   }
+  private catchingUp = false;
 
   /** Report an error where the reader sees it. */
   report(text: string): void {

@@ -130,5 +130,7 @@ export interface News {
   state: string;
   paused: boolean;
   waits: { service: string; what: string; elapsed_s: number }[];
-  events: (string | { n?: number; text: string })[];
+  /** Frames that came since the news before. */
+  added: Block[];
+  events?: (string | { n?: number; text: string })[];
 }

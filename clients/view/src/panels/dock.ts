@@ -54,7 +54,7 @@ export class Dock {
     if (this.element.firstChild !== panel.element) fill(this.element, panel.element);
     const [{ timeline }] = this.runs;
     const window = WINDOW * timeline.every;
-    const start = timeline.first + Math.floor((n - timeline.first) / window) * window;
+    const start = Math.max(timeline.first, Math.floor(n / window) * window);
     const key = dock === "clock" ? `clock ${start}` : `curves ${user && userKey(user)}`;
     const isOld = this.runs[0].about.live && performance.now() - this.refreshed > REFRESH_MS;
     if (key !== this.asked || isOld) {
