@@ -67,7 +67,12 @@ export class App {
     this.inspector = new Inspector(() => store.set({ sel: null }));
     this.pictures = new Pictures(store, about);
     this.live = about.live
-      ? new Live(runs[0].source, (news) => void this.hear(news), (text) => this.report(text))
+      ? new Live(
+          runs[0].source,
+          (news) => void this.hear(news),
+          (reason) => this.banner.show(`The run has ended. ${reason}`),
+          (text) => this.report(text),
+        )
       : null;
     this.dock = new Dock(store, this.runs, (n) => this.seek(n), (name) => void this.live?.command(name));
     this.transport = new Transport(store, this.timeline, about.live, this.dock.tabs, {
@@ -106,7 +111,8 @@ export class App {
     this.applyTheme();
     const report = (text: string) => this.report(text);
     await Promise.all(this.runs.map(({ view }) => view.load(report).catch((error: Error) => report(error.message))));
-    this.stage.setCovered(this.layers.element.offsetWidth + 10);
+    this.layers.element.hidden = !state.panel;
+    this.stage.setCovered(this.layers.element.offsetWidth);
     this.stage.setViews(this.runs.map(({ view }) => view));
     await this.show(this.n);
     for (const line of [...this.about.damage, ...(this.about.notes ?? [])]) report(line);
@@ -172,6 +178,9 @@ export class App {
     await this.correct(n, loaded[0].frame?.info ?? null);
     if (this.runs.length > 1) this.compare();
     this.banner.clear();
+    for (const { topic, reason, failed } of loaded.flatMap(({ frame }) => frame?.absent ?? [])) {
+      if (failed) this.report(`${topic} is not shown. ${reason}`);
+    }
     for (const run of this.runs) run.drawTrails(n);
     this.redraw();
     this.track();
@@ -226,6 +235,10 @@ export class App {
     const n = this.placeOf(state);
     if (changed.has("n") && n !== this.n) void this.show(n);
     else if (changed.has("layers") || changed.has("user") || changed.has("pics")) void this.show(this.n);
+    if (changed.has("panel")) {
+      this.layers.element.hidden = !state.panel;
+      this.stage.setCovered(this.layers.element.offsetWidth);
+    }
     if (changed.has("mode") || changed.has("sel")) this.track();
     this.redraw();
     this.writeAddress();
@@ -321,7 +334,7 @@ export class App {
 
   /** Report an error where the reader sees it. */
   report(text: string): void {
-    this.errors.push(text);
+    if (!this.errors.includes(text)) this.errors.push(text);
     this.banner.show(text);
   }
 
@@ -363,6 +376,7 @@ export class App {
       key(["b"], "B", "look from the selection", () => mode("board")),
       key(["c"], "C", "clock", () => this.dock.toggle("clock")),
       key(["v"], "V", "curves", () => this.dock.toggle("curves")),
+      key(["p"], "P", "panel of layers", () => store.set({ panel: !store.state.panel })),
       key(["d"], "D", "light, dark", () => toggleTheme(store)),
       key(["Escape"], "Esc", "clear the selection", () => store.set({ sel: null, mode: "free" })),
       key(["?"], "?", "this help", () => showHelp(this.keyActions())),

@@ -139,7 +139,7 @@ export class Run {
         lobe = await this.source.json<Lobe>(`frames/${frame.n}/lobes`, { device: device.name, beam }, signal);
       } catch (error) {
         if (signal.aborted) throw error;
-        frame.absent.push({ topic: "link", source: device.name, reason: `lobe of beam ${beam}: ${(error as Error).message}` });
+        frame.absent.push({ topic: "link", source: device.name, reason: (error as Error).message, failed: true });
         return null;
       }
       this.lobes.set(key, lobe);

@@ -49,6 +49,8 @@ export interface ViewState {
   /** Topic of the pictures in the corner; null: the first that there is. */
   pics: PictureTopic | null;
   dock: Dock;
+  /** Whether the panel with layers and colours is there. */
+  panel: boolean;
   speed: number;
   loop: boolean;
   theme: "auto" | "light" | "dark";
@@ -68,6 +70,7 @@ export const INITIAL: Readonly<ViewState> = {
   layers: new Set(DEFAULT_LAYERS),
   pics: null,
   dock: "none",
+  panel: true,
   speed: 1,
   loop: false,
   theme: "auto",
@@ -95,6 +98,7 @@ export function toFragment(state: ViewState): string {
   put("layers", layers, DEFAULT_LAYERS.join(","));
   put("pics", state.pics, INITIAL.pics);
   put("dock", state.dock, INITIAL.dock);
+  put("panel", state.panel ? 1 : 0, 1);
   put("speed", state.speed, INITIAL.speed);
   put("loop", state.loop ? 1 : 0, 0);
   put("theme", state.theme, INITIAL.theme);
@@ -140,6 +144,7 @@ export function fromFragment(fragment: string): ViewState {
     layers: layers ? new Set(ALL.filter((layer) => layers.includes(layer))) : INITIAL.layers,
     pics: PICTURES.find((topic) => topic === given.get("pics")) ?? null,
     dock: one("dock", Object.keys(DOCKS) as Dock[], INITIAL.dock),
+    panel: given.get("panel") !== "0",
     speed: SPEEDS.find((value) => value === speed) ?? INITIAL.speed,
     loop: given.get("loop") === "1",
     theme: one("theme", ["auto", "light", "dark"], INITIAL.theme),

@@ -132,5 +132,7 @@ export interface News {
   waits: { service: string; what: string; elapsed_s: number }[];
   /** Frames that came since the news before. */
   added: Block[];
+  /** Why there are no more. */
+  ended?: string;
   events?: (string | { n?: number; text: string })[];
 }

@@ -77,6 +77,7 @@ export class LayersPanel {
   }
 
   update(state: ViewState, input: LayersInput): void {
+    this.element.hidden = !state.panel;
     for (const [layer, box] of this.shown) box.checked = state.layers.has(layer as Layer);
     this.coloring.value = state.color;
     this.mode.value = state.mode;

@@ -68,6 +68,7 @@ export class Stage {
 
   setViews(views: RunView[]): void {
     this.views = views;
+    this.element.classList.toggle("two", views.length > 1);
     this.measure();
   }
 
