@@ -118,7 +118,7 @@ export class App {
     for (const line of [...this.about.damage, ...(this.about.notes ?? [])]) report(line);
     if (state.cam) this.stage.setPlace(state.cam);
     else this.goHome(state.mode);
-    this.track();
+    this.track(state.cam !== null);
     this.stage.start();
     void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.render());
     void this.live?.listen();
@@ -282,14 +282,14 @@ export class App {
   }
 
   /** Follow the selection with the camera, or look from it. */
-  private track(): void {
+  private track(keep = false): void {
     const { sel } = this.store.state;
     const { objects, devices } = this.runs[0].view;
     const object = sel === null ? undefined : objects.shown.get(sel);
     const device = sel === null ? undefined : devices.shown.get(sel);
     const pose: Pose | null = object?.pose ?? device?.pose ?? null;
     const fieldOfView = device?.device.type === "camera" ? device.device.field_of_view : null;
-    this.stage.track(pose, object?.size ?? [1, 1, 1], fieldOfView);
+    this.stage.track(pose, object?.size ?? [1, 1, 1], fieldOfView, keep);
   }
 
   private goHome(mode: Mode = "free"): void {
@@ -298,7 +298,7 @@ export class App {
     const covered = this.runs.length === 1 ? this.layers.element.offsetWidth : 0;
     const aspect = (clientWidth - covered) / clientHeight / this.runs.length;
     this.stage.setPlace(overview(this.runs[0].view, this.origin, aspect));
-    this.store.set({ cam: null });
+    this.keepCamera();
   }
 
   private keepCamera(): void {
@@ -341,7 +341,12 @@ export class App {
   private writeAddress(): void {
     clearTimeout(this.writing);
     // Browsers refuse more than some hundred a minute.
-    this.writing = setTimeout(() => history.replaceState(null, "", `#${toFragment(this.store.state)}`), 300);
+    this.writing = setTimeout(() => history.replaceState(null, "", this.address()), 300);
+  }
+
+  /** Fragment of the view, with the camera where it has followed to. */
+  private address(): string {
+    return `#${toFragment({ ...this.store.state, cam: this.stage.place })}`;
   }
 
   private announce(): void {

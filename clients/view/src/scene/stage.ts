@@ -106,8 +106,14 @@ export class Stage {
     this.render();
   }
 
-  /** Follow a pose, or look from it, as the mode says. `size` is that of the object that has it [m]. */
-  track(pose: Pose | null, size: Vector, fieldOfView: number | null): void {
+  /**
+   * Follow a pose, or look from it, as the mode says.
+   *
+   * @param size of the object that has it [m]
+   * @param fieldOfView of a camera, horizontally [rad]
+   * @param keep whether the camera already is where it follows from
+   */
+  track(pose: Pose | null, size: Vector, fieldOfView: number | null, keep: boolean): void {
     const mode = this.state?.mode ?? "free";
     if (!pose || mode === "free") {
       this.followed = null;
@@ -119,11 +125,11 @@ export class Stage {
       if (this.followed) {
         const moved = at.clone().sub(this.followed);
         this.camera.position.add(moved);
-      } else {
-        // From behind and above, as near as shows the object in its street.
+      } else if (!keep) {
+        // From the same side, as near as shows the object in its street.
         const away = this.camera.position.clone().sub(this.controls.target).normalize();
-        const distance = Math.max(25, 6 * Math.max(...size));
-        this.camera.position.copy(at).addScaledVector(away, Math.min(distance, this.camera.position.distanceTo(at)));
+        const distance = Math.min(Math.max(25, 6 * Math.max(...size)), this.camera.position.distanceTo(at));
+        this.camera.position.copy(at).addScaledVector(away, distance);
       }
       this.controls.target.copy(at);
       this.followed = at;
@@ -132,8 +138,8 @@ export class Stage {
       this.controls.enabled = false;
       const ahead = new Vector3(...rotate(pose.orientation, [1, 0, 0]));
       const up = new Vector3(...rotate(pose.orientation, [0, 0, 1]));
-      // A camera looks from where it is, an object from above its roof.
-      if (fieldOfView === null) at.addScaledVector(up, 0.5 * size[2] + 0.4);
+      // A camera looks from where it is, an object from above the front of its roof.
+      if (fieldOfView === null) at.addScaledVector(ahead, 0.45 * size[0]).addScaledVector(up, 0.5 * size[2] + 0.4);
       this.camera.position.copy(at);
       this.camera.up.copy(up);
       this.controls.target.copy(at).addScaledVector(ahead, 10);
