@@ -19,7 +19,7 @@ import type { Pose } from "./scene/pose";
 import { isSoftware, Stage } from "./scene/stage";
 import { DARK, LIGHT } from "./scene/theme";
 import type { Hit } from "./scene/view";
-import { isSaved, type Source } from "./source";
+import { isSaved, type Source, takeToken } from "./source";
 import { type Changed, fromFragment, type Mode, SPEEDS, type Store, toFragment, type ViewState } from "./state";
 import type { Timeline } from "./timeline";
 import type { About, News, User, Vector } from "./types";
@@ -96,7 +96,10 @@ export class App {
     );
     listenToKeys(actions);
     store.listen((state, changed) => this.changed(state, changed));
-    addEventListener("hashchange", () => store.set(fromFragment(location.hash)));
+    addEventListener("hashchange", () => {
+      takeToken();
+      store.set(fromFragment(location.hash));
+    });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.applyTheme());
   }
 

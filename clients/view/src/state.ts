@@ -10,8 +10,8 @@ export const LAYERS = {
   devices: "Devices",
   rays: "Rays",
   beams: "Beams",
-  lidar: "LIDAR points",
-  frusta: "Camera frusta",
+  lidar: "LIDAR",
+  frusta: "Frusta",
   pictures: "Pictures",
   grid: "Grid",
 } as const;

@@ -37,7 +37,8 @@ export class Dock {
     ] as const) {
       this.buttons.set(choice, el("button", { type: "button", class: "tab", title, click: () => this.toggle(choice) }, text));
     }
-    this.tabs = [...this.buttons.values()];
+    // A scenario that has not run has neither.
+    this.tabs = about.kind === "scenario" ? [] : [...this.buttons.values()];
   }
 
   toggle(choice: Choice): void {

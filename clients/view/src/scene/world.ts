@@ -195,6 +195,8 @@ function skyMaterial(): ShaderMaterial {
       void main() {
         vDirection = position;
         gl_Position = projectionMatrix * vec4(mat3(viewMatrix) * position, 1.0);
+        // Behind all else: its own distance may be before the nearest place.
+        gl_Position.z = 0.999 * gl_Position.w;
       }`,
     fragmentShader: `
       uniform vec3 uZenith, uHorizon;
