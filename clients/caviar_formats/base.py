@@ -64,9 +64,13 @@ class Format:
     flavours: ClassVar[Mapping[str, str]] = {}
     """Variants of the format by name, with what each is; the first is the default."""
     packages: ClassVar[Sequence[str]] = ()
-    """Modules beyond the base installation that it imports; extra `formats` brings those of `FORMATS`."""
+    """Modules beyond the base installation that it imports."""
+    extra: ClassVar[str] = "formats"
+    """Extra that brings them."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
+    needs_users: ClassVar[bool] = True
+    """Whether there is no export of scenes without users."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
     temporary: ClassVar[Sequence[str]] = ()
@@ -138,6 +142,7 @@ class Format:
 FORMATS: Mapping[str, str] = {
     "deepmimo": "caviar_formats.deepmimo:DeepMimo",
     "deepsense": "caviar_formats.deepsense:DeepSense",
+    "foxglove": "caviar_formats.viewers:Foxglove",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "minari": "caviar_formats.minari:Minari",
@@ -146,7 +151,10 @@ FORMATS: Mapping[str, str] = {
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
     "pcd": "caviar_formats.traces:Pcd",
+    "rerun": "caviar_formats.viewers:Rerun",
+    "ros2": "caviar_formats.viewers:Ros2",
     "sionna": "caviar_formats.npz:Sionna",
+    "viwi": "caviar_formats.viwi:ViWi",
 }
 """Places of the formats that come with this distribution, by name."""
 
@@ -169,7 +177,7 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     if cls is None:
         raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
     if lacking := [module for module in cls.packages if find_spec(module) is None]:
-        raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command('formats')}")
+        raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command(cls.extra)}")
     found: Format = cls(flavour)
     return found
 
@@ -203,7 +211,7 @@ def export_users(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunError(f"{out} is there and not empty; choose another folder with --out")
-    if not len(users):
+    if not len(users) and to.needs_users:
         raise RunError(f"{users.dataset.location} has no such users to export; record scene and channel")
     if lacking := [name for name in to.needs if name not in users.recorded()]:
         users.check_names(lacking)

@@ -21,8 +21,8 @@ def export_command(
         str,
         typer.Option(
             metavar="NAME",
-            help="npz, parquet, huggingface, sionna, itu, deepmimo, deepsense, minari, ns3-qd, pcd, or an "
-            "installed package's",
+            help="npz, parquet, huggingface, sionna, itu, deepmimo, deepsense, minari, ns3-qd, pcd, "
+            "viwi, foxglove, ros2, rerun, or an installed package's",
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder that is made")],

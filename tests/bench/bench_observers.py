@@ -4,7 +4,7 @@
         [--period S] [--json FILE]
 
 Each observer is a process of its own that gets every product of the newest frame, once in ``--period`` at
-most (0: as often as it can), and decodes none. Prints the frames a second of each pair of runs, their ratios,
+most (0.04 s, as pages do; 0: as often as it can), and decodes none. Prints the frames a second of each pair of runs, their ratios,
 and whether the digests are equal; the exit status is 1 where they are not.
 """
 
@@ -63,7 +63,7 @@ def main() -> int:
     parser.add_argument("--observers", type=int, default=3)
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--frames", type=int, default=0, help="instead of the scenario's")
-    parser.add_argument("--period", type=float, default=0.0, help="[s] from one observation to the next")
+    parser.add_argument("--period", type=float, default=0.04, help="[s] from one observation to the next")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--watch", help=argparse.SUPPRESS)
     parser.add_argument("--name", help=argparse.SUPPRESS)

@@ -78,14 +78,14 @@ def test_rays_run_from_transmitter_over_their_points_to_the_receiver():
     assert not len(found.tick_gains)
     assert len(lines) == 4  # two cars with two paths each, the third has none
     receiver = next(d for d in data.scene.devices if d.name == "car.1/rx")
-    end = device_pose(data.scene, receiver).position[:2]
+    end = device_pose(data.scene, receiver).position
     direct, bounced = (line for line in lines if np.allclose(line[-1], end))
-    assert direct.shape == (2, 2)
-    assert bounced.shape == (3, 2)
+    assert direct.shape == (2, 3)
+    assert bounced.shape == (3, 3)
     assert bounced[1, 1] == pytest.approx(30.0)
     for line in (direct, bounced):
-        np.testing.assert_allclose(line[0], [0.0, 20.0])
-    strongest = 20 * math.log10(1e-3 / np.linalg.norm(np.array(end) - [0, 20]))
+        np.testing.assert_allclose(line[0][:2], [0.0, 20.0])
+    strongest = 20 * math.log10(1e-3 / np.linalg.norm(np.array(end[:2]) - [0, 20]))
     assert gains.max() == pytest.approx(strongest, abs=2.0)
 
 

@@ -206,7 +206,7 @@ def draw_rays(axes: Any, drawn: Rays, limits: tuple[float, float]) -> list[Any]:
     for lines, gains, width in ((drawn.lines, drawn.gains, 1.1), (ticks, drawn.tick_gains, 2.0)):
         order = np.argsort(gains, kind="stable")
         if len(order):
-            ordered: list[Any] = [lines[i] for i in order]
+            ordered: list[Any] = [lines[i][:, :2] for i in order]
             collections.append(LineCollection(ordered, array=gains[order], linewidths=width, **style))
             axes.add_collection(collections[-1])
     return collections

@@ -1,4 +1,4 @@
-"""Shapes that a map draws: the paths of a channel, objects and scenery from above."""
+"""Shapes that maps and viewers draw: the paths of a channel, objects and scenery from above."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _STRAIGHT = np.cos(np.radians(0.5))
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Paths seen from above; gains are those of the first carrier [dB].
+    """Paths in the world; gains are those of the first carrier [dB].
 
     A path without interaction points is a line only if it leaves and arrives along the straight line
     between its ends. Otherwise, as with components that a statistical model draws, its route is
@@ -37,13 +37,13 @@ class Rays:
     """
 
     lines: list[Float64Array]
-    """x and y [m] of transmitter, points and receiver, Shape ``[N, 2]`` each."""
+    """Transmitter, points and receiver [m], Shape ``[N, 3]`` each."""
     gains: Float64Array
     """Shape ``[lines]``."""
     ends: Float64Array
-    """Where ticks stand, x and y [m], Shape ``[T, 2]``."""
+    """Where ticks stand [m], Shape ``[T, 3]``."""
     towards: Float64Array
-    """Directions of the ticks, unit vectors in space of which x and y are kept, Shape ``[T, 2]``."""
+    """Directions of the ticks, unit vectors, Shape ``[T, 3]``."""
     tick_gains: Float64Array
     """Shape ``[T]``."""
 
@@ -53,7 +53,7 @@ class Rays:
         return np.concatenate([self.gains, self.tick_gains])
 
     def ticks(self, length_m: float) -> Float64Array:
-        """Compute both ends of each tick in x and y [m], Shape ``[T, 2, 2]``."""
+        """Compute both ends of each tick [m], Shape ``[T, 2, 3]``."""
         result: Float64Array = np.stack([self.ends, self.ends + length_m * self.towards], axis=1)
         return result
 
@@ -88,13 +88,13 @@ def rays(scene: Scene, channel: Channel | None) -> Rays:
                 for path, is_known in zip(strongest, known, strict=True):
                     gain = 10 * float(np.log10(power[path]))
                     if is_known:
-                        lines.append(np.vstack([start, channel.points[path][used[path]], end])[:, :2])
+                        lines.append(np.vstack([start, channel.points[path][used[path]], end]))
                         gains.append(gain)
                     else:
                         ticks += [np.stack([start, leaving[path]]), np.stack([end, coming[path]])]
                         tick_gains += [gain, gain]
     table = np.array(ticks).reshape(-1, 2, 3)
-    return Rays(lines, np.array(gains), table[:, 0, :2], table[:, 1, :2], np.array(tick_gains))
+    return Rays(lines, np.array(gains), table[:, 0], table[:, 1], np.array(tick_gains))
 
 
 def scale(gains: Float64Array) -> tuple[float, float]:
