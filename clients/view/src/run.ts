@@ -15,7 +15,7 @@ import type { AntennaDevice, Scene } from "../../js/src/types.d.ts";
 const TRAIL = 30;
 const AT_ONCE = 4;
 /** Length of the strongest direction of a lobe, of the distance between both ends: of TX and of RX. */
-const LOBE_SHARE = { tx: 0.5, rx: 0.15 };
+const LOBE_SHARE = { tx: 0.42, rx: 0.15 };
 
 export class Run {
   readonly timeline: Timeline;
@@ -139,7 +139,7 @@ export class Run {
         lobe = await this.source.json<Lobe>(`frames/${frame.n}/lobes`, { device: device.name, beam }, signal);
       } catch (error) {
         if (signal.aborted) throw error;
-        frame.absent.push({ topic: "link", source: device.name, reason: `lobe of beam ${beam}: ${(error as Error).message}` });
+        frame.absent.push({ topic: "link", source: device.name, reason: (error as Error).message, failed: true });
         return null;
       }
       this.lobes.set(key, lobe);

@@ -130,5 +130,9 @@ export interface News {
   state: string;
   paused: boolean;
   waits: { service: string; what: string; elapsed_s: number }[];
-  events: (string | { n?: number; text: string })[];
+  /** Frames that came since the news before. */
+  added: Block[];
+  /** Why there are no more. */
+  ended?: string;
+  events?: (string | { n?: number; text: string })[];
 }

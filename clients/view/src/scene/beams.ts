@@ -47,7 +47,7 @@ export class Beams {
     const shared = { color, transparent: true, side: DoubleSide, depthWrite: false };
     const surface = new Mesh(
       surfaceGeometry(lobe, radius),
-      new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.2 }),
+      new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.14 }),
     );
     const [w, x, y, z] = pose.orientation;
     surface.quaternion.set(x, y, z, w);
