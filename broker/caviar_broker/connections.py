@@ -18,6 +18,7 @@ from caviar_broker.assets import AssetExchange
 from caviar_broker.core import events as ev
 from caviar_broker.core.clock import FrameClock
 from caviar_broker.event_loop import EventLoop
+from caviar_broker.observers import Observers
 from caviar_broker.security.access import Access, check_bind
 from caviar_broker.security.limits import FRAMING, NoticeThrottle, PeerGuard, PeerLimits
 from caviar_broker.supervision import Watchdog
@@ -265,13 +266,24 @@ class Connections:
         self._host = host_identity()
         # Whose HELLO the clock looks at.
         self._replying = b""
+        self.observers = Observers(
+            clock=self.clock,
+            epoch=self.epoch,
+            patience_ns=self._guard.limits.observer_ns,
+            send=self.router.send,
+            cut=lambda route, why: self._guard.cut(route, why, bar=False),
+            note=self.note_rarely,
+        )
+        """Peers that are no services."""
         self._guard.start(self.loop, self._cut_off, self._gone, self._refused)
 
     # --- what comes ----------------------------------------------------------------------------------
 
     def from_stranger(self, route: bytes, message: m.Message) -> None:
-        """A message on a connection that has not said who it is."""
-        if not isinstance(message, m.Hello | m.Attach):
+        """A message on a connection that has not said who it is, or is an observer's."""
+        if route in self.observers.known:
+            self.observers.handle(route, message)
+        elif not isinstance(message, m.Hello | m.Attach):
             kind = message_type(message)
             text = f"{kind} came before HELLO or ATTACH"
             self.reply(route, m.Error(code="unknown-peer", of=kind, message=text))
@@ -322,6 +334,14 @@ class Connections:
     def _hello(self, route: bytes, hello: m.Hello) -> None:
         if why := self._guard.refusal(route, hello.name, hello.role, hello.outputs):
             self._unauthorized(route, f"HELLO as {hello.name!r} ({hello.role}): {why}")
+            return
+        if hello.role == "observer":
+            refusal = self.observers.join(route, hello, self._guard.is_open)
+            if refusal is None:
+                self._guard.admit_service(route, hello.name)
+            else:
+                self._replying = route
+                self.turn_away(ev.TurnAway("", refusal))
             return
         before = self.clock.member(hello.name)
         attempt = before.attempt if before else 0
@@ -387,7 +407,7 @@ class Connections:
         """A peer took more than its share, or may not take part any more: whether it was a service."""
         connection = self.known.pop(route, None)
         if connection is None:
-            return False
+            return self.observers.lost(route, f"it was disconnected: {why}")
         for other in [r for r, c in self.known.items() if c.service == connection.service]:
             self._guard.cut(other, why)
         self.feed(ev.Lost(connection.service, f"it was cut off: {why}"))
@@ -397,6 +417,7 @@ class Connections:
         """A connection has ended: a remote service is lost; of a local one the operating system tells."""
         connection = self.known.get(route)
         if connection is None:
+            self.observers.lost(route, self._guard.gone_words)
             return
         service = connection.service
         if connection.heartbeat:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import zmq
@@ -51,7 +52,7 @@ which the next frame would wait for."""
 _CAN_WAIT = frozenset({ev.Notice, ev.Latency, ev.FrameFinished})
 
 
-class Observer(Protocol):
+class Listener(Protocol):
     """Gets what happens in a run: the command line, a log, a page. Must not wait."""
 
     def notice(self, notice: ev.Notice) -> None:
@@ -68,7 +69,7 @@ class BrokerServer:
         plan: The run.
         endpoint: Address to bind, ``tcp://127.0.0.1:0`` for any free port.
         journal: Where decisions are written.
-        observer: Gets notices and finished frames.
+        listener: Gets notices and finished frames.
         store: Where scenery is kept.
         supervised: Services whose death a launcher reports, which knows their exit status and last words.
         access: The keys of those who may take part; None: every process of this machine may.
@@ -83,7 +84,7 @@ class BrokerServer:
         plan: RunPlan,
         endpoint: str,
         journal: JournalFile,
-        observer: Observer,
+        listener: Listener,
         store: AssetStore | None = None,
         supervised: Sequence[str] = (),
         access: Access | None = None,
@@ -95,7 +96,7 @@ class BrokerServer:
         self.clock = FrameClock(plan, time.monotonic_ns(), payload_size=_payload_size, resumption=resumption)
         self.statistics = Statistics({s.name: s.budget_ns for s in plan.services})
         self.outcome: ev.Finished | None = None
-        self._plan, self._observer = plan, observer
+        self._plan, self._listener = plan, listener
         # Number of the last journal entry that the clock knows to be handed over.
         self._confirmed = 0
         # [s] for which the disk had taken nothing at the last notice; 0: it takes what comes.
@@ -161,6 +162,7 @@ class BrokerServer:
             perform=self._perform,
             note=self.note,
         )
+        self._observers = self._connections.observers
         # On the path of every frame: looked up without a detour.
         self._known, self._routes = self._connections.known, self._connections.routes
         self._handlers: dict[type, Callable[[str, Any, Sequence[zmq.Frame]], None]] = {
@@ -181,7 +183,7 @@ class BrokerServer:
         self._performers: dict[type, Callable[[Any], None]] = {
             ev.Latency: self._latency,
             ev.Overdue: lambda a: self.statistics.decision(time.monotonic_ns() - a.due_ns),
-            ev.Notice: self._observer.notice,
+            ev.Notice: self._listener.notice,
             ev.FrameFinished: self._frame_finished,
             ev.EpisodeFinished: lambda _: None,  # its frames are reported one by one
             ev.TurnAway: self._connections.turn_away,
@@ -207,12 +209,18 @@ class BrokerServer:
             self._standby.run(begin)
         finally:
             self._watchdog.close()
+            self._observers.end(self.clock.error or m.RUN_COMPLETE)
             self._router.close()
             self.disk_answers = not self._standby.calling and self._journal.close()
             self._standby.close()
         if self.outcome is None:
             raise AssertionError("the loop ended before the run")
         return self.outcome
+
+    def scenery(self) -> dict[str, Path]:
+        """Files of the run's scenery by asset name; those that are on their way are left out."""
+        store = self._assets.store
+        return {asset.name: store.path(asset.digest) for asset in self.clock.scenery if store.holds(asset)}
 
     @property
     def cpu_s(self) -> float:
@@ -261,6 +269,7 @@ class BrokerServer:
             self._sign.touch()
             self._guard.check(now)
             self._look_at_disk()
+            self._observers.check(now)
         self._write_journal()
         now = time.monotonic_ns()  # the disk may have taken its time
         deadline = self.clock.next_deadline()
@@ -392,7 +401,9 @@ class BrokerServer:
     def _frame_finished(self, action: ev.FrameFinished) -> None:
         self.clock.digest.fold()
         self.statistics.frame(time.monotonic_ns(), action.episode, action.lag_ns)
-        self._observer.frame(action, self.statistics)
+        self._listener.frame(action, self.statistics)
+        if self._observers.known:
+            self._observers.frame_finished()
 
     def _send(self, action: ev.Send) -> None:
         parts: list[Any] = []
@@ -416,8 +427,8 @@ class BrokerServer:
         self._connections.reply(self._routes[service], message, *parts)
 
     def note(self, service: str, text: str, kind: str = "note") -> None:
-        """Tell the observer something about a service, or in general."""
-        self._observer.notice(ev.Notice(kind, service, one_line(text), self.clock.episode))
+        """Tell the listener something about a service, or in general."""
+        self._listener.notice(ev.Notice(kind, service, one_line(text), self.clock.episode))
 
 
 def _payload_size(payload: Sequence[zmq.Frame]) -> int:

@@ -80,17 +80,20 @@ class Statistics:
         self._slips = self._worst_slip = self._lag = 0
         self._lag_of_episode = (0, 0)
 
-    def latency(self, service: str, elapsed_ns: int, missed: bool, *answer: int) -> None:
+    def latency(
+        self, service: str, elapsed_ns: int, missed: bool, episode: int = 0, frame: int = 0, now: int = 0
+    ) -> None:
         """A grant was answered, or its deadline passed.
 
         Args:
             service: Which was granted.
             elapsed_ns: From GRANT to answer or deadline [ns].
             missed: Whether its budget was up.
-            answer: Episode and frame of the grant, and when it was answered [ns].
+            episode, frame: Of the grant.
+            now: The time [ns].
         """
         self._latencies[service].append(elapsed_ns)
-        self._answers[service].extend(answer)
+        self._answers[service].extend((episode, frame, now))
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
 
@@ -195,6 +198,10 @@ class Statistics:
             np.savez_compressed(path, **figures)
         except OSError:
             path.unlink(missing_ok=True)
+
+    def granted(self, service: str) -> int:
+        """Number of a service's grants that were answered, or overdue."""
+        return len(self._latencies[service])
 
     def answers(self, service: str, first: int = 0) -> Int64Array:
         """Grants of a service in the order of their answers, from the ``first``-th on.

@@ -145,15 +145,17 @@ class Answers:
             **self.world.about(),
         }
 
-    def blocks(self) -> list[dict[str, int]]:
-        """Runs of consecutive frames: episode, first frame, its place, and their number."""
+    def blocks(self, first: int = 0) -> list[dict[str, int]]:
+        """Runs of consecutive frames from a place on: episode, first frame, its place, and their number."""
 
         def block(place: int) -> tuple[int, int]:
             entry = self.frames.entry(place)
             return entry.episode, entry.frame - place
 
         found = []
-        for (episode, offset), places in groupby(range(self.frames.first, self.frames.end), block):
+        for (episode, offset), places in groupby(
+            range(max(first, self.frames.first), self.frames.end), block
+        ):
             held = list(places)
             found.append(
                 {
@@ -295,7 +297,7 @@ class Answers:
         places = range(first, min(first + min(count, 1000), self.frames.end))
         services: Mapping[str, Any] = self.frames.scenario.get("services") or {}
         answered = {
-            name: {(episode, frame): (at, took) for episode, frame, at, took in table.tolist()}
+            name: {(episode, frame): (at, took) for episode, frame, at, took in table}
             for name in services
             if (table := self.frames.answers().get(f"answers/{name}")) is not None
         }

@@ -100,7 +100,7 @@ class RecordedFrames(Frames):
     def _answers(self) -> Mapping[str, Any]:
         try:
             with np.load(RunDirectory(self._recording.directory).latencies) as found:
-                return {name: found[name] for name in found if name.startswith("answers/")}
+                return {name: found[name].tolist() for name in found if name.startswith("answers/")}
         except (OSError, ValueError):
             return {}
 

@@ -77,6 +77,8 @@ class Format:
     """Folders of the export that are removed once `finish` has made files of them."""
     frequency_hz: float | None = None
     """Of the carrier, where the files that are read do not have it [Hz]."""
+    origin: tuple[float, float] | None = None
+    """Latitude and longitude of the origin of the world [°], where the dataset does not have them."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -139,9 +141,11 @@ class Format:
 
 FORMATS: Mapping[str, str] = {
     "deepmimo": "caviar_formats.deepmimo:DeepMimo",
+    "deepsense": "caviar_formats.deepsense:DeepSense",
     "foxglove": "caviar_formats.viewers:Foxglove",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
+    "minari": "caviar_formats.minari:Minari",
     "npz": "caviar_formats.npz:Npz",
     "ns3-qd": "caviar_formats.traces:Ns3Qd",
     "p2m": "caviar_formats.p2m:P2m",
@@ -243,16 +247,14 @@ def export_users(
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:
     """Cut users into those of `SCENES` scenes each; both are sorted by episode and scene."""
     scenes = users.dataset.table("scenes")
-    numbers = np.stack([scenes["episode"], scenes["scene"]], axis=1)
-    of_user = np.stack([users["episode"], users["scene"]], axis=1)
-    place = {key: at for at, key in enumerate(map(tuple, numbers.tolist()))}
-    at = np.array([place[key] for key in map(tuple, of_user.tolist())])
+    span = scenes["scene"].max() + 1
+    of_scene, of_user = (table["episode"] * span + table["scene"] for table in (scenes, users))
     starts = np.arange(0, len(scenes), SCENES)
     if whole_episodes:
         starts = np.unique(np.searchsorted(scenes["episode"], scenes["episode"][starts]))
     for number, (start, stop) in enumerate(pairwise([*starts.tolist(), len(scenes)])):
-        in_part = np.flatnonzero((at >= start) & (at < stop))
-        yield Part(number, users[in_part], scenes.where(np.arange(start, stop)))
+        low, high = np.searchsorted(of_user, of_scene[[start, stop - 1]] + [0, 1]).tolist()
+        yield Part(number, users[low:high], scenes.where(np.arange(start, stop)))
 
 
 def _identity(users: Users, to: Format) -> str:
@@ -260,7 +262,8 @@ def _identity(users: Users, to: Format) -> str:
     keys = [users[name].tolist() for name in ("episode", "scene", "carrier", "tx", "rx")]
     digests = users.dataset.table("episodes")["digest"].tolist()
     content = hashlib.sha256(msgspec.json.encode([digests, keys])).hexdigest()
-    return f"{type(to).__module__}:{type(to).__qualname__}:{to.flavour}:{content}"
+    origin = ":{},{}".format(*to.origin) if to.origin else ""
+    return f"{type(to).__module__}:{type(to).__qualname__}:{to.flavour}{origin}:{content}"
 
 
 def _continued(folder: Path, export: str) -> _State:
@@ -286,6 +289,25 @@ def _readme(users: Users, to: Format) -> str:
     made = ", ".join(f"{name} {version}" for name, version in dataset.settings["versions"].items())
     counts = f"{len(dataset):,} episodes, {len(users):,} users"
     return f"{text}{lost}\n\n## Origin\n\nDataset `{dataset.name}` of CAVIAR: {counts}; {made}.\n"
+
+
+def only_one(users: Users, column: str) -> str:
+    """Find the one carrier, or transmitter, that a format has room for.
+
+    Args:
+        users: All users of the export.
+        column: ``carrier`` or ``tx``.
+
+    Raises:
+        RunError: There are several.
+    """
+    names: list[str] = np.unique(users[column]).tolist()
+    if len(names) > 1:
+        raise RunError(
+            f"{users.dataset.location} has {', '.join(names)} as {column}, and this format holds one; choose "
+            f"with --{column} {names[0]}"
+        )
+    return names[0]
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 from rich.console import Console
 
 from caviar_clients.cli.shared import print_line, progress_bar
+from caviar_protocol.errors import RunError
 
 
 def export_command(
@@ -19,12 +21,16 @@ def export_command(
         str,
         typer.Option(
             metavar="NAME",
-            help="npz, parquet, huggingface, sionna, itu, deepmimo, ns3-qd, pcd, foxglove, ros2, rerun, or "
-            "that of an installed package",
+            help="npz, parquet, huggingface, sionna, itu, deepmimo, deepsense, minari, ns3-qd, pcd, "
+            "foxglove, ros2, rerun, or that of an installed package",
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder that is made")],
     flavour: Annotated[str, typer.Option(help="variant of the format")] = "",
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON", help="of the world's origin [°], for deepsense, where it has none"),
+    ] = None,
     carrier: Annotated[str | None, typer.Option(help="users of this carrier alone")] = None,
     tx: Annotated[str | None, typer.Option(help="users of this transmitter alone")] = None,
     object_class: Annotated[str | None, typer.Option(help="users on objects of this class alone")] = None,
@@ -36,12 +42,23 @@ def export_command(
     from caviar_formats.runs import open_source
 
     console, form = Console(), find_format(to, flavour)
+    form.origin = None if origin is None else _origin(origin)
     columns = (MofNCompleteColumn(), TimeRemainingColumn())
     with open_source(source) as dataset, progress_bar(console, *columns, transient=True) as bar:
         users = dataset.users(carrier=carrier, tx=tx, object_class=object_class)
         task = bar.add_task(f"{to}: scenes", total=None)
         export_users(users, form, out, lambda done, of: bar.update(task, completed=done, total=of))
     print_line(console, out)
+
+
+def _origin(text: str) -> tuple[float, float]:
+    try:
+        latitude, longitude = map(float, text.split(","))
+    except ValueError:
+        latitude = longitude = math.nan
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        raise RunError(f"--origin {text!r}: write latitude and longitude in degrees, as 38.8907,-77.0787")
+    return latitude, longitude
 
 
 def import_command(

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_clients.datasets.impulse_responses import only_array, placed_antennas
+from caviar_clients.datasets.impulse_responses import antennas_of, only_array, placed_antennas
 from caviar_clients.datasets.user_rows import Users
-from caviar_formats.base import Format, Part
+from caviar_formats.base import Format, Part, only_one
 from caviar_formats.imports import ImportedScene, Paths, Source, damaged
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RecordingError, RunError
@@ -64,11 +64,7 @@ class DeepMimo(Format):
         self.whole_episodes = self.flavour == "dynamic"
 
     def begin(self, users: Users) -> None:
-        if len(carriers := np.unique(users["carrier"]).tolist()) > 1:
-            raise RecordingError(
-                f"{users.dataset.location} has {len(carriers)} carriers, and a scenario of DeepMIMO one: "
-                f"choose with --carrier {carriers[0]}"
-            )
+        self._carrier = only_one(users, "carrier")
         self._arrays = {end: only_array(users, end) for end in ("tx", "rx")}
         for end, array in self._arrays.items():
             if array.rows > 1 and array.columns > 1 and array.vertical_spacing != array.horizontal_spacing:
@@ -77,7 +73,6 @@ class DeepMimo(Format):
                     f"wavelengths between columns and {array.vertical_spacing} between rows, and arrays of "
                     "DeepMIMO one spacing; use equal ones"
                 )
-        self._carrier = carriers[0]
         specs = users.dataset.settings["scenario"]["carriers"]
         self._frequency = next(c["frequency_hz"] for c in specs if c["name"] == self._carrier)
         self._name = "".join(c if c.isalnum() else "_" for c in users.dataset.name.lower())
@@ -103,7 +98,9 @@ class DeepMimo(Format):
             scenes = part.scenes["scene"][part.scenes["episode"] == episode].tolist()
             for scene in scenes:
                 here = users[users["scene"] == scene]
-                counts = self._write_scene(here, names, scenario / f"scene_{scene:06d}", episode, scene)
+                # The package looks for folders of scenes where there are several.
+                place = scenario / f"scene_{scene:06d}" if len(scenes) > 1 else scenario
+                counts = self._write_scene(here, names, place, episode, scene)
             active = len(np.unique(users["rx"][users["valid"]]))
             self._write_params(scenario, len(names), active, len(scenes), counts)
 
@@ -144,13 +141,11 @@ class DeepMimo(Format):
             [f"{e} {s} {rx}" for e, s, rx in zip(users["episode"], users["scene"], users["rx"], strict=True)],
             np.str_,
         )
+        columns = ("a", "tau", "aod", "aoa", "doppler", "interactions", "points")
+        rows = users.rows([f"channel.{name}" for name in columns], beside=antennas_of)
         sent, taken = (list(placed_antennas(users, end)) for end in ("tx", "rx"))
         out["rx_pos"] = np.array([antenna.position for antenna in taken], np.float32).reshape(n, 3)
         out["rx_orientation"] = np.array([antenna.orientation for antenna in taken]).reshape(n, 4)
-        if not n:
-            return out
-        columns = ("a", "tau", "aod", "aoa", "doppler", "interactions", "points")
-        rows = users.rows([f"channel.{name}" for name in columns])
         for at, row in enumerate(zip(*rows.values(), strict=True)):
             paths = dict(zip(columns, row, strict=True))
             depth = (paths["interactions"] != 0).sum(1)

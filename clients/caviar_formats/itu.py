@@ -14,7 +14,7 @@ import numpy as np
 
 from caviar_clients.datasets.impulse_responses import PlacedAntenna, placed_antennas
 from caviar_clients.datasets.user_rows import Columns, Users
-from caviar_formats.base import Format, Part, markdown_table
+from caviar_formats.base import Format, Part, markdown_table, only_one
 from caviar_formats.imports import Source
 from caviar_formats.itu_reading import ABOVE_M, ARRAYS, HEADER, TX_YAW_DEG, WORDS, read_itu
 from caviar_formats.itu_training import INPUTS, TRAINING, join_arrays, picture_inputs
@@ -62,11 +62,7 @@ class Itu(Format):
     def begin(self, users: Users) -> None:
         dataset = users.dataset
         for column in ("carrier", "tx"):
-            if len(names := np.unique(users[column])) > 1:
-                raise RunError(
-                    f"{dataset.location} has {', '.join(names)} as {column}, and this format holds one; "
-                    f"export one, with --{column}"
-                )
+            only_one(users, column)
         episodes = np.unique(users["episode"])
         if len(gaps := np.setdiff1d(np.arange(episodes[-1] + 1), episodes)):
             raise RunError(

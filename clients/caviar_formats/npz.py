@@ -23,6 +23,8 @@ class Npz(Format):
         self._names = users.readable()
 
     def write(self, part: Part, folder: Path) -> None:
+        if not len(part.users):  # which --tx and the like narrow
+            return
         columns = part.users.read([*USER_COLUMNS, *self._names])
         np.savez(folder / f"users-{part.number:05d}.npz", allow_pickle=False, **columns)
 
@@ -56,23 +58,23 @@ class Sionna(Format):
 
     def begin(self, users: Users) -> None:
         self._cir = users[users["valid"]].cir()
-        self._shape = self._cir.shape
 
     def write(self, part: Part, folder: Path) -> None:
         valid = part.users[part.users["valid"]]
         if not len(valid):
             return
-        a = np.empty((len(valid), *self._shape.values()), np.complex64)
-        tau = np.empty((len(valid), 1, 1, self._shape["num_paths"]))
-        for start in range(0, len(valid), 256):
-            cut = slice(start, start + 256)
-            found, tau[cut, 0, 0] = self._cir.block(valid[cut])
-            a[cut, 0, :, 0] = found
+        a, tau = self._cir.block(valid, np.complex64)
         columns = valid.read(["episode", "scene", "carrier", "tx", "rx"])
-        np.savez(folder / f"cir-{part.number:05d}.npz", allow_pickle=False, a=a, tau=tau, **columns)
+        np.savez(
+            folder / f"cir-{part.number:05d}.npz",
+            allow_pickle=False,
+            a=a[:, None, :, None],
+            tau=tau[:, None, None],
+            **columns,
+        )
 
     def readme(self, users: Users) -> str:
-        sizes = "\n".join(f"    {name}={size}," for name, size in self._shape.items())
+        sizes = "\n".join(f"    {name}={size}," for name, size in self._cir.shape.items())
         return f"""# {users.dataset.name} as impulse responses for Sionna PHY
 
 `cir-NNNNN.npz` hold a row for each user with a path: a receiver in a scene, on a carrier, for a transmitter.

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caviar_clients.cli.shared import require_installed
 from caviar_clients.datasets.rows import SCENE_COLUMNS, USER_COLUMNS
 from caviar_clients.datasets.user_rows import Users
 from caviar_formats.base import Format, Part, markdown_table
@@ -33,19 +32,20 @@ class Parquet(Format):
     """Tables ``users/part-NNNNN.parquet`` and ``scenes/part-NNNNN.parquet``."""
 
     loses = f"{LOSES} Pictures, which `npz` has where a user has one camera, and gains of beams."
+    packages = ("duckdb", "nanoarrow")
 
     def begin(self, users: Users) -> None:
-        require_installed("a format of Parquet", ["datasets"])
         self._connection = _connected()  # takes as long as writing a dozen scenes
         found = users.readable().items()
         self._names = {name: text for name, text in found if not name.startswith(LEFT_OUT)}
 
     def write(self, part: Part, folder: Path) -> None:
-        table = _Table(self._connection, len(part.users))
-        table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
-        for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
-            table.add_rows(name, rows)
-        table.save(_file(folder, "users", part.number))
+        if len(part.users):  # which --tx and the like narrow
+            table = _Table(self._connection, len(part.users))
+            table.add_columns(part.users.read([*USER_COLUMNS]), USER_COLUMNS)
+            for name, rows in part.users.rows(list(self._names)).items() if self._names else ():
+                table.add_rows(name, rows)
+            table.save(_file(folder, "users", part.number))
         table = _Table(self._connection, len(part.scenes))
         table.add_columns(part.scenes, SCENE_COLUMNS)
         table.save(_file(folder, "scenes", part.number))
@@ -91,9 +91,9 @@ class _Table:
     def __init__(self, connection: DuckDBPyConnection, rows: int) -> None:
         self._connection, self._rows = connection, rows
         self._select = list[str]()
-        self._lists: dict[bytes, dict[str, NDArray[Any]]] = {}
         self._about: dict[str, str] = {}
-        self._flat: dict[str, NDArray[Any]] = {"row": np.arange(rows)}
+        self._flat: dict[str, NDArray[Any]] = {}
+        self._lists: dict[str, Any] = {}
 
     def add_columns(self, columns: Mapping[str, NDArray[Any]], about: Mapping[str, str]) -> None:
         """Add columns of the catalogue; a number that is missing there is null."""
@@ -125,12 +125,16 @@ class _Table:
         self._note(name, text, unit, shape)
 
     def _add_lists(self, name: str, rows: Sequence[NDArray[Any]]) -> None:
-        # Columns of equal lengths become lists together.
-        sizes = np.array([row.size for row in rows])
-        group = self._lists.setdefault(sizes.tobytes(), {"row": np.repeat(np.arange(len(rows)), sizes)})
-        key = f"c{len(self._select)}"
-        group[key] = np.concatenate([row.ravel() for row in rows])
-        self._select.append(f'coalesce({key}, []) AS "{name}"')
+        import nanoarrow
+
+        values = np.concatenate([row.ravel() for row in rows])
+        kind = getattr(nanoarrow, values.dtype.name)()
+        items = nanoarrow.c_array_from_buffers(kind, len(values), [None, values], null_count=0)
+        cuts = np.cumsum([0, *(row.size for row in rows)], dtype=np.int64)
+        self._lists[name] = nanoarrow.c_array_from_buffers(
+            nanoarrow.large_list(kind), len(rows), [None, cuts], null_count=0, children=[items]
+        )
+        self._select.append(f'"{name}"')
 
     def _note(self, name: str, text: str, unit: str, shape: str) -> None:
         self._about[name] = json.dumps(
@@ -139,18 +143,19 @@ class _Table:
 
     def save(self, file: Path) -> None:
         """Write the table."""
-        joins = ""
-        for number, group in enumerate(self._lists.values()):
-            self._connection.register("flat", group)
-            lists = ", ".join(f"list({key}) AS {key}" for key in group if key != "row")
-            self._connection.execute(
-                f"CREATE OR REPLACE TEMP TABLE t{number} AS SELECT row, {lists} FROM flat GROUP BY row"  # noqa: S608
-            )
-            joins += f" LEFT JOIN t{number} USING (row)"
+        import nanoarrow
+
         self._connection.register("flat", self._flat)
-        select = f"SELECT {', '.join(self._select)} FROM flat{joins} ORDER BY row"  # noqa: S608
+        select = f"SELECT {', '.join(self._select)} FROM flat"  # noqa: S608
+        if self._lists:
+            kinds = {name: nanoarrow.Schema(lists.schema) for name, lists in self._lists.items()}
+            rows = nanoarrow.c_array_from_buffers(
+                nanoarrow.struct(kinds), self._rows, [None], null_count=0, children=self._lists.values()
+            )
+            self._connection.register("lists", nanoarrow.ArrayStream(rows))
+            select += " POSITIONAL JOIN lists"
         _copy(self._connection, select, file, self._about)
-        self._connection.unregister("flat")
+        self._connection.unregister("flat").unregister("lists")
 
 
 def _copy(connection: DuckDBPyConnection, select: str, file: Path, about: Mapping[str, str]) -> None:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from caviar_clients.datasets.impulse_responses import only_array, placed_antennas
+from caviar_clients.datasets.impulse_responses import antennas_of, only_array, placed_antennas
 from caviar_clients.datasets.user_rows import Users
-from caviar_formats.base import Format, Part
+from caviar_formats.base import Format, Part, only_one
 from caviar_formats.deepmimo import first_element
-from caviar_protocol.errors import RecordingError
 
 
 class Ns3Qd(Format):
@@ -26,15 +25,10 @@ class Ns3Qd(Format):
     )
 
     def begin(self, users: Users) -> None:
-        carriers = np.unique(users["carrier"]).tolist()
-        if len(carriers) > 1:
-            raise RecordingError(
-                f"{users.dataset.location} has {len(carriers)} carriers, and a trace one: choose with "
-                f"--carrier {carriers[0]}"
-            )
+        carrier = only_one(users, "carrier")
         self._arrays = {end: only_array(users, end) for end in ("tx", "rx")}
         scenario = users.dataset.settings["scenario"]
-        self._frequency = next(c["frequency_hz"] for c in scenario["carriers"] if c["name"] == carriers[0])
+        self._frequency = next(c["frequency_hz"] for c in scenario["carriers"] if c["name"] == carrier)
         self._period_s = scenario["run"]["sampling_period_ns"] * 1e-9
 
     def write(self, part: Part, folder: Path) -> None:
@@ -53,14 +47,14 @@ class Ns3Qd(Format):
         )
         for made in (traces, settings, places):
             made.mkdir(parents=True, exist_ok=True)
+        columns = ("a", "tau", "aod", "aoa")
+        rows = users.rows([f"channel.{name}" for name in columns], beside=antennas_of)
         ends = {end: list(placed_antennas(users, end)) for end in ("tx", "rx")}
         nodes: dict[str, tuple[float, ...]] = {}
         for end in ("tx", "rx"):
             for name, antenna in zip(users[end].tolist(), ends[end], strict=True):
                 nodes.setdefault(name, tuple(antenna.position.tolist()))
         order = list(nodes)
-        columns = ("a", "tau", "aod", "aoa")
-        rows = users.rows([f"channel.{name}" for name in columns])
         texts: dict[tuple[str, str], dict[int, str]] = {}
         for at, (tx, rx) in enumerate(zip(users["tx"].tolist(), users["rx"].tolist(), strict=True)):
             a, tau, aod, aoa = (rows[f"channel.{name}"][at] for name in columns)

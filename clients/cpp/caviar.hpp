@@ -585,9 +585,10 @@ class Unpacker {
 // (`@`: an object of defaults). Types: `[T]` list, `{T}` map, `T*3` three of them, `A/B` objects by their
 // `type`, `a|b` words, `<f8[N,3]` array.
 inline constexpr char TYPES[] = R"(
-Hello#HELLO version:Version! name:NewName! role:world|channel|sensors|link|agent|recorder!
+Hello#HELLO version:Version! name:NewName! role:world|channel|sensors|link|agent|recorder|observer!
   inputs:[Input]<=256=[] outputs:[NewName]<=256=[] capabilities:[Word]<=256=[]
   implementation:Text="" max_in_flight:int>=1<=64=1 host:Text="" pid:Count=0
+  subscriptions:[Subscription]<=256=[]
 Welcome#WELCOME version:Version! run:Text! epoch:Epoch! attempt:Attempt! capabilities:[Word]<=256=[]
   heartbeat_ns:Period! liveness_ns:Period! seed:Seed=0 settings:{plain}={} scenario:{plain}={}
   rejoin_ns:Duration=0
@@ -622,10 +623,14 @@ Shutdown#SHUTDOWN reason:Text! grace_ns:Duration=0
 Bye#BYE epoch:Epoch! attempt:Attempt! reason:Text=""
 Stale#STALE of:Word! epoch:Epoch! attempt:Attempt! episode:EpisodeIndex! frame:FrameOrNone!
 Error#ERROR code:Word! message:Text! of:Text="" subject:Text=""
+Observe#OBSERVE sequence:Count! state:Word! paused:bool=false episode:EpisodeIndex=0
+  frame:FrameOrNone=-1 t_ns:Nanoseconds=0 inputs:[GrantInput]<=256=[] reports:[Report]<=256=[]
+Observed#OBSERVED sequence:Count!
 Attach#ATTACH epoch:Epoch! attempt:Attempt! name:Name!
 Heartbeat#HEARTBEAT sequence:Count! progress:Count=0 phase:Text="" grace_ns:Duration=0
 HeartbeatAck#HEARTBEAT_ACK sequence:Count!
 Input topic:NewName! lag:int>=0<=1=0 required:bool=true parts:[Word]<=256=[]
+Subscription topic:NewName! source:Text="" every:int>=1=1
 Demand topic:Name! parts:[Word]<=256=[]
 Asset name:AssetName! digest:Digest! size:Size!
 GeometryChange frame:FrameIndex! assets:[Asset]=[]
@@ -1196,10 +1201,11 @@ struct Message {
 // The parts that a message has to have, and their sizes.
 inline Problem check_parts(const Message& message) {
   std::size_t due = 0;
-  const bool products = message.is("GRANT") || message.is("DONE"), asset = message.is("ASSET_DATA");
+  const bool inputs = message.is("GRANT") || message.is("OBSERVE");
+  const bool products = inputs || message.is("DONE"), asset = message.is("ASSET_DATA");
   if (message.is("DONE")) due = 2 * message.fields["products"].size();
   for (const Value& input : message.fields["inputs"].items())
-    if (message.is("GRANT") && input["status"].text() != "absent") due += 2;
+    if (inputs && input["status"].text() != "absent") due += 2;
   if (asset || message.is("RESTORE") || message.is("CHECKPOINT_DONE")) due = 1;
   if (message.parts.size() != due)
     return malformed(message.type->tag + " announces " + std::to_string(due) + " parts behind its header, " +

@@ -112,6 +112,8 @@ few = msgspec.Meta(max_length=256)
 
 
 Role = Literal["world", "channel", "sensors", "link", "agent", "recorder"]
+PeerRole = Literal[Role, "observer"]
+"""Role of a service, or of an observer, which no scenario names."""
 Policy = Literal["wait", "hold", "drop", "abort"]
 
 
@@ -148,6 +150,21 @@ class Input(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     # A word of another minor version is accepted here; `PARTS` knows those of this one.
     parts: Annotated[tuple[Word, ...], few] = ()
     """Parts of the payload that the service needs beyond the mandatory fields (clause 5)."""
+
+
+class Subscription(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Products that an observer wants to see, of those that the run has anyway: it creates no demand.
+
+    Example:
+        >>> Subscription(topic="lidar", every=10)
+        Subscription(topic='lidar', source='', every=10)
+    """
+
+    topic: NewName
+    """Topic, or ``*`` for every topic."""
+    source: Text = ""
+    """Service that they come from; empty: any."""
+    every: Annotated[int, quantity("frame", "frames from one to the next, at least", ge=1)] = 1
 
 
 class Demand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -265,6 +282,10 @@ class ProductHeader(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tru
 # --- versions ---------------------------------------------------------------------------------------------
 
 SINCE: dict[str, str] = {
+    "Subscription": "1.7",
+    "Hello.subscriptions": "1.7",
+    "Observe": "1.7",
+    "Observed": "1.7",
     "GeometryChange": "1.6",
     "Geometry": "1.6",
     "GeometryDone": "1.6",
@@ -327,6 +348,7 @@ SINCE: dict[str, str] = {
 
 
 VALUES_SINCE: dict[str, dict[str, str]] = {
+    "Hello.role": {"observer": "1.7"},
     "AntennaArray.polarization": dict.fromkeys(
         ("-45", "+45", "RHCP", "LHCP", "VH", "cross", "circular"), "1.4"
     ),

@@ -31,7 +31,7 @@ from msgspec import Meta
 
 from caviar_protocol.errors import SetupError
 from caviar_protocol.files import replace_file
-from caviar_protocol.messages import Role
+from caviar_protocol.messages import PeerRole
 from caviar_protocol.scenario.toml import key_lines, toml_text
 
 BROKER = "broker"
@@ -40,8 +40,8 @@ AUTHORIZED = "authorized.toml"
 TOKENS = "tokens.toml"
 KEY_VARIABLE, BROKER_KEY_VARIABLE = "CAVIAR_KEY", "CAVIAR_BROKER_KEY"
 """Environment variables with the paths of a service's secret key and of its broker's public one."""
-ROLES: tuple[str, ...] = get_args(Role)
-VIEWER, OPERATOR, TRAINER = "viewer", "operator", "trainer"
+ROLES: tuple[str, ...] = get_args(PeerRole)
+VIEWER, OPERATOR, TRAINER, OBSERVER = "viewer", "operator", "trainer", "observer"
 TOKEN_ROLES = (VIEWER, OPERATOR, TRAINER, *ROLES)
 """What the holder of a token may be over HTTP."""
 
@@ -66,8 +66,8 @@ class Authorization(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     name: Name
-    """Of the service that it may appear as, and of the key itself."""
-    role: Role
+    """Of the service or observer that it may appear as, and of the key itself."""
+    role: PeerRole
     public: Z85
     topics: tuple[str, ...] | None = None
     """Topics that it may produce; None: all that its role has."""
@@ -89,7 +89,7 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     role: str
     """``viewer`` may read, ``operator`` may also give every order, ``trainer`` may read and give agents other
     policies; a role of a service, such as ``agent``, may take part through the gateway under that name and in
-    that role, and nothing else."""
+    that role, and nothing else, but ``observer`` may also read."""
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
     """Of the token's text; the token itself is written nowhere."""
 
@@ -99,11 +99,11 @@ class Token(_Entry, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
         Args:
             role: `VIEWER`, `TRAINER` or `OPERATOR`.
         """
-        return self.role in (OPERATOR, role) or (role == VIEWER and self.role == TRAINER)
+        return self.role in (OPERATOR, role) or (role == VIEWER and self.role in (TRAINER, OBSERVER))
 
     @property
     def of_service(self) -> bool:
-        """True if a service takes part with it."""
+        """True if a service or an observer takes part with it."""
         return self.role in ROLES
 
 

@@ -41,16 +41,18 @@ from caviar_protocol.fields import Demand as Demand
 from caviar_protocol.fields import GeometryChange as GeometryChange
 from caviar_protocol.fields import GrantInput as GrantInput
 from caviar_protocol.fields import Input as Input
+from caviar_protocol.fields import PeerRole as PeerRole
 from caviar_protocol.fields import Policy as Policy
 from caviar_protocol.fields import ProductHeader as ProductHeader
 from caviar_protocol.fields import Report as Report
 from caviar_protocol.fields import Role as Role
 from caviar_protocol.fields import Status as Status
+from caviar_protocol.fields import Subscription as Subscription
 
-PROTOCOL_VERSION = (1, 6)
+PROTOCOL_VERSION = (1, 7)
 """Major and minor version of the protocol that this package speaks."""
 
-CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "geometry", "parts")
+CAPABILITIES: tuple[str, ...] = ("assets", "checkpoint", "episodes", "geometry", "observe", "parts")
 """Optional features that this package implements. Peers use what both of them list."""
 
 
@@ -68,14 +70,14 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     Example:
         >>> hello = Hello(version=PROTOCOL_VERSION, name="agent", role="agent", outputs=("action",))
         >>> msgspec.to_builtins(hello)  # the map on the wire
-        {'type': 'HELLO', 'version': (1, 6), 'name': 'agent', 'role': 'agent', 'outputs': ('action',)}
+        {'type': 'HELLO', 'version': (1, 7), 'name': 'agent', 'role': 'agent', 'outputs': ('action',)}
     """
 
     version: Version
     """That the service speaks."""
     name: NewName
     """Unique in the run; what the scenario calls this service."""
-    role: Role
+    role: PeerRole
     """What it does in a run."""
     inputs: Annotated[tuple[Input, ...], few] = ()
     """What it consumes."""
@@ -93,6 +95,8 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     """Identifies kernel and process namespace, so that a broker on the same one can watch ``pid``."""
     pid: Count = 0
     """Process id on ``host``; 0: unknown."""
+    subscriptions: Annotated[tuple[Subscription, ...], few] = ()
+    """Observers: what they want to see; without any, they learn of each frame and of no product."""
 
 
 class Welcome(_Message, frozen=True, kw_only=True, tag="WELCOME"):
@@ -491,6 +495,43 @@ class Error(_Message, frozen=True, kw_only=True, tag="ERROR"):
     """What it was about: the digest of an unknown asset, or of a mesh that is refused."""
 
 
+# --- observers -----------------------------------------------------------------------------
+
+
+class Observe(_Message, frozen=True, kw_only=True, tag="OBSERVE"):
+    """Broker to observer: the newest finished frame, or another state of the run. Answered by OBSERVED,
+    before which no further one comes. Needs capability ``observe``."""
+
+    sequence: Count
+    """Counts these messages to the observer, from 0."""
+    state: Word
+    """Of the run: ``joining``, ``preparing``, ``resetting``, ``running`` or ``stopping``."""
+    paused: bool = False
+    """Whether the user has it begin no frames."""
+    episode: EpisodeIndex = 0
+    """Of the frame."""
+    frame: FrameOrNone = -1
+    """Newest finished frame; −1: none is."""
+    t_ns: Nanoseconds = 0
+    """Time of the frame."""
+    inputs: Annotated[tuple[GrantInput, ...], few] = ()
+    """Products of the frame, as a service that consumes them in it is granted them."""
+    reports: Annotated[tuple[Report, ...], few] = ()
+    """What the services of the frame reported; empty where the observer has had the frame before."""
+
+
+class Observed(_Message, frozen=True, kw_only=True, tag="OBSERVED"):
+    """Observer to broker: I can take another one.
+
+    Example:
+        >>> msgspec.to_builtins(Observed(sequence=7))
+        {'type': 'OBSERVED', 'sequence': 7}
+    """
+
+    sequence: Count
+    """Of the OBSERVE answered."""
+
+
 # --- the heartbeat connection --------------------------------------------------------------
 
 
@@ -533,6 +574,7 @@ class HeartbeatAck(_Message, frozen=True, kw_only=True, tag="HEARTBEAT_ACK"):
 Message = (
     Hello | Welcome | Refuse | Prepare | AssetOffer | AssetGet | AssetData | Ready
     | Reset | ResetDone | Grant | Done | Fault | Cancel | EpisodeEnd | Checkpoint | CheckpointDone | Restore
-    | Geometry | GeometryDone | Shutdown | Bye | Stale | Error | Attach | Heartbeat | HeartbeatAck
+    | Geometry | GeometryDone | Shutdown | Bye | Stale | Error | Observe | Observed
+    | Attach | Heartbeat | HeartbeatAck
 )  # fmt: skip
 """Every message of the protocol."""

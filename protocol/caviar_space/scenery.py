@@ -47,7 +47,9 @@ def scenery_assets(scenery: str) -> dict[str, Path]:
             raise AssetError(
                 f"{place} names {name!r}, and there is no file {xml.parent / name}; put it there"
             )
-    return {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in sorted(files)}}
+    found = {f"scenery/{xml.name}": xml, **{f"scenery/{name}": xml.parent / name for name in sorted(files)}}
+    about = xml.with_suffix(".json")  # of an imported scene: its place on the Earth
+    return found | ({f"scenery/{about.name}": about} if about.is_file() else {})
 
 
 def scenery_file(scenery: str) -> Path:

@@ -368,11 +368,32 @@ class Client:
         return msgpack.packb({"commands": [command]}), b"\0" * 8 if bad("pads the body") else b""
 
 
+def look_on() -> int:
+    """The whole life of an observer; its exit status."""
+    socket = zmq.Context.instance().socket(zmq.DEALER)
+    socket.connect(ENDPOINT)
+
+    def send(**fields: Any) -> None:
+        socket.send(msgpack.packb(fields))
+
+    hello = {"name": NAME, "role": ROLE, "capabilities": ["observe"], "subscriptions": [{"topic": "*"}]}
+    send(type="HELLO", version=[1, 7], **hello)
+    while True:
+        message = msgpack.unpackb(socket.recv_multipart()[0])
+        if message["type"] == "OBSERVE":
+            send(type="OBSERVED", sequence=message["sequence"] + bad("acknowledges another"))
+        elif message["type"] == "REFUSE" or message.get("version", [1])[0] != 1:
+            sys.stderr.write(message.get("message", "another major version"))
+            return 1
+        elif message["type"] == "SHUTDOWN":
+            return 0
+
+
 if not bad("dies of SIGTERM"):
     signal.signal(
         signal.SIGTERM, signal.SIG_IGN if bad("ignores SIGTERM") else lambda *_: asked_to_stop.set()
     )
-status = Client().run()
+status = look_on() if ROLE == "observer" else Client().run()
 zmq.Context.instance().destroy(linger=500)
 sys.stderr.flush()
 time.sleep(0.05)  # what is sent last is on its way

@@ -128,6 +128,29 @@ def test_a_right_client_fails_nothing(
     assert sum(v.outcome == "pass" for v in verdicts) >= 25
 
 
+LOOK = """import sys
+from caviar_protocol.observer import Observer
+with Observer(sys.argv[1], sys.argv[2]) as observer:
+    for observation in observer:
+        [product.payload for product in observation.products.values()]
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        python("-c", LOOK, "{endpoint}", "{name}"),
+        python(BROKEN, "{endpoint}", "{name}", "none", "observer"),
+    ],
+    ids=["library", "control"],
+)
+def test_an_observer_fails_nothing(command: str) -> None:
+    verdicts = conform(ANY, command=command, rules=Rules(name="mine", role="observer"))
+    assert failures(verdicts) == {}
+    passed = [v.case for v in verdicts if v.outcome == "pass"]
+    assert passed == ["hello", "other-major", "refused", "observe", "canonical"]
+
+
 @pytest.fixture
 def node_client(
     tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config
@@ -356,6 +379,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "later-minor": ("accepts its own minor version only",),
     "no-demand": ("wants demand/world",),
     "final-grant": ("acts in the final grant",),
+    "observe": ("acknowledges another/observer",),
     "several-sources": ("wants one source of each topic",),
     "canonical": ("writes out a default",),
     "scene-orientations": (

@@ -171,7 +171,7 @@ def test_the_world_fails_no_case_of_the_kit(node: str) -> None:
     # Not of a world: parts of a channel, late inputs of a recorder, an agent's final grant, others' meshes.
     assert {v.case for v in verdicts} - passed == {
         "late-inputs", "channel-parts", "channel-consistency", "final-grant",
-        "geometry", "later-geometry", "geometry-gone",
+        "geometry", "later-geometry", "geometry-gone", "observe",
     }  # fmt: skip
 
 
@@ -179,6 +179,23 @@ def test_the_agent_fails_no_case_that_differs_from_the_worlds(node: str) -> None
     verdicts = judged(node, "agent.mjs", "agent", *CASES_OF_THE_AGENT)
     assert failures(verdicts) == {}
     assert sum(v.outcome == "pass" for v in verdicts) == len(CASES_OF_THE_AGENT)
+
+
+LOOK = """import {{ Observer }} from "{library}";
+const [url, name] = process.argv.slice(2);
+const observer = new Observer(url, {{ name }});
+for await (const {{ products }} of observer) for (const {{ payload }} of products) payload.names.length;
+if (!observer.ended) process.exit(1);
+"""
+
+
+def test_an_observer_fails_no_case_of_the_kit(node: str, tmp_path: Path) -> None:
+    script = tmp_path / "look.mjs"
+    script.write_text(LOOK.format(library=CLIENT / "src" / "index.mjs"))
+    verdicts = judged(node, str(script), "observer")
+    assert failures(verdicts) == {}
+    passed = [v.case for v in verdicts if v.outcome == "pass"]
+    assert passed == ["hello", "other-major", "refused", "observe", "canonical"]
 
 
 # --- whole runs -------------------------------------------------------------------------------------

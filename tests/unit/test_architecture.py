@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 PACKAGES = (
     "caviar_protocol",
     "caviar_space",
+    "caviar_view",
     "caviar_broker",
     "caviar_services",
     "caviar_bridges",

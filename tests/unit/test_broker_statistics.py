@@ -38,7 +38,7 @@ def test_frames_per_second_leave_the_warm_up_out() -> None:
 
 def test_every_figure_is_saved(tmp_path: Path) -> None:
     statistics = Statistics({"file": MS, "idle": MS})
-    statistics.latency("file", 5, False)
+    statistics.latency("file", 5, False, 1, 2, 30)
     statistics.frame(7)
     statistics.decision(3)
     statistics.save(tmp_path / "latency.npz")
@@ -48,6 +48,8 @@ def test_every_figure_is_saved(tmp_path: Path) -> None:
             "decision_lateness_ns": [3],
             "latency_ns/file": [5],
             "latency_ns/idle": [],
+            "answers/file": [[1, 2, 30, 5]],
+            "answers/idle": [],
         }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -20,6 +21,8 @@ from caviar_clients.datasets.impulse_responses import placed_antennas
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.verification.verify import verify
+from caviar_clients.envs.base import BeamSelectionEnv
+from caviar_clients.envs.uav_path import UavPathEnv
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
@@ -53,30 +56,11 @@ def generated(out: Path, scenario: str | Path, episodes: int = EPISODES, scenes:
     return Dataset(out)
 
 
-SCENARIO = """
-[run]
-name = "asymmetric"
-frames = 3
-sampling_period_ns = 100_000_000
-record = ["scene", "channel", "channel.h", "channel.hf", "link"]
-
-[[carriers]]
-name = "mm"
-frequency_hz = 28e9
-bandwidth_hz = 100e6
-subcarriers = 8
-subcarrier_spacing_hz = 1e6
-
+SERVICES = """
 [services.world]
 role = "world"
 use = "trajectory"
 budget_ms = 20
-
-[[services.world.settings.objects]]
-name = "car"
-kind = "car"
-dimensions_m = [4.5, 1.8, 1.5]
-waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [services.channel]
 role = "channel"
@@ -84,7 +68,7 @@ use = "geometric"
 budget_ms = 100
 
 [services.channel.settings]
-components = 4
+components = 5
 
 [services.link]
 role = "link"
@@ -100,6 +84,29 @@ budget_ms = 20
 role = "recorder"
 use = "mcap"
 budget_ms = 100
+"""
+
+SCENARIO = (
+    SERVICES
+    + """
+[run]
+name = "asymmetric"
+frames = 3
+sampling_period_ns = 100_000_000
+record = ["scene", "channel", "channel.h", "channel.hf", "action", "link"]
+
+[[carriers]]
+name = "mm"
+frequency_hz = 28e9
+bandwidth_hz = 100e6
+subcarriers = 8
+subcarrier_spacing_hz = 1e6
+
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, 20.0, 15.0, 0.75], [10.0, 80.0, -35.0, 2.75]]
 
 [[devices]]
 name = "bs"
@@ -120,6 +127,7 @@ position_m = [0.3, 0.2, 1.0]
 yaw_deg = -35.0
 array = { rows = 1, columns = 3 }
 """
+)
 
 
 @pytest.fixture(scope="module")
@@ -135,20 +143,6 @@ role = "sensors"
 use = "lidar"
 budget_ms = 1000
 
-[services.camera]
-role = "sensors"
-use = "camera"
-budget_ms = 1000
-
-[[devices]]
-name = "eye"
-kind = "camera"
-on = "car"
-position_m = [3.0, 0.0, 1.0]
-yaw_deg = -20.0
-size_px = [16, 12]
-field_of_view_deg = 80.0
-
 [[devices]]
 name = "lidar"
 kind = "lidar"
@@ -157,16 +151,34 @@ yaw_deg = 25.0
 pitch_deg = 4.0
 beams = 8
 azimuth_steps = 180
+
+[services.camera]
+role = "sensors"
+use = "camera"
+budget_ms = 1000
+
+[[devices]]
+name = "camera"
+kind = "camera"
+position_m = [3.0, -40.0, 12.0]
+yaw_deg = 45.0
+pitch_deg = 15.0
+size_px = [40, 32]
 """
 
 
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset with a LIDAR and a camera on the car."""
+    """A dataset with a LIDAR and a camera beside the road, of a world that knows its place on the Earth."""
     place = tmp_path_factory.mktemp("clouds")
     text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "camera", "depth", "scene"') + LIDAR
     (place / "lidar.toml").write_text(text)
-    return generated(place / "data", place / "lidar.toml").directory.path
+    data = generated(place / "data", place / "lidar.toml")
+    (data.assets / "scenery").mkdir(parents=True)
+    (data.assets / "scenery" / "town.json").write_text(
+        '{"origin": {"latitude_deg": -33.4, "longitude_deg": -70.6}}'
+    )
+    return data.directory.path
 
 
 @pytest.fixture
@@ -179,7 +191,7 @@ def exported(data: Dataset, name: str, out: Path, flavour: str = "") -> Path:
     return out / name
 
 
-WITH_SENSORS = ("foxglove", "pcd", "ros2")
+WITH_SENSORS = ("deepsense", "foxglove", "pcd", "ros2")
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -216,6 +228,33 @@ def test_npz_has_each_user_in_its_row(data: Dataset, tmp_path: Path) -> None:
         users = data.users()
         for name in (*users.recorded(), "x_m", "rx", "gain_db"):
             assert np.array_equal(rows[name], users[name], equal_nan=rows[name].dtype.kind in "fc"), name
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("npz", "users-*.npz"),
+        ("sionna", "cir-*.npz"),
+        ("parquet", "users/*.parquet"),
+        ("huggingface", "users.parquet"),
+    ],
+)
+def test_scenes_without_chosen_users_have_no_rows(
+    name: str, files: str, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import duckdb
+
+    users = data.users()
+    monkeypatch.setattr("caviar_formats.base.SCENES", 1)
+    late = users[users["scene"] > 0]
+    export_users(late, find_format(name), tmp_path / name)
+    found = [
+        duckdb.read_parquet(str(file)).fetchnumpy()["rx"]
+        if file.suffix == ".parquet"
+        else np.load(file)["rx"]
+        for file in sorted((tmp_path / name).glob(files))
+    ]
+    assert np.concatenate(found).tolist() == late["rx"].tolist()
 
 
 def test_impulse_responses_make_the_recorded_wideband_channel(data: Dataset, tmp_path: Path) -> None:
@@ -448,6 +487,13 @@ def test_deepmimo_comes_back_within_single_precision(flavour: str, data: Dataset
     assert list(verify(tmp_path / "back")) == []
 
 
+def test_episodes_of_one_scene_come_back_from_scenarios_of_deepmimo(folder: Path, tmp_path: Path) -> None:
+    data = generated(tmp_path / "data", folder.parent / "asymmetric.toml", episodes=1, scenes=1)
+    scenario = exported(data, "deepmimo", tmp_path, "dynamic") / "data_e000000"
+    import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+    assert nmse_db(Dataset(tmp_path / "back").users()["channel.h"], data.users()["channel.h"]) < -100
+
+
 def broken(content: bytes, how: str) -> bytes:
     """Damage a file."""
     return {
@@ -490,6 +536,183 @@ def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path
     np.savez(file, **{name: change(table)})
     with pytest.raises(RunError, match=r"_t000_tx000_r001.npz"):
         import_dataset(find_format("deepmimo").read(scenario), tmp_path / "back")
+
+
+# --- DeepSense ----------------------------------------------------------------------------------------------
+
+
+def circle(azimuths_deg: Any) -> Iterator[ImportedScene]:
+    """A receiver on a circle around an array that looks to the north-north-west, seen on a straight path."""
+    turn = np.radians(110.0)
+    tx = AntennaDevice(
+        name="bs", role="tx", position=(5.0, 3.0, 1.5), array=AntennaArray(rows=2, columns=32),
+        orientation=(np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)), power_dbm=10.0,
+    )  # fmt: skip
+    for number, azimuth in enumerate(azimuths_deg):
+        phi = turn + np.radians(azimuth)
+        place = (5.0 + 80 * np.cos(phi), 3.0 + 80 * np.sin(phi), 1.5)
+        rx = AntennaDevice(name="u", role="rx", position=place, array=AntennaArray(columns=2))
+        paths = Paths(
+            tx="bs", rx="u", los=True, a=np.array([[1e-4j]]), tau=np.array([80 / 299792458]),
+            aod=np.array([[np.pi / 2, phi]]), aoa=np.array([[np.pi / 2, phi + np.pi]]),
+            interactions=np.zeros((1, 1), np.uint8),
+        )  # fmt: skip
+        yield ImportedScene(episode=number // 2, scene=number % 2, devices=(tx, rx), paths=[paths])
+
+
+def test_beams_of_deepsense_turn_counter_clockwise(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj")
+    azimuths = np.arange(-44.0, 45.0, 4.0)[:-1]
+    data = Dataset(import_dataset(source_of(tmp_path / "files", circle(azimuths)), tmp_path / "data"))
+    form = find_format("deepsense")
+    with pytest.raises(RunError, match="--origin"):
+        export_users(data.users(), form, tmp_path / "out")
+    form.origin = (38.8907, -77.0787)
+    export_users(data.users(), form, tmp_path / "out")
+    with (tmp_path / "out" / "scenario00.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    found = {name: [row[name] for row in rows] for name in rows[0]}
+    assert list(found) == [
+        "index", "unit1_pwr_60ghz", "unit1_loc", "unit2_loc", "unit1_beam", "seq_index", "time_stamp[UTC]",
+    ]  # fmt: skip
+    assert found["index"] == [str(1 + at) for at in range(22)]
+    assert found["seq_index"] == [str(1 + at // 2) for at in range(22)]
+    assert found["time_stamp[UTC]"][1].startswith("['00-00-0")
+    arrays = {name: np.array([np.loadtxt(tmp_path / "out" / path) for path in found[name]])
+              for name in ("unit1_pwr_60ghz", "unit1_loc", "unit2_loc")}  # fmt: skip
+    beams = np.array(found["unit1_beam"], int)
+    assert (arrays["unit1_pwr_60ghz"].argmax(axis=1) == beams - 1).all()
+    assert np.abs((beams - 1) * 90 / 63 - 45 - azimuths).max() < 0.5 * 90 / 63 + 1e-6
+    # |a|² of 10 mW by a gain of 64; a path between two beams has less.
+    assert arrays["unit1_pwr_60ghz"].max() == pytest.approx(1e-8 * 10 * 64, rel=0.01)
+    # On the sphere that osculates WGS84 there, within 1 cm of 80 m.
+    sine2 = np.sin(np.radians(38.8907)) ** 2
+    prime = 6378137.0 / np.sqrt(1 - 6.69437999014e-3 * sine2)
+    meridian = prime * (1 - 6.69437999014e-3) / (1 - 6.69437999014e-3 * sine2)
+    north, east = np.radians(arrays["unit2_loc"] - arrays["unit1_loc"]).T
+    turn = np.radians(110.0 + azimuths)
+    assert np.allclose(north * meridian, 80 * np.sin(turn), atol=0.01)
+    assert np.allclose(east * prime * np.cos(np.radians(38.8907)), 80 * np.cos(turn), atol=0.01)
+
+
+def test_samples_of_deepsense_have_what_sensors_beside_the_road_saw(clouds: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    pytest.importorskip("pyproj")
+    data = Dataset(clouds)
+    out = exported(data, "deepsense", tmp_path)
+    with (out / "scenario00.csv").open() as file:
+        row = list(csv.DictReader(file))[4]
+    recording = data.episode(1)
+    assert np.array_equal(np.asarray(Image.open(out / row["unit1_rgb"])), recording["camera"].rgb[1, 0])
+    header, _, points = (out / row["unit1_lidar"]).read_bytes().partition(b"end_header\n")
+    hits = recording["lidar"].hits[1, 0]
+    assert f"element vertex {hits}\n".encode() in header
+    right = recording["lidar"].points[1, 0, :hits]
+    assert np.array_equal(np.frombuffer(points, "<f4").reshape(-1, 3), right)
+    latitude, longitude = np.loadtxt(out / row["unit1_loc"])
+    assert (latitude, longitude) == pytest.approx((-33.4 - 40 / 110.9e3, -70.6 + 3 / 93.1e3), abs=1e-6)
+
+
+# --- Minari -------------------------------------------------------------------------------------------------
+
+
+def equal(found: Any, right: Any) -> bool:
+    """Compare trees of arrays bit by bit."""
+    if isinstance(right, dict):
+        return set(found) == set(right) and all(equal(found[name], right[name]) for name in right)
+    return np.asarray(found[()]).dtype == right.dtype and np.asarray(found[()]).tobytes() == right.tobytes()
+
+
+def stacked(steps: list[Any]) -> Any:
+    """Steps as a tree of arrays."""
+    if isinstance(steps[0], dict):
+        return {name: stacked([step[name] for step in steps]) for name in steps[0]}
+    return np.array(steps)
+
+
+OBSERVED = ("aoa", "aod", "departure", "position", "velocity", "last_abs_y", "last_rate", "last_beam")
+
+
+def played(env: Any, episodes: int, **options: Any) -> list[dict[str, Any]]:
+    """Play episodes of random actions, and keep what an environment gives."""
+    found = []
+    env.action_space.seed(3)
+    for _ in range(episodes):
+        observation, _ = env.reset(**options)
+        steps = []
+        while not steps or not steps[-1][-1]:
+            action = env.action_space.sample()
+            before = observation
+            observation, reward, over, cut, _ = env.step(action)
+            steps.append((before, action, reward, over, cut))
+        columns = [*zip(*steps, strict=True)]
+        names = ("observations", "actions", "rewards", "terminations", "truncations")
+        found.append(dict(zip(names, (stacked([*column]) for column in columns), strict=True)))
+        found[-1]["observations"] = stacked([*columns[0], observation])
+    env.close()
+    return found
+
+
+def minari_file(run: Path, out: Path, flavour: str = "") -> Path:
+    """Export a run; the folder of the one dataset in it."""
+    with open_source(str(run)) as data:
+        (folder,) = (path for path in exported(data, "minari", out, flavour).iterdir() if path.is_dir())
+    return folder
+
+
+def test_minari_has_what_the_environment_gave(folder: Path, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    scenario = folder.parent / "asymmetric.toml"
+    env = BeamSelectionEnv(scenario, observe=OBSERVED, reward="normalised", directory=tmp_path / "run")
+    right = played(env, 2)
+    out = minari_file(tmp_path / "run", tmp_path, "normalised")
+    with h5py.File(out / "data" / "main_data.hdf5") as file:
+        assert list(file) == ["episode_0", "episode_1"]
+        for number, episode in enumerate(right):
+            group = file[f"episode_{number}"]
+            assert all(equal(group[name], values) for name, values in episode.items())
+            assert (group.attrs["id"], group.attrs["total_steps"]) == (number, SCENES)
+    about = json.loads((out / "data" / "metadata.json").read_text())
+    assert (about["total_episodes"], about["total_steps"], about["jpeg_encoding"]) == (2, 2 * SCENES, False)
+
+
+def test_minari_itself_finds_what_the_environment_gave(
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    scenario = clouds.parent / "lidar.toml"
+    env = BeamSelectionEnv(scenario, observe=(*OBSERVED, "camera:camera"), directory=tmp_path / "run")
+    right = played(env, 2)
+    out = minari_file(tmp_path / "run", tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
+    data = minari.load_dataset(out.name)
+    assert data.observation_space == env.observation_space
+    assert data.action_space == env.action_space
+    assert (data.total_episodes, data.total_steps) == (2, 2 * SCENES)
+    for found, episode in zip(data, right, strict=True):
+        assert all(equal(getattr(found, name), values) for name, values in episode.items())
+        assert found.observations["aod"][0] in env.observation_space["aod"]
+
+
+def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    shipped = Path(__file__).parents[2] / "deploy" / "caviar_scenarios" / "uav-path.toml"
+    head, _, tail = shipped.read_text().partition("[services.channel.settings]")
+    text = (head + tail[tail.index("[services.link]") :]).replace('"sionna-rt"', '"free-space"')
+    text = text.replace("frames = 60", "frames = 6", 1)
+    scenario = tmp_path / "flight.toml"
+    scenario.write_text("\n".join(line for line in text.splitlines() if not line.startswith("scenery")))
+    env = UavPathEnv(scenario, directory=tmp_path / "run")
+    right = played(env, 1, seed=5)[0]
+    out = minari_file(tmp_path / "run", tmp_path)
+    with h5py.File(out / "data" / "main_data.hdf5") as file:
+        group = file["episode_0"]
+        velocity = group["actions/velocity"][:, 0]
+        share = right["actions"].astype(np.float64)
+        speed = env._max_speed / np.maximum(1.0, np.linalg.norm(share, axis=1, keepdims=True))
+        assert np.allclose(velocity, share * speed)
+        assert len(group["rewards"]) == len(right["rewards"])
 
 
 # --- Wireless InSite ----------------------------------------------------------------------------------------
@@ -707,7 +930,7 @@ def test_a_reader_of_foxglove_finds_what_was_recorded(clouds: Path, tmp_path: Pa
         assert xyz(car.cubes[0].pose.position) == tuple(world.position[0])
         assert xyz(car.cubes[0].size) == (4.5, 1.8, 1.5)
         poses = {t.child_frame_id: t for t in found["/tf"][scene][1].transforms}
-        assert set(poses) == {"car", "bs", "car/rx", "lidar", "car/eye", "car/eye_optical"}
+        assert set(poses) == {"car", "bs", "car/rx", "lidar", "camera", "camera_optical"}
         assert poses["car/rx"].parent_frame_id == "car"
         assert xyz(poses["car/rx"].translation) == (0.3, 0.2, 1.0)
         assert len(found["/rays"][scene][1].entities) == drawn_paths(data, scene)
@@ -717,21 +940,21 @@ def test_a_reader_of_foxglove_finds_what_was_recorded(clouds: Path, tmp_path: Pa
         assert np.array_equal(rows[:, :3], scan.points[0, 0])
         assert xyz(cloud.pose.position) == (16.0, 10.0, 3.0)
         camera = recording["camera"].select(frames=[scene])
-        image = found["/camera/car/eye/image"][scene][1]
-        assert (image.width, image.height, image.encoding) == (16, 12, "rgb8")
+        image = found["/camera/camera/image"][scene][1]
+        assert (image.width, image.height, image.encoding) == (40, 32, "rgb8")
         assert image.data == camera.rgb[0, 0].tobytes()
         link = recording["link"].select(frames=[scene])
         user = found["/users/car/rx/bs/mm"][scene][1]
         assert user["snr_db"] == pytest.approx(10 * np.log10(link.snr[0, 0]))
         assert user["tx_beam"] == link.tx_beam[0, 0]
     # Straight ahead of the camera is z of its optical axes.
-    optical = poses["car/eye_optical"]
+    optical = poses["camera_optical"]
     turned = optical.rotation
     ahead = rotation_matrix((turned.w, turned.x, turned.y, turned.z))[:, 2]
     assert np.allclose(ahead, rotation_matrix(camera.orientation[0, 0].tolist())[:, 0])
-    calibration = found["/camera/car/eye/calibration"][0][1]
-    assert calibration.K[0] == pytest.approx(8 / np.tan(np.radians(40)))
-    assert calibration.K[2] == 7.5
+    calibration = found["/camera/camera/calibration"][0][1]
+    assert calibration.K[0] == pytest.approx(20.0)
+    assert calibration.K[2] == 19.5
 
 
 def test_beams_of_viewers_point_where_the_codebook_does() -> None:
@@ -753,8 +976,8 @@ def test_a_reader_of_ros_finds_what_was_recorded(clouds: Path, tmp_path: Path) -
             found.setdefault(connection.topic, []).append((time, message))
     assert {topic: len(messages) for topic, messages in found.items() if "users" not in topic} == {
         "/scenery": 1, "/tf": 3, "/objects": 3, "/objects/car/pose": 3, "/rays": 3,
-        "/lidar/lidar/points": 3, "/camera/car/eye/image": 3, "/camera/car/eye/depth": 3,
-        "/camera/car/eye/camera_info": 3,
+        "/lidar/lidar/points": 3, "/camera/camera/image": 3, "/camera/camera/depth": 3,
+        "/camera/camera/camera_info": 3,
     }  # fmt: skip
     places = np.array([xyz(pose.pose.position) for _, pose in found["/objects/car/pose"]])
     assert np.array_equal(places, recording["scene"].position[:, 0])
@@ -766,12 +989,12 @@ def test_a_reader_of_ros_finds_what_was_recorded(clouds: Path, tmp_path: Path) -
         rows = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(cloud.width, 4)
         assert np.array_equal(rows[:, :3], recording["lidar"].select(frames=[scene]).points_world[0, 0])
         assert len(found["/rays"][scene][1].markers) == 1 + drawn_paths(data, scene)
-        image = found["/camera/car/eye/image"][scene][1]
+        image = found["/camera/camera/image"][scene][1]
         right = recording["camera"].select(frames=[scene]).rgb[0, 0]
         assert np.array_equal(image.data.reshape(image.height, image.width, 3), right)
-        depth = found["/camera/car/eye/depth"][scene][1]
+        depth = found["/camera/camera/depth"][scene][1]
         assert np.array_equal(
-            np.frombuffer(depth.data.tobytes(), "<f4").reshape(12, 16),
+            np.frombuffer(depth.data.tobytes(), "<f4").reshape(32, 40),
             recording["depth"].select(frames=[scene]).depth[0, 0],
         )
     snr = [message.data for _, message in found["/users/car/rx/bs/mm/snr_db"]]

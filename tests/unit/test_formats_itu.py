@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from test_formats import generated
+from test_formats import SERVICES, generated
 
 from caviar_clients.datasets.reader import Dataset
 from caviar_formats.base import export_users, find_format
@@ -37,35 +37,7 @@ name = "60GHz"
 frequency_hz = 60e9
 bandwidth_hz = 100e6
 
-[services.world]
-role = "world"
-use = "trajectory"
-budget_ms = 20
-
 {objects}
-
-[services.channel]
-role = "channel"
-use = "geometric"
-budget_ms = 100
-
-[services.channel.settings]
-components = 5
-
-[services.link]
-role = "link"
-use = "beams"
-budget_ms = 20
-
-[services.agent]
-role = "agent"
-use = "los-beam"
-budget_ms = 20
-
-[services.recorder]
-role = "recorder"
-use = "mcap"
-budget_ms = 100
 
 {sensors}
 
@@ -128,7 +100,7 @@ size_px = [960, 540]
 
 def scenario(objects: str, sensors: str = "", topics: str = "") -> str:
     count = objects.count("name = ")
-    return SCENARIO.format(objects=objects, sensors=sensors, topics=topics, count=count)
+    return SERVICES + SCENARIO.format(objects=objects, sensors=sensors, topics=topics, count=count)
 
 
 def vehicle(name: str, kind: str, waypoints: list[list[float]]) -> str:

@@ -18,7 +18,7 @@ ANTENNA = {"type": "antenna", "name": "bs", "role": "tx"}
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        (HELLO | {"role": "worldd"}, "write one of agent, channel, link, recorder, sensors, world"),
+        (HELLO | {"role": "worldd"}, "write one of agent, channel, link, observer, recorder, sensors, world"),
         (HELLO | {"type": "HELO"}, "write one of HELLO, WELCOME, REFUSE"),
         (
             GRANT | {"inputs": [{"topic": "scene", "source": "city", "status": "new"}]},

@@ -24,7 +24,7 @@ from caviar_protocol.codec import (
 from caviar_protocol.codec.payloads import BodyReader, BodyWriter
 from caviar_protocol.digest import payload_digest
 from caviar_protocol.errors import ProtocolError
-from caviar_protocol.messages import Grant, Hello, Message
+from caviar_protocol.messages import Grant, Hello, Message, Observe
 from caviar_protocol.topics import PAYLOADS
 
 VECTORS = all_vectors()
@@ -116,10 +116,10 @@ def test_every_digest_in_a_vector_with_a_product_is_that_of_its_parts() -> None:
     for vector in MESSAGES:
         message = read(vector)
         if "product" in vector.stated:
-            entries = message.inputs if isinstance(message, Grant) else message.products
+            entries = message.inputs if isinstance(message, Grant | Observe) else message.products
             assert [e.digest for e in entries] == [payload_digest(*vector.parts[1:3])], vector.name
             checked += 1
-    assert checked == 2
+    assert checked == 3
 
 
 # --- completeness ---------------------------------------------------------------------------------

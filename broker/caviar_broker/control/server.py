@@ -20,7 +20,7 @@ import zmq
 
 from caviar_broker.control.socket import ControlSocket
 from caviar_broker.core import events as ev
-from caviar_broker.server import BrokerServer, Observer
+from caviar_broker.server import BrokerServer, Listener
 from caviar_broker.statistics import Statistics
 from caviar_protocol.errors import AssetError
 from caviar_protocol.policies import PolicyFolder
@@ -34,6 +34,8 @@ MAX_CONNECTIONS = 32
 FRAME_EVENT_NS = 50_000_000
 """[ns] between ``frame`` events at least."""
 MAX_STEPS = 1_000_000_000
+MAX_ANSWERS = 200
+"""Answers to grants of a service that a client gets at once, the newest ones."""
 NOTED = ("note", "refused")
 """Kinds of notices that a client may give."""
 BLAMES = frozenset({"miss", "lost", "away", "fault", "skipped"})
@@ -45,21 +47,21 @@ Answer = dict[str, Any]
 class ControlServer:
     """Answers questions about one broker.
 
-    It is the server's observer, in front of the one that it is given, so it knows the last blame.
+    It is the server's listener, in front of the one that it is given, so it knows the last blame.
 
     Args:
         directory: Directory of the run; the socket is made there.
-        observer: Gets everything too.
+        listener: Gets everything too.
 
     Raises:
         RunError: Another broker serves that directory, or no socket can be made.
     """
 
-    def __init__(self, directory: Path, observer: Observer) -> None:
+    def __init__(self, directory: Path, listener: Listener) -> None:
         # Before the broker itself exists: a second broker is refused before it touches anything of the run.
         self._place = ControlSocket(directory)
         self._given = PolicyFolder(directory)
-        self._observer = observer
+        self._listener = listener
         self._server: BrokerServer | None = None
         self._callers: dict[int, _Caller] = {}
         self._last_blame: Answer | None = None
@@ -75,6 +77,8 @@ class ControlServer:
             "stop": self._stop,
             "policies": self._policies,
             "swap": self._swap,
+            "scenery": self._scenery,
+            "answers": self._answers,
             "gateway": self._gateway,
             "serving": self._note_serving,
             "note": self._note,
@@ -115,11 +119,11 @@ class ControlServer:
             # The wall clock, which a user compares with logs; everything else here is monotonic.
             self._last_blame = {**fields, "at": time.time()}
         self._tell({"event": "notice", **fields})
-        self._observer.notice(notice)
+        self._listener.notice(notice)
 
     def frame(self, frame: ev.FrameFinished, statistics: Statistics) -> None:
         """Pass a frame on; subscribers get one in 50 ms at most, which is as often as a person reads."""
-        self._observer.frame(frame, statistics)
+        self._listener.frame(frame, statistics)
         # The frame path: without a client it costs this one look.
         if not self._callers:
             return
@@ -212,6 +216,22 @@ class ControlServer:
             name: msgspec.to_builtins(figures)
             for name, figures in self.server.statistics.recent_services().items()
         }
+
+    def _scenery(self, _: Mapping[str, Any]) -> Answer:
+        files = self.server.scenery()
+        return {"ok": True, "assets": {name: str(path) for name, path in files.items()}}
+
+    def _answers(self, request: Mapping[str, Any]) -> Answer:
+        """Answers to grants that came after the first so many of each service."""
+        known = request.get("known", {})
+        statistics = self.server.statistics
+        found = {}
+        for service in self.server.clock.plan.services:
+            first = known.get(service.name, 0) if isinstance(known, dict) else 0
+            newest = statistics.granted(service.name) - MAX_ANSWERS
+            first = max(first if type(first) is int else 0, newest, 0)
+            found[service.name] = {"first": first, "rows": statistics.answers(service.name, first).tolist()}
+        return {"ok": True, "answers": found}
 
     # --- orders ---------------------------------------------------------------------------------------
 

@@ -26,8 +26,10 @@ from caviar_broker.core.plan import RunPlan
 from caviar_broker.core.policy_swaps import PolicyState
 from caviar_broker.core.run import Member, Resumption, Run, Snapshot
 from caviar_broker.core.status import RunStatus, status_of
+from caviar_broker.core.tasks import FinishedFrame
 from caviar_broker.core.transitions import RunState, ServiceState
 from caviar_protocol.digest import RunDigest
+from caviar_protocol.fields import Asset
 
 
 class FrameClock:
@@ -76,6 +78,11 @@ class FrameClock:
         }
 
     # --- the interface of a shell ----------------------------------------------------------------
+
+    @property
+    def scenery(self) -> tuple[Asset, ...]:
+        """The scenery of all worlds that have announced it."""
+        return self._run.scenery()
 
     def receive(self, event: ev.Event, now: int) -> None:
         """Take in one event.
@@ -184,6 +191,15 @@ class FrameClock:
         """Frames of the present episode that are finished; 0 between episodes."""
         dispatcher = self._episodes.dispatcher
         return 0 if dispatcher is None else dispatcher.table.finished_frames
+
+    def newest_frame(self) -> FinishedFrame | None:
+        """The newest finished frame, with what its consumers got; None: none is finished."""
+        return self._episodes.newest_frame()
+
+    @property
+    def paused(self) -> bool:
+        """True if the user has the run begin no frames."""
+        return self._run.gate.closed
 
     def snapshot(self) -> Snapshot | None:
         """The run up to its last finished frame, as a compacted journal opens with it; None without one."""

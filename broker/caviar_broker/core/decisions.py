@@ -13,7 +13,7 @@ from caviar_broker.core.graph import Edge
 from caviar_broker.core.pace import Pacer
 from caviar_broker.core.plan import milliseconds
 from caviar_broker.core.run import Run
-from caviar_broker.core.tasks import Decision, Participant, Task, TaskInputs, provenance_of
+from caviar_broker.core.tasks import Decision, FinishedFrame, Participant, Task, TaskInputs, provenance_of
 from caviar_broker.core.transitions import DECIDED, OUTSTANDING, TaskEvent, TaskState
 from caviar_protocol.messages import GrantInput, Status
 
@@ -86,6 +86,21 @@ class DecisionTable:
     def tasks(self) -> Iterable[Task]:
         """All tasks that are not forgotten."""
         return (task for participant in self.participants.values() for task in participant.tasks.values())
+
+    def newest(self) -> FinishedFrame | None:
+        """The newest finished frame; None: there is none, or a broker before finished it."""
+        frame = self.finished_frames - 1
+        tasks = [p.tasks[frame] for p in self.participants.values() if frame in p.tasks]
+        if not tasks:
+            return None
+        return FinishedFrame(
+            self._episode,
+            frame,
+            self._plan.t_ns(frame),
+            # Of a run that goes on the journal has only products that later frames may need.
+            tuple([d for t in tasks for d in t.decisions.values() if d.product or d.status is _ABSENT]),
+            tuple([task.report for task in tasks if task.report is not None]),
+        )
 
     # --- what consumers get ------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from caviar_broker.core.checkpoints import Checkpoints, PayloadSize
 from caviar_broker.core.dispatch import Dispatcher
 from caviar_broker.core.mesh_changes import GeometryLedger
 from caviar_broker.core.run import Member, Run
+from caviar_broker.core.tasks import FinishedFrame
 from caviar_broker.core.transitions import RunEvent, RunState, ServiceEvent, ServiceState, TaskState
 from caviar_protocol.errors import one_line
 from caviar_protocol.messages import (
@@ -159,6 +160,11 @@ class Episodes:
             self.dispatcher.close(now)
             self._ended, self.dispatcher = self.dispatcher, None
             self.geometry.end_episode()
+
+    def newest_frame(self) -> FinishedFrame | None:
+        """The newest finished frame of this episode, or of the one before; None: there is none."""
+        tables = [d.table for d in (self.dispatcher, self._ended) if d is not None]
+        return next((frame for table in tables if (frame := table.newest()) is not None), None)
 
     def handle_last_recording(self, event: ev.DoneReceived, now: int) -> bool:
         """Take a recorder's DONE after the end of the run: whether it was such a one.

@@ -68,6 +68,16 @@ class Decision(msgspec.Struct, frozen=True):
         return self.provenance.status
 
 
+class FinishedFrame(msgspec.Struct, frozen=True):
+    """A frame that every service is through with, as observers see it."""
+
+    episode: int
+    frame: int
+    t_ns: int
+    decisions: tuple[Decision, ...]
+    reports: tuple[Report, ...]
+
+
 class GrantOrder(msgspec.Struct, frozen=True):
     """A grant that the dispatcher wants sent."""
 

@@ -109,17 +109,24 @@ def _refuse_taken(host: str, port: int) -> None:
         ) from None
 
 
-async def serve(run: Path, address: str, keys: Path | None) -> None:
+async def serve(
+    run: Path, address: str, keys: Path | None, announce: Callable[[str], None] = lambda url: None
+) -> None:
     """Serve until the broker ends. Raises `RunError` where none runs there, or the address is taken.
 
     Args:
         run: Directory of the run.
         address: ``HOST:PORT`` to serve at.
         keys: Keys directory; None: that of the broker, if any.
+        announce: Called with the URL, once it is served.
     """
-    from caviar_broker.http.app import make_app
+    from fastapi import Depends
+
+    from caviar_broker.http.app import make_app, may
     from caviar_broker.http.gateway import NOTE, REMEDY, Gateway
     from caviar_broker.http.server import http_server, listening_socket, place_of
+    from caviar_broker.http.view import LiveView, view_router
+    from caviar_protocol.keys import VIEWER
 
     # Everything is asked over the control socket, which only the broker's user can reach.
     ask = functools.partial(ask_in_thread, run)
@@ -144,14 +151,19 @@ async def serve(run: Path, address: str, keys: Path | None) -> None:
         notices.add(task)
         task.add_done_callback(notices.discard)
 
-    server = http_server(make_app(ask, run, tokens, gateway), notify_soon, own_process=True)
+    app = make_app(ask, run, tokens, gateway)
+    live = LiveView(ask, run, _reachable(status["endpoint"]), credentials)
+    app.include_router(view_router({"": live.answers}, [Depends(may(VIEWER, tokens))], live))
+    server = http_server(app, notify_soon, own_process=True)
 
     def end() -> None:
         server.should_exit = True
 
     # Before the address is announced: a broker that ends in between must not leave this process behind.
     call_at_end(connect(run), end)
-    await ask(do="serving", http=f"http://{place_of(host, listening)}")
+    url = f"http://{place_of(host, listening)}"
+    await ask(do="serving", http=url)
+    announce(url)
     try:
         await server.serve(sockets=[listening])
     finally:

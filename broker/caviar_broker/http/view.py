@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
-from collections.abc import Callable, Mapping
+import json
+import threading
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import RedirectResponse
+from fastapi.responses import RedirectResponse, StreamingResponse
 
+from caviar_broker.control.socket import Ask
 from caviar_broker.http.app import LocalOnly, may
 from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.http.server import http_server, listening_socket, place_of
-from caviar_protocol.errors import CaviarError
-from caviar_protocol.keys import VIEWER
+from caviar_broker.security.access import PAGE
+from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.keys import VIEWER, Credentials
+from caviar_protocol.observer import EVERYTHING, Observer
+from caviar_protocol.run_directory import RunDirectory
 from caviar_view.answers import BINARY, Answers, NotThereError
+from caviar_view.live import LiveFrames
+
+PERIOD_S = 0.04
+"""[s] from one frame that is shown to the next at least: more than a screen needs."""
+QUIET_S = 0.5
+"""[s] between news of a run that makes no frames."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -33,13 +47,11 @@ _FILES = {
 _COMPRESSED_FROM = 1024
 
 
-async def serve_views(
-    views: Mapping[str, Answers], address: str, keys: Path | None, announce: Callable[[str], None]
-) -> None:
+async def serve_views(views: Views, address: str, keys: Path | None, announce: Callable[[str], None]) -> None:
     """Serve the viewer, without a broker, until the process is interrupted.
 
     Args:
-        views: Answers, as of `view_router`.
+        views: What is shown.
         address: ``HOST:PORT``; port 0: any free one.
         keys: Keys directory with tokens; None: processes of this machine are served without.
         announce: Called with the URL of the page, once it is served.
@@ -64,12 +76,104 @@ async def serve_views(
     await server.serve(sockets=[listening])
 
 
-def view_router(views: Mapping[str, Answers], viewer: list[Any]) -> APIRouter:
+class LiveView:
+    """Answers about a run as it goes on: observed from the first request on, until the run ends.
+
+    Args:
+        ask: Asks the broker.
+        directory: Of the run.
+        endpoint: ZeroMQ address of the broker.
+        credentials: For a broker with keys.
+    """
+
+    def __init__(self, ask: Ask, directory: Path, endpoint: str, credentials: Credentials | None) -> None:
+        self._ask, self._record = ask, RunDirectory(directory).record
+        self._observed = endpoint, PAGE, EVERYTHING, credentials
+        self._starting = asyncio.Lock()
+        self._answers: Answers | None = None
+        self._frames: LiveFrames | None = None
+        self._failure = ""
+
+    async def answers(self, path: str) -> Answers:
+        """Answers; the observer begins with the first call.
+
+        Raises:
+            RunError: The run has not begun, or the broker refuses the observer.
+        """
+        async with self._starting:
+            if self._answers is None:
+                await self._start()
+        if self._answers is None or self._frames is None or (self._failure and not self._frames.end):
+            raise RunError(self._failure)
+        if path == "clock":
+            known = self._frames.known_answers()
+            self._frames.add_answers((await self._ask(do="answers", known=known))["answers"])
+        return self._answers
+
+    async def _start(self) -> None:
+        status = (await self._ask(do="status"))["status"]
+        if status["state"] in ("joining", "preparing"):
+            waits = ", ".join(wait["service"] for wait in status["waits"])
+            raise RunError(f"the run has not begun: it waits for {waits or 'its services'}")
+        files = (await self._ask(do="scenery"))["assets"]
+        record = json.loads(await asyncio.to_thread(self._record.read_text, "utf-8"))
+        scenario = record["scenario"]
+        seed = (scenario.get("run") or {}).get("seed", 0)
+        assets = {name: Path(file) for name, file in files.items()}
+        self._frames = LiveFrames(scenario, status["run"], seed, assets)
+        self._answers = Answers(self._frames, controls=True)
+        threading.Thread(target=self._observe, args=(self._frames,), name="observer", daemon=True).start()
+        for _ in range(100):  # the first frame, where there is one: a page can show it at once
+            if self._frames.end or self._failure:
+                break
+            await asyncio.sleep(0.02)
+
+    def _observe(self, frames: LiveFrames) -> None:
+        try:
+            with Observer(*self._observed, period_s=PERIOD_S) as observer:
+                for seen in observer:
+                    frames.add(seen)
+            self._failure = observer.ended or "the run is over"
+        except CaviarError as error:
+            self._failure = str(error)
+
+    async def news(self) -> AsyncIterator[bytes]:
+        """Server-sent events about new frames, and what the run does; without any, one in `QUIET_S`."""
+        answers = await self.answers("news")
+        frames, told, said_at = answers.frames, -1, 0.0
+        while not self._failure:
+            now = time.monotonic()
+            if frames.end != told or now - said_at > QUIET_S:
+                why = (await self._ask(do="why"))["why"]
+                added = answers.blocks(told)
+                told, said_at = frames.end, now
+                event = {key: why.get(key) for key in ("state", "paused", "waits")}
+                event |= {"first": frames.first, "frames": told, "added": added}
+                yield f"data: {json.dumps(event)}\n\n".encode()
+            await asyncio.sleep(PERIOD_S)
+        yield f"data: {json.dumps({'ended': self._failure})}\n\n".encode()
+
+
+Views = Mapping[str, Callable[[str], Awaitable[Answers]]]
+"""By the place before ``data/``, "" and, of a second run, ``beside/``: answers for a path."""
+
+
+def standing(answers: Answers) -> Callable[[str], Awaitable[Answers]]:
+    """Answers that are there from the beginning, as an entry of `Views`."""
+
+    async def found(_: str) -> Answers:
+        return answers
+
+    return found
+
+
+def view_router(views: Views, viewer: list[Any], live: LiveView | None = None) -> APIRouter:
     """Make the routes below ``/view/``.
 
     Args:
-        views: Answers by their place before ``data/``: "" and, of a second run, ``beside/``.
+        views: What is shown.
         viewer: Dependencies that check a request for data; the page itself has no data.
+        live: Has the news of a run as it goes on; None: there are none.
     """
     router = APIRouter(prefix="/view", include_in_schema=False)
     folder = resources.files("caviar_view") / "page"
@@ -84,10 +188,20 @@ def view_router(views: Mapping[str, Answers], viewer: list[Any]) -> APIRouter:
     for path, (name, media_type) in _FILES.items():
         router.get(f"/{path}")(page(name, media_type))
 
-    def data(answers: Answers) -> Any:
+    if live is not None:
+        news = live.news
+
+        @router.get("/data/news", dependencies=viewer)
+        async def tell() -> Response:
+            return StreamingResponse(news(), media_type="text/event-stream")
+
+    def data(view: Callable[[str], Awaitable[Answers]]) -> Any:
         async def answer(path: str, request: Request) -> Response:
             try:
+                answers = await view(path)
                 found = await run_in_threadpool(answers.get, path, dict(request.query_params))
+            except RunError as error:
+                raise HTTPException(503, str(error)) from None
             except NotThereError as error:
                 raise HTTPException(404, str(error)) from None
             except CaviarError as error:
@@ -96,8 +210,8 @@ def view_router(views: Mapping[str, Answers], viewer: list[Any]) -> APIRouter:
 
         return answer
 
-    for place, answers in views.items():
-        router.get(f"/{place}data/{{path:path}}", dependencies=viewer)(data(answers))
+    for place, view in views.items():
+        router.get(f"/{place}data/{{path:path}}", dependencies=viewer)(data(view))
     return router
 
 

@@ -110,6 +110,8 @@ LOCAL = "services of this run"
 """What the key is called that a launcher gives to the services that it starts itself."""
 GATEWAY = "WebSocket gateway"
 """What the key is called with which the gateway connects those who have a token."""
+PAGE = "HTTP page"
+"""Observer that the process with the gateway is itself; no token can have this name."""
 
 _Stamp = tuple[int, int, int]
 
@@ -177,6 +179,8 @@ class Access:
             if known is None:
                 return f"the key given to services that this run starts is not for {name!r}"
             return _role_refusal(name, known, role)
+        if key == self.gateway.public and name == PAGE:
+            return _role_refusal(name, "observer", role)
         if key == self.gateway.public:
             # Reason why no peer of the gateway may appear as that service; the gateway checks its token.
             roles = [token.role for token in self._tokens if token.name == name and token.of_service]

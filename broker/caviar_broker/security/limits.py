@@ -96,6 +96,8 @@ class PeerLimits:
     """[B] that wait of a service, or for it: the largest product and something."""
     part: int = MAX_BODY
     """[B] of one part of a message."""
+    observer_ns: int = 10_000_000_000
+    """[ns] that an observer may take to acknowledge a message."""
 
     @classmethod
     def from_scenario(cls, limits: Limits) -> PeerLimits:
@@ -109,6 +111,7 @@ class PeerLimits:
             rate=limits.messages_per_s,
             queued=limits.waiting_mib << 20,
             part=limits.part_mib << 20,
+            observer_ns=round(limits.observer_s * 1e9),
         )
 
 
@@ -275,11 +278,16 @@ class PeerGuard:
         peer = self._peers.get(route)
         return self._origin(peer) if peer is not None else ""
 
-    def cut(self, route: bytes, why: str) -> None:
-        """End the connection of a peer, and bar it for a while."""
+    def is_open(self, route: bytes) -> bool:
+        """Return whether the connection of a peer still stands, as far as is known."""
+        peer = self._peers.get(route)
+        return peer is not None and not peer.ended and not peer.cut
+
+    def cut(self, route: bytes, why: str, *, bar: bool = True) -> None:
+        """End the connection of a peer, and ``bar`` it for a while."""
         peer = self._peers.get(route)
         if peer is not None and not peer.cut:
-            self._cut(peer, why)
+            self._cut(peer, why, bar=bar)
 
     def _origin(self, peer: _Peer) -> str:
         wire = peer.wire or peer.maybe

@@ -104,7 +104,7 @@ def token(
         str,
         typer.Option(
             help="viewer: look on; operator: also give orders; trainer: look on and swap policies; "
-            "or the role of a service"
+            "observer: look on, frames over WebSocket too; or the role of a service"
         ),
     ] = k.VIEWER,
     directory: Directory = DEFAULT,

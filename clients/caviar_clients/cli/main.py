@@ -113,6 +113,9 @@ def run(
     pace: Pace = None,
     keys: Keys = None,
     http: Http = "",
+    view: Annotated[
+        bool, typer.Option("--view", help="show the run in 3D: print the page's address, open a browser")
+    ] = False,
     attach: Attach = None,
     resume: Resume = None,
     force: Force = False,
@@ -130,7 +133,7 @@ def run(
     else:
         ended = run_scenario(
             source, out, _console, frames, seed, json, bind, embedded, keys, http, pace,
-            attach or (), keys_given,
+            attach or (), keys_given, view,
         )  # fmt: skip
     raise typer.Exit(ended.status)
 

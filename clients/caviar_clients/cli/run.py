@@ -21,6 +21,7 @@ from caviar_clients.cli.launch import Interruption, Launcher
 from caviar_clients.cli.remote import key_text, reachable, start_command, waiting_text
 from caviar_clients.cli.scenarios import require_extras
 from caviar_clients.cli.shared import new_run_directory, print_line, progress_bar, require_writable
+from caviar_clients.cli.view import live_page, open_browser
 from caviar_clients.files import printable, write_file
 from caviar_clients.session.prepared import PreparedScenario, implemented, prepare
 from caviar_protocol.errors import RecordingError, RunError, SetupError
@@ -195,6 +196,7 @@ def run_scenario(
     pace: str | None = None,
     attachments: Sequence[str] = (),
     settings: Sequence[str] = (),
+    view: bool = False,
 ) -> RunOutcome:
     """Run a scenario to its end, with progress and summary on the screen.
 
@@ -210,12 +212,14 @@ def run_scenario(
         http: ``HOST:PORT`` at which HTTP is served; empty: nowhere.
         attachments: ``NAME=VALUE`` each, what is attached to the scenario.
         settings: ``KEY=VALUE`` each, in place of what the scenario's file says.
+        view: Whether a browser is opened with the viewer's page, where there is one.
 
     Raises:
         ScenarioError: A key or value of the scenario is wrong.
         SetupError: An extra is missing, or options do not go together.
         RunError: A file cannot be written, or the broker cannot start.
     """
+    http = http or "127.0.0.1:0" * view
     with loading():  # the classes of services
         prepared = prepare(path, frames, seed, pace, attachments, settings)
     scenario = prepared.scenario
@@ -227,7 +231,9 @@ def run_scenario(
     if embedded:
         refuse_remote(scenario)
     if http and embedded:
-        raise SetupError("an embedded run has no broker process that HTTP could ask; leave out --http")
+        raise SetupError(
+            "an embedded run has no broker process that HTTP could ask; leave out --http and --view"
+        )
     if embedded and (bind or keys is not None):
         raise SetupError("an embedded run has no sockets: leave out --bind and --keys, or --embedded")
     if http:
@@ -257,7 +263,9 @@ def run_scenario(
             attachments=attachments,
             settings=settings,
         )
-    return _follow(launcher, scenario, directory, console, json_file, keys, prepared.warnings, new=True)
+    return _follow(
+        launcher, scenario, directory, console, json_file, keys, prepared.warnings, new=True, view=view
+    )
 
 
 def resume_run(
@@ -309,6 +317,7 @@ def _follow(
     warnings: Sequence[str] = (),
     *,
     new: bool = False,
+    view: bool = False,
 ) -> RunOutcome:
     """Show a run to its end, and sum it up.
 
@@ -317,6 +326,7 @@ def _follow(
         scenario, directory, console, json_file, keys: As of `run_scenario`.
         warnings: Of the scenario.
         new: Whether the directory is removed where the user stops the run before its first frame.
+        view: Whether a browser is opened with the viewer's page.
     """
     from caviar_clients.cli.summary import recorded_figures, summary_of
 
@@ -328,6 +338,10 @@ def _follow(
             watcher = _Watcher(bar, console, scenario, keys)
             for event in launcher.events():
                 watcher.show(event)
+                if view and (page := live_page(directory)):
+                    view = False
+                    print_line(console, f"{page} shows the run")
+                    open_browser(page)
                 if event["event"] == "finished":
                     outcome = event
     except KeyboardInterrupt:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import sys
 import webbrowser
@@ -14,8 +15,9 @@ import msgspec
 from rich.console import Console
 
 from caviar_clients.cli.shared import print_line, progress_bar
-from caviar_protocol.errors import RecordingError, SetupError
-from caviar_protocol.run_directory import runs_below
+from caviar_protocol.errors import CaviarError, RecordingError, SetupError
+from caviar_protocol.files import read_regular
+from caviar_protocol.run_directory import RunDirectory, runs_below
 
 if TYPE_CHECKING:
     from caviar_view.frames import Frames
@@ -62,19 +64,49 @@ def view(
         thin = "" if every == 1 else f", every {every} frames one"
         print_line(console, f"{save}: {len(content) / 1e6:.1f} MB{thin}; it opens without a server")
         return
-    from caviar_broker.http.view import serve_views
-
-    views = {"": Answers(_frames(source, episode), beside=beside is not None)}
-    if beside is not None:
-        views["beside/"] = Answers(_frames(beside, episode))
 
     def announce(url: str) -> None:
-        print_line(console, f"{url} shows {source}; Ctrl-C ends it")
+        print_line(console, f"{url} shows {source}{'' if url == served else '; Ctrl-C ends it'}")
         if opens:
             open_browser(url)
 
+    served = live_page(source)
+    if _is_running(source):
+        if served:
+            announce(served)
+            return
+        from caviar_broker.http.process import serve
+
+        with contextlib.suppress(KeyboardInterrupt):
+            asyncio.run(serve(source, http, keys, lambda url: announce(f"{url}/view/")))
+        return
+    from caviar_broker.http.view import serve_views, standing
+
+    views = {"": standing(Answers(_frames(source, episode), beside=beside is not None))}
+    if beside is not None:
+        views["beside/"] = standing(Answers(_frames(beside, episode)))
+
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve_views(views, http, keys, announce))
+
+
+def live_page(run: Path) -> str:
+    """URL of the page of a run whose broker serves HTTP; empty where none does, or not yet."""
+    try:
+        note = json.loads(read_regular(RunDirectory(run).control_note))
+    except (OSError, ValueError):
+        return ""
+    return f"{note['http']}/view/" if "http" in note else ""
+
+
+def _is_running(run: Path) -> bool:
+    from caviar_broker.control.socket import connect
+
+    try:
+        connect(run).close()
+    except CaviarError:
+        return False
+    return True
 
 
 def open_browser(url: str) -> None:

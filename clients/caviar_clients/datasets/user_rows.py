@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import random
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _DTYPES: dict[type, Any] = {int: np.int64, float: np.float64, bool: np.bool_, str: np.str_}
 _NONE: dict[type, Any] = {int: -1, float: np.nan}
+Beside: TypeAlias = "Callable[[Dataset, int, int], object] | None"
 SENSORS = topics_of("sensors")
 """Topics with a row for each sensor: a user has the one on its own object, or that of all."""
 _WITH_USERS = ("channel", "link", *SENSORS)
@@ -196,11 +197,12 @@ class Users:
             raise IndexError(f"users[{_shown(name)}]: {error}; {has}, as a slice, list or mask") from None
         return Users(self._dataset, self._table.where(rows))
 
-    def read(self, names: Sequence[str]) -> Columns:
+    def read(self, names: Sequence[str], beside: Beside = None) -> Columns:
         """Read several columns and recorded arrays at once, each scene once.
 
         Args:
             names: As of ``users[name]``.
+            beside: Called with (dataset, episode, scene) after each scene, to read more of its frame.
 
         Returns:
             An array for each name; axis 0 counts the users, in their order. Rows of different lengths are
@@ -216,14 +218,15 @@ class Users:
         self.check_names(names)
         columns = {name: self._table[name] for name in names if "." not in name}
         recorded = [name for name in names if "." in name]
-        rows = self._recorded(recorded) if recorded else {}
+        rows = self._recorded(recorded, beside) if recorded else {}
         return Columns({name: columns[name] if name in columns else _stacked(rows[name]) for name in names})
 
-    def rows(self, names: Sequence[str]) -> dict[str, list[Any]]:
+    def rows(self, names: Sequence[str], beside: Beside = None) -> dict[str, list[Any]]:
         """Read the rows of recorded arrays as they are, without padding.
 
         Args:
             names: Of recorded arrays.
+            beside: As of `read`.
 
         Returns:
             For each name an array or a number a user, in their order.
@@ -232,7 +235,7 @@ class Users:
             RecordingError, ValueError, TypeError: As of `read`.
         """
         self.check_names(names)
-        return self._recorded(names)
+        return self._recorded(names, beside)
 
     def distinct(self, name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Read each row of a recorded array once, however many users have it, as the pictures of cameras.
@@ -416,7 +419,7 @@ class Users:
             order += part
         return np.array(order, dtype=np.int64)
 
-    def _recorded(self, names: Sequence[str]) -> dict[str, list[Any]]:
+    def _recorded(self, names: Sequence[str], beside: Beside = None) -> dict[str, list[Any]]:
         """Rows of recorded arrays, in the order of the users."""
         found: dict[str, list[Any]] = {name: [None] * len(self) for name in names}
         by_topic: dict[str, list[str]] = {}
@@ -438,6 +441,8 @@ class Users:
                     column = found[f"{topic}.{field}"]
                     for user, row in zip(users, values, strict=True):
                         column[user] = row
+            if beside:
+                beside(self._dataset, episode, scene)
         return found
 
     def _rows(

@@ -35,9 +35,9 @@ CHUNK = 700
 EPOCH, ATTEMPT = 3, 2
 """Neither is 1, so that a client that sends constants instead of WELCOME's values is found."""
 SEED = 11
-VERSION = (1, 6)
+VERSION = (1, 7)
 """Version of the protocol that the kit plays."""
-CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "parts")
+CAPABILITIES = ("assets", "checkpoint", "episodes", "geometry", "observe", "parts")
 """Capabilities of a broker of that version."""
 LEFT_OVER = 100_000
 """Messages of a life that are discarded before the next one, at most."""

@@ -17,6 +17,7 @@ export {
 } from "./axes.mjs";
 export { CaviarError, ProtocolError, RunError, SceneError } from "./errors.mjs";
 export { main } from "./main.mjs";
+export { Observer } from "./observer.mjs";
 export { generator } from "./random.mjs";
 export { cos, sin } from "./trigonometry.mjs";
 export { decodePayload, encodePayload } from "./topics.mjs";
@@ -29,6 +30,7 @@ export { World } from "./world.mjs";
  * @typedef {import("./types.d.ts").Input} Input
  * @typedef {import("./types.d.ts").Lidar} Lidar
  * @typedef {import("./types.d.ts").Link} Link
+ * @typedef {import("./types.d.ts").Observation} Observation
  * @typedef {import("./types.d.ts").RunInfo} RunInfo
  * @typedef {import("./types.d.ts").Scene} Scene
  * @typedef {import("./types.d.ts").SceneObject} SceneObject

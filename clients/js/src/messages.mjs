@@ -6,7 +6,7 @@ import { bigInteger, bool, integer, list, map, optional, plain, string, Struct }
 /** @import { Context } from "./schema.mjs" */
 
 /** Version of the protocol that this library speaks. */
-export const VERSION = [1, 6];
+export const VERSION = [1, 7];
 export const MAX_HEADER = 1 << 20;
 export const MAX_BODY = 1 << 30;
 export const MAX_PARTS = 513;
@@ -53,18 +53,28 @@ const granted = new Struct({
   cause: optional(text, ""),
   geometry: optional(digestOrNone, ""),
 });
+const subscription = new Struct({
+  topic: newName,
+  source: optional(text, ""),
+  every: optional(ordinal, 1),
+});
 const reported = {
   decisions: optional(map(text), {}),
   measured: optional(map(count), {}),
   counts: optional(map(count), {}),
 };
 
+const reports = optional(
+  list(new Struct({ source: word, ...reported, geometry: geometryChange }), few),
+  [],
+);
+
 /** Fields of each message, by its type. @type {Record<string, Struct>} */
 export const MESSAGES = {
   HELLO: new Struct({
     version,
     name: newName,
-    role: string({ values: ["world", "channel", "sensors", "link", "agent", "recorder"] }),
+    role: string({ values: ["world", "channel", "sensors", "link", "agent", "recorder", "observer"] }),
     inputs: optional(list(input, few), []),
     outputs: optional(list(newName, few), []),
     capabilities: optional(list(word, few), []),
@@ -72,6 +82,7 @@ export const MESSAGES = {
     max_in_flight: optional(integer(1, 64), 1),
     host: optional(text, ""),
     pid: optional(count, 0),
+    subscriptions: optional(list(subscription, few), []),
   }),
   WELCOME: new Struct({
     version,
@@ -121,7 +132,7 @@ export const MESSAGES = {
     inputs: optional(list(granted, few), []),
     final: optional(bool, false),
     decisions: optional(map(text), {}),
-    reports: optional(list(new Struct({ source: word, ...reported, geometry: geometryChange }), few), []),
+    reports,
   }),
   DONE: new Struct({
     ...turn,
@@ -152,6 +163,17 @@ export const MESSAGES = {
   BYE: new Struct({ ...who, reason: optional(text, "") }),
   STALE: new Struct({ of: word, ...turn, frame: orNone }),
   ERROR: new Struct({ code: word, message: text, of: optional(text, ""), subject: optional(text, "") }),
+  OBSERVE: new Struct({
+    sequence: count,
+    state: word,
+    paused: optional(bool, false),
+    episode: optional(count, 0),
+    frame: optional(orNone, -1),
+    t_ns: optional(nanoseconds, 0n),
+    inputs: optional(list(granted, few), []),
+    reports,
+  }),
+  OBSERVED: new Struct({ sequence: count }),
   ATTACH: new Struct({ ...who, name: word }),
   HEARTBEAT: new Struct({
     sequence: count,
@@ -235,6 +257,7 @@ function checkParts(message, parts) {
 function partsOf(message) {
   switch (message.type) {
     case "GRANT":
+    case "OBSERVE":
       return 2 * message.inputs.filter((/** @type {any} */ entry) => entry.status !== "absent").length;
     case "DONE":
       return 2 * message.products.length;

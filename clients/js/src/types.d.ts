@@ -170,6 +170,48 @@ export type Input = {
   };
 }[keyof Payloads];
 
+/** A product of a frame, as an observer sees it; its payload is decoded at the first look. */
+export type ObservedProduct = Input & { readonly header: Uint8Array; readonly body: Uint8Array };
+
+/** The newest finished frame of a run, or another state of it. */
+export interface Observation {
+  episode: number;
+  /** −1: none is finished yet. */
+  frame: number;
+  /** Time of the frame [s]. */
+  t: number;
+  /** `joining`, `preparing`, `resetting`, `running` or `stopping`. */
+  state: string;
+  paused: boolean;
+  /** Provenance of what subscriptions ask for; of what is absent, too. */
+  inputs: Omit<Input, "payload">[];
+  /** What services reported of the frame: `source`, `decisions`, `measured`, `counts`. */
+  reports: Record<string, any>[];
+  /** Those that are there; none where only the state is news. */
+  products: ObservedProduct[];
+}
+
+/** What an observer wants to see, of what the run has anyway. */
+export interface Subscription {
+  /** Or `*`. */
+  topic: keyof Payloads | "*";
+  /** Service; any where it is left out. */
+  source?: string;
+  /** Frames from one to the next at least; 1 by default. */
+  every?: number;
+}
+
+export interface ObserverOptions {
+  /** Unique in the run; with a token, the token's. */
+  name?: string;
+  /** Everything by default. */
+  subscriptions?: Subscription[];
+  /** Of the role `observer`, where the broker has tokens. */
+  token?: string;
+  /** [s] from one observation to the next at least. */
+  period?: number;
+}
+
 /** How the library says what happens: one line of text each. */
 export type Log = (line: string) => void;
 

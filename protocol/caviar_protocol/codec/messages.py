@@ -36,6 +36,7 @@ from caviar_protocol.messages import (
     Done,
     Grant,
     Message,
+    Observe,
     Restore,
     Status,
     Welcome,
@@ -327,7 +328,7 @@ def part_count(message: Message) -> int:
         case Done():
             return 1 + 2 * len(message.products)
         # An absent input has provenance and no bytes.
-        case Grant():
+        case Grant() | Observe():
             return 1 + 2 * sum([entry.status is not _ABSENT for entry in message.inputs])
         case AssetData() | Restore() | CheckpointDone():
             return 2
@@ -364,7 +365,7 @@ def check_parts(message: Message, parts: Sequence[Any]) -> None:
     if max(map(len, parts)) <= MAX_HEADER:
         return
     # The only part of RESTORE and CHECKPOINT_DONE is a state, which is as large as a body.
-    payload_header = MAX_HEADER if isinstance(message, (Grant, Done)) else MAX_BODY
+    payload_header = MAX_HEADER if isinstance(message, (Grant, Done, Observe)) else MAX_BODY
     for index, part in enumerate(parts[1:], 1):
         limit = payload_header if index % 2 else MAX_BODY
         if len(part) > limit:

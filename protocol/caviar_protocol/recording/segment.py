@@ -338,6 +338,9 @@ class Segment:
             position = stop
 
     def _register(self, content: memoryview, offset: int) -> None:
+        # Chunks and the summary repeat the channels, each with its id in front.
+        if len(content) > 2 and int.from_bytes(content[:2], "little") in self.channels:
+            return
         record = _library_record("Channel", content, self.path, offset)
         topic, source = record.metadata.get("topic", record.topic), record.metadata.get("source", "")
         self.channels.setdefault(record.id, Channel(topic, source))

@@ -120,9 +120,10 @@ def _each_pair(value: Callable[[Channel, int, int], Any]) -> Callable[[Any, Chan
 
 def _cuts(channel: Channel) -> Iterator[tuple[int, slice]]:
     """Carrier, and run on the path axis, of each user."""
+    offsets = channel.offsets.tolist()
     for c, t, r in _pairs(channel):
         pair = t * len(channel.rx) + r
-        yield c, slice(int(channel.offsets[pair]), int(channel.offsets[pair + 1]))
+        yield c, slice(offsets[pair], offsets[pair + 1])
 
 
 def _paths(field: str) -> Callable[[Any, Channel], Rows]:

@@ -94,6 +94,9 @@ class Limits(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     waiting_mib: Annotated[
         int, quantity("MiB", "unread messages of a service, or unsent ones to it", ge=2, le=2**20)
     ] = 1088
+    observer_s: Annotated[
+        float, quantity("s", "that an observer may take to acknowledge a frame", gt=0, le=LONGEST_S)
+    ] = 10.0
 
 
 class Run(_Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -385,7 +385,7 @@ func check_parts(fields, parts):
 	var products = 0
 	if type == "DONE":
 		products = fields["products"].size()
-	elif type == "GRANT":
+	elif type == "GRANT" or type == "OBSERVE":
 		for input in fields["inputs"]:
 			products += 0 if input["status"] == "absent" else 1
 	var raw = 1 if type == "ASSET_DATA" or type == "CHECKPOINT_DONE" or type == "RESTORE" else 0

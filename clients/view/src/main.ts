@@ -1,0 +1,47 @@
+// The page begins here.
+import { App } from "./app";
+import { el } from "./dom";
+import { RequestError, Source, takeToken } from "./source";
+import { askToken } from "./panels/token";
+import { fromFragment, Store } from "./state";
+import type { About } from "./types";
+
+declare global {
+  interface Window {
+    caviar?: { state(): ReturnType<App["state"]>; readonly ready: Promise<void> };
+  }
+}
+
+async function start(): Promise<App> {
+  takeToken();
+  const source = new Source("data/", askToken);
+  const about = await source.json<About>("about");
+  const runs = [{ about, source }];
+  if (about.beside) {
+    const other = new Source("beside/data/", askToken);
+    runs.push({ about: await other.json<About>("about"), source: other });
+  }
+  const app = new App(new Store(fromFragment(location.hash)), runs);
+  await app.start();
+  return app;
+}
+
+const begun = start();
+let app: App | null = null;
+window.caviar = {
+  state: () => {
+    if (!app) throw new Error("the page is still loading: await caviar.ready");
+    return app.state();
+  },
+  get ready() {
+    return begun.then((started) => started.ready);
+  },
+};
+begun.then(
+  (started) => (app = started),
+  (error: Error) => {
+    const text = error instanceof RequestError ? `${error.path}: ${error.reason}` : error.message;
+    document.body.append(el("p", { class: "fatal", role: "alert" }, `This page cannot show the run. ${text}`));
+    console.error(error);
+  },
+);
