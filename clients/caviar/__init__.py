@@ -20,8 +20,8 @@ import caviar_clients.envs as _registered  # noqa: F401
 from caviar_protocol.space.beams import beam_gains, best_pairs
 
 if TYPE_CHECKING:
+    from caviar.recorded_run import RecordedRun
     from caviar_clients.datasets.reader import Dataset
-    from caviar_protocol.recording import Recording
     from caviar_protocol.scenario import Scenario
 
 __all__ = ["beam_gains", "best_pairs", "dataset", "load_scenario", "open", "run"]
@@ -113,14 +113,15 @@ def run(
     return outcome.directory
 
 
-def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as caviar.open
+def open(run: str | Path | None = None) -> RecordedRun:  # noqa: A001 - read as caviar.open
     """Open the recording of a run.
 
     Args:
         run: Directory of the run; None for the newest one below ``runs``.
 
     Returns:
-        The recording: arrays by topic over all frames (``recording["link"].abs_y``), or frame by frame.
+        The recording: arrays by topic over all frames (``recording["link"].abs_y``), or frame by frame. A
+        notebook shows its summary and a map, with ``.view()`` its world in 3D.
 
     Raises:
         RecordingError: There is no recording, or it is damaged; the text has the place and the remedy.
@@ -131,9 +132,10 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
         >>> caviar.open(run)["link"].abs_y.shape  # frames × users
         (3, 2)
     """
-    from caviar_protocol.recording import Recording, newest_run
+    from caviar.recorded_run import RecordedRun
+    from caviar_protocol.recording import newest_run
 
-    return Recording(newest_run() if run is None else run)
+    return RecordedRun(newest_run() if run is None else run)
 
 
 def dataset(path: str | Path) -> Dataset:
