@@ -104,7 +104,8 @@ def run(
 
     if not (isinstance(settings, list | tuple) and all(isinstance(key, str) for key in settings)):
         raise TypeError(f"settings is {settings!r:.80}: write a list of KEY=VALUE texts, as ['run.seed=3']")
-    console = Console(quiet=not progress)
+    # A notebook shows the widgets of a console that is quiet, too.
+    console = Console(quiet=not progress, force_jupyter=None if progress else False)
     topics = record if record is None or isinstance(record, str) else ",".join(record)
     keys = keys_set(settings, topics, episodes)
     outcome = run_scenario(Path(scenario), Path(out), console, frames, seed, embedded=embedded, settings=keys)
