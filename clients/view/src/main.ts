@@ -8,7 +8,14 @@ import type { About } from "./types";
 
 declare global {
   interface Window {
-    caviar?: { state(): ReturnType<App["state"]>; readonly ready: Promise<void> };
+    caviar?: {
+      /** What is shown. */
+      state(): ReturnType<App["state"]>;
+      /** Resolves when the newest frame is drawn. */
+      readonly ready: Promise<void>;
+      /** Show a place, and draw it: for videos. */
+      go(n: number): Promise<void>;
+    };
   }
 }
 
@@ -34,7 +41,15 @@ window.caviar = {
     return app.state();
   },
   get ready() {
-    return begun.then((started) => started.ready);
+    return begun.then(async (started) => {
+      await started.ready;
+      started.draw();
+    });
+  },
+  go: async (n) => {
+    const started = await begun;
+    await started.go(n);
+    started.draw();
   },
 };
 begun.then(
