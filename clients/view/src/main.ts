@@ -22,7 +22,7 @@ declare global {
 async function start(): Promise<App> {
   takeToken();
   const source = new Source("data/", askToken);
-  const about = await source.json<About>("about");
+  const about = await whenBegun(source);
   const runs = [{ about, source }];
   if (about.beside) {
     const other = new Source("beside/data/", askToken);
@@ -31,6 +31,23 @@ async function start(): Promise<App> {
   const app = new App(new Store(fromFragment(location.hash)), runs);
   await app.start();
   return app;
+}
+
+/** Ask what there is, again where a run has not begun. */
+async function whenBegun(source: Source): Promise<About> {
+  const note = el("p", { class: "loading", role: "status" });
+  document.body.append(note);
+  for (;;) {
+    try {
+      const about = await source.json<About>("about");
+      note.remove();
+      return about;
+    } catch (error) {
+      if (!(error instanceof RequestError && error.status === 409)) throw error;
+      note.textContent = `${error.reason} …`;
+      await new Promise((resolve) => setTimeout(resolve, 2000));
+    }
+  }
 }
 
 const begun = start();
