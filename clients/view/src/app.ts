@@ -260,7 +260,9 @@ export class App {
       this.stage.setCovered(this.layers.element.offsetWidth);
     }
     if (changed.has("mode") || changed.has("sel")) this.track();
-    this.redraw();
+    // A new place is drawn when it is there: the old one again would only hold it up.
+    if (changed.size > 1 || !changed.has("n")) this.redraw();
+    this.updateTransport();
     this.writeAddress();
   }
 
