@@ -8,14 +8,21 @@ import type { About } from "./types";
 
 declare global {
   interface Window {
-    caviar?: { state(): ReturnType<App["state"]>; readonly ready: Promise<void> };
+    caviar?: {
+      /** What is shown. */
+      state(): ReturnType<App["state"]>;
+      /** Resolves when the newest frame is drawn. */
+      readonly ready: Promise<void>;
+      /** Show a place, and draw it: for videos. */
+      go(n: number): Promise<void>;
+    };
   }
 }
 
 async function start(): Promise<App> {
   takeToken();
   const source = new Source("data/", askToken);
-  const about = await source.json<About>("about");
+  const about = await whenBegun(source);
   const runs = [{ about, source }];
   if (about.beside) {
     const other = new Source("beside/data/", askToken);
@@ -26,6 +33,23 @@ async function start(): Promise<App> {
   return app;
 }
 
+/** Ask what there is, again where a run has not begun. */
+async function whenBegun(source: Source): Promise<About> {
+  const note = el("p", { class: "loading", role: "status" });
+  document.body.append(note);
+  for (;;) {
+    try {
+      const about = await source.json<About>("about");
+      note.remove();
+      return about;
+    } catch (error) {
+      if (!(error instanceof RequestError && error.status === 409)) throw error;
+      note.textContent = `${error.reason} …`;
+      await new Promise((resolve) => setTimeout(resolve, 2000));
+    }
+  }
+}
+
 const begun = start();
 let app: App | null = null;
 window.caviar = {
@@ -34,7 +58,15 @@ window.caviar = {
     return app.state();
   },
   get ready() {
-    return begun.then((started) => started.ready);
+    return begun.then(async (started) => {
+      await started.ready;
+      started.draw();
+    });
+  },
+  go: async (n) => {
+    const started = await begun;
+    await started.go(n);
+    started.draw();
   },
 };
 begun.then(
