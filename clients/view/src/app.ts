@@ -442,6 +442,11 @@ export class App {
     };
   }
 
+  /** Where a place in the world [m] is in the window [px]. */
+  project(place: Vector): [number, number] {
+    return this.stage.project(place);
+  }
+
   /** State of the page, for tests and for people at the console. */
   state() {
     const { state } = this.store;

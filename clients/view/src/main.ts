@@ -6,6 +6,8 @@ import { askToken } from "./panels/token";
 import { fromFragment, Store } from "./state";
 import type { About } from "./types";
 
+const LOADING = "the page is still loading: await caviar.ready";
+
 declare global {
   interface Window {
     caviar?: {
@@ -13,6 +15,8 @@ declare global {
       state(): ReturnType<App["state"]>;
       /** Resolves when the newest frame is drawn. */
       readonly ready: Promise<void>;
+      /** Where a place in the world [m] is in the window [px]. */
+      project: App["project"];
       /** Show a place, and draw it: for videos. */
       go(n: number): Promise<void>;
     };
@@ -43,9 +47,9 @@ async function whenBegun(source: Source): Promise<About> {
       note.remove();
       return about;
     } catch (error) {
-      if (!(error instanceof RequestError && error.status === 409)) throw error;
+      if (!(error instanceof RequestError && error.status === 503)) throw error;
       note.textContent = `${error.reason} …`;
-      await new Promise((resolve) => setTimeout(resolve, 2000));
+      await new Promise((resolve) => setTimeout(resolve, 500));
     }
   }
 }
@@ -54,8 +58,12 @@ const begun = start();
 let app: App | null = null;
 window.caviar = {
   state: () => {
-    if (!app) throw new Error("the page is still loading: await caviar.ready");
+    if (!app) throw new Error(LOADING);
     return app.state();
+  },
+  project: (place) => {
+    if (!app) throw new Error(LOADING);
+    return app.project(place);
   },
   get ready() {
     return begun.then(async (started) => {
