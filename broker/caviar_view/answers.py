@@ -251,8 +251,8 @@ class Answers:
         codebook = codebook_of(device.array)
         if not beam.isdigit() or int(beam) >= codebook.beams:
             raise NotThereError(f"{name!r} has the beams 0 to {codebook.beams - 1}, and no {beam!r}")
-        # Around the longer side of the array, about which a line of elements looks the same from all sides,
-        # and finer than the narrowest beam: of N elements half a wavelength apart the first null is at 2/N rad.
+        # Around the longer side of the array, about which a line of elements looks the same from all sides;
+        # finer than the narrowest beam: of N elements half a wavelength apart the first null is at 2/N rad.
         short, long = sorted((device.array.rows, device.array.columns))
         axis = "y" if device.array.columns > device.array.rows else "z"
         azimuth = np.radians(np.linspace(-180, 180, min(721, 8 * max(9, short) + 1)))

@@ -20,8 +20,8 @@ import caviar_clients.envs as _registered  # noqa: F401
 from caviar_protocol.space.beams import beam_gains, best_pairs
 
 if TYPE_CHECKING:
+    from caviar.recorded_run import RecordedRun
     from caviar_clients.datasets.reader import Dataset
-    from caviar_protocol.recording import Recording
     from caviar_protocol.scenario import Scenario
 
 __all__ = ["beam_gains", "best_pairs", "dataset", "load_scenario", "open", "run"]
@@ -104,7 +104,8 @@ def run(
 
     if not (isinstance(settings, list | tuple) and all(isinstance(key, str) for key in settings)):
         raise TypeError(f"settings is {settings!r:.80}: write a list of KEY=VALUE texts, as ['run.seed=3']")
-    console = Console(quiet=not progress)
+    # A notebook shows the widgets of a console that is quiet, too.
+    console = Console(quiet=not progress, force_jupyter=None if progress else False)
     topics = record if record is None or isinstance(record, str) else ",".join(record)
     keys = keys_set(settings, topics, episodes)
     outcome = run_scenario(Path(scenario), Path(out), console, frames, seed, embedded=embedded, settings=keys)
@@ -113,14 +114,15 @@ def run(
     return outcome.directory
 
 
-def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as caviar.open
+def open(run: str | Path | None = None) -> RecordedRun:  # noqa: A001 - read as caviar.open
     """Open the recording of a run.
 
     Args:
         run: Directory of the run; None for the newest one below ``runs``.
 
     Returns:
-        The recording: arrays by topic over all frames (``recording["link"].abs_y``), or frame by frame.
+        The recording: arrays by topic over all frames (``recording["link"].abs_y``), or frame by frame. A
+        notebook shows its summary and a map, with ``.view()`` its world in 3D.
 
     Raises:
         RecordingError: There is no recording, or it is damaged; the text has the place and the remedy.
@@ -131,9 +133,10 @@ def open(run: str | Path | None = None) -> Recording:  # noqa: A001 - read as ca
         >>> caviar.open(run)["link"].abs_y.shape  # frames × users
         (3, 2)
     """
-    from caviar_protocol.recording import Recording, newest_run
+    from caviar.recorded_run import RecordedRun
+    from caviar_protocol.recording import newest_run
 
-    return Recording(newest_run() if run is None else run)
+    return RecordedRun(newest_run() if run is None else run)
 
 
 def dataset(path: str | Path) -> Dataset:

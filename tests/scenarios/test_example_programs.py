@@ -37,10 +37,29 @@ def started(folder: Path, program: str, *arguments: str) -> str:
     return str(output)
 
 
-@pytest.mark.parametrize("program", sorted(path.name for path in EXAMPLES.glob("*.py")))
+@pytest.mark.parametrize("program", sorted(path.name for path in EXAMPLES.glob("*.[pi]*")))
 def test_each_example_is_tried_here_and_on_the_page(program: str) -> None:
     assert program in Path(__file__).read_text(encoding="utf-8")
     assert f"({program})" in (EXAMPLES / "README.md").read_text(encoding="utf-8")
+
+
+def test_first_run(tmp_path: Path) -> None:
+    """The cells of ``first_run.ipynb`` run from top to bottom, and show recording, curves and page."""
+    pytest.importorskip("ipykernel", reason="the kernel of Jupyter is not installed")
+    nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
+    book = nbformat.read(EXAMPLES / "first_run.ipynb", as_version=4)
+    assert len(book.cells) == 10
+    nbclient.NotebookClient(book, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in book.cells for output in cell.get("outputs", ())]
+    shown = [output["data"] for output in outputs if "data" in output]
+    assert ["text/html" in data for data in shown] == [True, False, False, False, True]
+    assert "image/png" in shown[3]
+    assert "<iframe" in shown[4]["text/html"]
+    assert "as the link says: True" in "".join(output.get("text", "") for output in outputs)
+    # Jupyter asks libraries for colours, which no file has.
+    (summary,) = tmp_path.glob("runs/*/summary.txt")
+    assert summary.read_text().startswith("geometric: ")
+    assert "\x1b" not in summary.read_text()
 
 
 @pytest.mark.exhaustive

@@ -36,6 +36,8 @@ from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
 from caviar_protocol.observer import EVERYTHING, Observation, Observer
 
+pytestmark = pytest.mark.slow
+
 OBSERVER: dict[str, Any] = {"version": m.PROTOCOL_VERSION, "capabilities": ("observe",)}
 
 

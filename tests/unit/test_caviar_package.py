@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
+import pickle
 import shutil
 import signal
 import subprocess
 import sys
+import warnings
+from html import unescape
 from pathlib import Path
 
 import pytest
 
 import caviar
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError
+from caviar_protocol.recording import Recording
 from caviar_services.agent.baselines import LosBeamAgent
 from caviar_services.service import Frame, StepResult
 
@@ -69,6 +74,36 @@ def test_a_run_takes_episodes_settings_and_topics_as_the_command_does(tmp_path: 
     for wrong in ("run.seed=3", {"run.seed": 3}, 3, [3]):
         with pytest.raises(TypeError, match=r"settings is .*KEY=VALUE"):
             caviar.run("smoke", settings=wrong, out=tmp_path)  # type: ignore[arg-type]
+
+
+def test_a_notebook_shows_summary_map_and_page_of_a_run(tmp_path: Path) -> None:
+    out = tmp_path / "<script>alert(1)</script>"
+    recording = caviar.open(caviar.run("smoke", frames=3, out=out, embedded=True))
+    html = recording._repr_html_()
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html
+    assert "3 frames, " in html
+    image = html.partition("data:image/png;base64,")[2].partition('"')[0]
+    assert base64.b64decode(image).startswith(b"\x89PNG")
+    page = recording.view(limit_mb=4.0, height=300)
+    frame = page._repr_html_()
+    assert frame.startswith('<iframe sandbox="allow-scripts" style="width: 100%; height: 300px')
+    assert unescape(frame.partition('srcdoc="')[2].partition('"')[0]) == page.html
+    assert len(page.html.encode()) < 4e6
+    assert isinstance(pickle.loads(pickle.dumps(recording)), Recording)  # noqa: S301 - its own
+
+
+def test_a_notebook_shows_a_damaged_run_by_its_text(tmp_path: Path) -> None:
+    run = caviar.run("smoke", frames=3, out=tmp_path, embedded=True)
+    (run / "summary.txt").unlink()
+    segment, place = caviar.open(run).segment_of(1)
+    content = bytearray(segment.path.read_bytes())
+    content[segment.chunks[place].offset + 200] ^= 1
+    segment.path.write_bytes(content)
+    with warnings.catch_warnings(action="ignore"):
+        html = caviar.open(run)._repr_html_()
+    assert "Recording of" in html
+    assert "<img" not in html
 
 
 def test_a_scenario_is_loaded_by_name_and_by_file(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -21,7 +23,7 @@ from recording_builders import (
     with_packets,
 )
 
-from caviar_protocol.errors import ProductError, RecordingError
+from caviar_protocol.errors import ProductError, RecordingError, SetupError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.recording.arrays import TopicArrays
@@ -464,6 +466,29 @@ def test_the_page_lists_every_array(repository: Path, section: str) -> None:
     wanted = "\n".join(lines) + "\n"
     page = (repository / "docs" / "reference" / "recordings.md").read_text()
     assert wanted in page, f"docs/reference/recordings.md lacks\n{wanted}"
+
+
+def test_a_table_has_a_row_for_each_that_is_present_and_what_was_recorded(
+    street: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = Recording(street)
+    links, objects = recording["link"], recording["scene"]
+    table = links.table()
+    assert len(table["t"]) == links.present.sum() < links.present.size
+    assert table["rx"].tolist()[:3] == ["car.0/rx", "car.1/rx", "car.0/rx"]
+    assert np.array_equal(table["abs_y"], links.abs_y[links.present])
+    assert np.array_equal(table["frame"], links.frame[np.nonzero(links.present)[0]])
+    assert "top_abs_y" not in table, "has several values"
+    assert "buffered" not in table, "was not recorded"
+    assert np.array_equal(objects.table()["position_y"], objects.position[objects.present][:, 1])
+    assert np.array_equal(objects.table()["orientation_w"], objects.orientation[objects.present][:, 0])
+    assert "first_tap" not in recording["channel"].table()
+    assert len(links[:0].table()["t"]) == 0
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(SetupError, match="pip install pandas"):
+        links.dataframe()
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda columns: ["frame", *columns]))
+    assert links.dataframe() == ["frame", *table]
 
 
 def test_a_recording_and_its_topics_say_what_they_hold(

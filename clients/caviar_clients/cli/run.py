@@ -392,7 +392,7 @@ def _write_summary(summary: Mapping[str, Any], directory: Path, json_file: Path 
     write_file(RunDirectory(directory).summary, text)
     if summary["frames"]:
         table = StringIO()
-        _show(Console(file=table, width=100), summary)
+        _show(Console(file=table, width=100, force_terminal=False, force_jupyter=False), summary)
         write_file(RunDirectory(directory).summary_table, table.getvalue())
 
 

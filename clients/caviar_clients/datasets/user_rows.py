@@ -15,7 +15,7 @@ from caviar_clients.datasets.texts import counted
 from caviar_protocol.errors import RecordingError, SetupError, suggestion
 from caviar_protocol.host import install_command
 from caviar_protocol.recording import Recording
-from caviar_protocol.recording.arrays import TopicArrays
+from caviar_protocol.recording.arrays import TopicArrays, data_frame
 from caviar_protocol.recording.topics import TOPIC_ARRAYS
 from caviar_protocol.topics import Lidar, Link, topics_of
 
@@ -88,6 +88,14 @@ class Columns(Mapping[str, NDArray[Any]]):
         """
         return Columns({name: column[rows] for name, column in self._columns.items()})
 
+    def dataframe(self) -> Any:
+        """Make a ``pandas.DataFrame`` of the columns: ``data.table("scenes").dataframe()``.
+
+        Raises:
+            SetupError: pandas is not installed.
+        """
+        return data_frame(self)
+
 
 class Users:
     """Users of a dataset, a row each: a receiver in a scene, on a carrier, for a transmitter.
@@ -112,6 +120,14 @@ class Users:
     def __len__(self) -> int:
         """Number of users."""
         return len(self._table)
+
+    def dataframe(self) -> Any:
+        """Make a ``pandas.DataFrame`` of the columns of the catalogue.
+
+        Raises:
+            SetupError: pandas is not installed.
+        """
+        return self._table.dataframe()
 
     def __repr__(self) -> str:
         about = {name: USER_COLUMNS.get(name, "") for name in self._table} | self.recorded()

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, Payload, array_fields
-from caviar_protocol.errors import RecordingError, suggestion
+from caviar_protocol.errors import RecordingError, SetupError, suggestion
 from caviar_protocol.fields import GrantInput, Status
 from caviar_protocol.space.scene import merge_scenes
 
@@ -387,6 +387,61 @@ class TopicArrays(Generic[P, K]):
                     part[tuple(map(slice, np.shape(rows[row])))] = rows[row]
         return out
 
+    def table(self) -> dict[str, NDArray[Any]]:
+        """Read what has one value, or three or four, a row: columns of a table, each product decoded once.
+
+        Returns:
+            ``episode``, ``frame``, ``t`` [s], names of the row, and arrays by name, of vectors with ``_x``,
+            ``_y``, ``_z`` (of orientations ``_w`` before them); a row for each that is present. Arrays that
+            were not recorded, or have no number in any row, are left out.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> table = Recording("runs/smoke-20261122-101500")["scene"].table()
+            >>> len(table["t"]), list(table)[:5]
+            (200, ['episode', 'frame', 't', 'name', 'position_x'])
+        """
+        found = {name: list[Any]() for name, c in self.columns.items() if c.shape in ((), (3,), (4,))}
+        at, keys = list[int](), list[K]()
+        for frame, payload in enumerate(self):
+            if payload is None:
+                continue
+            own, places = self._places(self.keys_of(payload))
+            at += [frame] * len(own)
+            keys += [self.keys[place] for place in places]
+            for name in list(found):
+                try:
+                    rows = self.columns[name].rows(self, payload)
+                except RecordingError:
+                    del found[name]  # a part that was not recorded
+                else:
+                    found[name] += [rows[row] for row in own]
+        names = getattr(self.keys[0], "_fields", ("name",)) if self.keys else ()
+        place = np.array(at, np.int64)
+        table = {"episode": self.episode[place], "frame": self.frame[place], "t": self.t[place]}
+        table |= {name: np.array([_field(key, i) for key in keys]) for i, name in enumerate(names)}
+        for name, values in found.items():
+            column = self.columns[name]
+            array = np.array(values, column.dtype).reshape(-1, *map(int, column.shape))
+            if array.size and array.dtype.kind == "f" and np.isnan(array).all():
+                continue
+            axes = "wxyz"[-array.shape[1] :] if array.ndim > 1 else ""
+            table |= {f"{name}_{axis}": array[:, i] for i, axis in enumerate(axes)} or {name: array}
+        return table
+
+    def dataframe(self) -> Any:
+        """Make a ``pandas.DataFrame`` of `table`.
+
+        Raises:
+            SetupError: pandas is not installed.
+
+        Example:
+            >>> from caviar_protocol.recording import Recording
+            >>> link = Recording("runs/smoke-20261122-101500")["link"]
+            >>> link.dataframe().groupby("rx").snr.mean()  # doctest: +SKIP
+        """
+        return data_frame(self.table())
+
     def __repr__(self) -> str:
         lines = [f"{self.topic} of {', '.join(map(repr, self.sources))}, F = {len(self)} frames"]
         shapes: dict[str, tuple[int, ...]] = {}
@@ -502,6 +557,24 @@ class TopicArrays(Generic[P, K]):
                         found = np.maximum(found, np.shape(rows[row]))
             self._known_sizes[column.name] = tuple(found.tolist())
         return self._known_sizes[column.name]
+
+
+def data_frame(table: Mapping[str, NDArray[Any]]) -> Any:
+    """Make a ``pandas.DataFrame``, which is no requirement of this distribution.
+
+    Args:
+        table: Columns.
+
+    Raises:
+        SetupError: pandas is not installed.
+    """
+    try:
+        from pandas import DataFrame
+    except ModuleNotFoundError as error:
+        raise SetupError(
+            "a DataFrame needs pandas, which is not installed; run: pip install pandas"
+        ) from error
+    return DataFrame(dict(table))
 
 
 def _field(key: Any, field: int) -> str:
