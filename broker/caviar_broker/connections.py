@@ -407,7 +407,9 @@ class Connections:
         """A peer took more than its share, or may not take part any more: whether it was a service."""
         connection = self.known.pop(route, None)
         if connection is None:
-            return self.observers.lost(route, f"it was disconnected: {why}")
+            if observer := self.observers.forget(route):
+                self.note("", f"observer {observer!r} was disconnected: {why}", "note")
+            return bool(observer)
         for other in [r for r, c in self.known.items() if c.service == connection.service]:
             self._guard.cut(other, why)
         self.feed(ev.Lost(connection.service, f"it was cut off: {why}"))
@@ -417,7 +419,7 @@ class Connections:
         """A connection has ended: a remote service is lost; of a local one the operating system tells."""
         connection = self.known.get(route)
         if connection is None:
-            self.observers.lost(route, self._guard.gone_words)
+            self.observers.gone(route, self._guard.gone_words)
             return
         service = connection.service
         if connection.heartbeat:

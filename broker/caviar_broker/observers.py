@@ -54,8 +54,8 @@ class Observers:
         epoch: Of the run.
         patience_ns: Time that an observer may take for one OBSERVE.
         send: Sends a header and further parts to a routing id; why it did not go, or an empty text.
-        cut: Ends the connection of a routing id, for a reason, and calls `lost`.
-        note: Called with a kind and a text for the log, which it may hold back.
+        cut: Ends the connection of a routing id, for a reason; then the observer is to be forgotten.
+        note: Called with a kind and a text for the log, of which it may hold back those of one kind.
     """
 
     clock: FrameClock
@@ -103,7 +103,7 @@ class Observers:
         observer = _Observer(hello.name, subscriptions, [_NEVER] * len(subscriptions))
         self.known[route] = observer
         self.send(route, encode_message(welcome), [])
-        self.note(f"observer {hello.name}", f"observer {hello.name!r} came")
+        self.note("observers that came", f"observer {hello.name!r} came")
         self._offer(route, observer, time.monotonic_ns())
         return None
 
@@ -120,18 +120,20 @@ class Observers:
             text = f"the run has a service or an observer named {hello.name!r}; use another name"
             return m.Refuse(code="name-taken", message=text)
         for route in namesakes:
-            self.lost(route, "its connection is gone")
+            self.gone(route, "its connection is gone")
         return m.Refuse(code="late", message="the run is over") if self.clock.over else None
 
-    def lost(self, route: bytes, why: str) -> bool:
-        """Forget an observer; whether the routing id was one's."""
+    def forget(self, route: bytes) -> str:
+        """Forget an observer; its name, or an empty text where the routing id was none's."""
         observer = self.known.pop(route, None)
-        if observer is None:
-            return False
         if not self.known:
             self._newest = None
-        self.note(f"observer {observer.name} gone", f"observer {observer.name!r} is gone: {why}")
-        return True
+        return "" if observer is None else observer.name
+
+    def gone(self, route: bytes, why: str) -> None:
+        """Forget an observer that has gone by itself, if the routing id was one's."""
+        if name := self.forget(route):
+            self.note("observers that went", f"observer {name!r} is gone: {why}")
 
     def end(self, reason: str) -> None:
         """Send the last frame to all, whatever is under way, and SHUTDOWN."""
@@ -150,15 +152,15 @@ class Observers:
                 observer.sent_at = None
                 self._offer(route, observer, time.monotonic_ns())
             case m.Bye(reason=reason):
-                self.lost(route, reason or "it left")
+                self.gone(route, reason or "it left")
             case m.Error():
                 text = f"observer {observer.name!r} could not use {message.of}: {message.message}"
-                self.note(f"observer {observer.name} error", text)
+                self.note("observers that complain", text)
             case _:
                 kind = message_type(message)
                 text = f"{kind} has no place on the connection of an observer, or not now"
                 self.send(route, encode_message(m.Error(code="unexpected", of=kind, message=text)), [])
-                self.note(f"observer {observer.name} error", f"observer {observer.name!r}: {text}; not used")
+                self.note("observers that send", f"observer {observer.name!r}: {text}; not used")
 
     # --- what goes -------------------------------------------------------------------------------------
 
@@ -219,4 +221,4 @@ class Observers:
         observer.sequence += 1
         observer.sent_at, observer.told = now, state
         if reason := self.send(route, encode_message(message), parts):
-            self.lost(route, reason)
+            self.gone(route, reason)

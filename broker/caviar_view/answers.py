@@ -251,15 +251,19 @@ class Answers:
         codebook = codebook_of(device.array)
         if not beam.isdigit() or int(beam) >= codebook.beams:
             raise NotThereError(f"{name!r} has the beams 0 to {codebook.beams - 1}, and no {beam!r}")
-        # Finer than the narrowest beam: of N elements half a wavelength apart the first null is at 2/N rad.
-        array = device.array
-        azimuth = np.radians(np.linspace(-180, 180, min(721, 8 * max(18, array.columns) + 1)))
-        elevation = np.radians(np.linspace(-90, 90, min(361, 4 * max(18, array.rows) + 1)))
+        # Around the longer side of the array, about which a line of elements looks the same from all sides;
+        # finer than the narrowest beam: of N elements half a wavelength apart the first null is at 2/N rad.
+        short, long = sorted((device.array.rows, device.array.columns))
+        axis = "y" if device.array.columns > device.array.rows else "z"
+        azimuth = np.radians(np.linspace(-180, 180, min(721, 8 * max(9, short) + 1)))
+        elevation = np.radians(np.linspace(-90, 90, min(721, 8 * max(9, long) + 1)))
         grid = np.stack(np.meshgrid(np.pi / 2 - elevation, azimuth, indexing="ij"), -1)
-        gain = codebook.gain(int(beam), unit_vectors(grid))
+        directions = unit_vectors(grid)
+        gain = codebook.gain(int(beam), directions if axis == "z" else directions[..., [1, 2, 0]])
         return {
             "device": name,
             "beam": int(beam),
+            "axis": axis,
             "azimuths": azimuth.round(6).tolist(),
             "elevations": elevation.round(6).tolist(),
             "gain": gain.round(4).tolist(),

@@ -154,6 +154,7 @@ FORMATS: Mapping[str, str] = {
     "rerun": "caviar_formats.viewers:Rerun",
     "ros2": "caviar_formats.viewers:Ros2",
     "sionna": "caviar_formats.npz:Sionna",
+    "viwi": "caviar_formats.viwi:ViWi",
 }
 """Places of the formats that come with this distribution, by name."""
 

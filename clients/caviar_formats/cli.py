@@ -22,7 +22,7 @@ def export_command(
         typer.Option(
             metavar="NAME",
             help="npz, parquet, huggingface, sionna, itu, deepmimo, deepsense, minari, ns3-qd, pcd, "
-            "foxglove, ros2, rerun, or that of an installed package",
+            "viwi, foxglove, ros2, rerun, or an installed package's",
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder that is made")],

@@ -329,7 +329,7 @@ The rotation of an array is (roll, pitch, yaw) in degrees of its quaternion.
             carriers=(Carrier(name="carrier", frequency_hz=frequency),),
             scenes_of_episode=scenes,
             lacks="the scenario has no time, objects that move, sensors, and paths but the strongest",
-            assumed=f"Scenes are 100 ms apart; transmitters send 0 dBm.{known}",
+            assumed=f"Scenes are 100 ms apart; transmitters send 0 dBm on 100 MHz.{known}",
         )
 
 

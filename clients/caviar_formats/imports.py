@@ -141,7 +141,7 @@ def _write(source: Source, directory: DatasetDirectory, on_episode: Callable[[in
         on_episode(count)
     if not count:
         raise RunError(f"{source.path} has no scene")
-    catalogue.plan(plan.settings(), count)
+    catalogue.plan(plan.settings() | {"device": ""}, count)
     catalogue.close()
     directory.assets.mkdir(exist_ok=True)
 
@@ -171,7 +171,7 @@ def _scenario(source: Source) -> Scenario:
         ),
         carriers=source.carriers,
         services=services,
-        devices=(DeviceSpec(name="imported", kind="antenna", role="rx", on="none"),),
+        devices=(DeviceSpec(name="imported", kind="antenna", role="both", on="none"),),
     )
 
 

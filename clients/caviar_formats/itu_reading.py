@@ -74,7 +74,8 @@ def read_itu(path: Path, frequency_hz: float | None = None) -> Source:
         lacks="No receivers that are not valid, objects, velocities, Doppler shifts, LIDARs and pictures are "
         "imported." + ("" if phases else " The files have no phases: those of paths are of their delays."),
         assumed=f"Arrays have {ARRAYS['tx'].size} and {ARRAYS['rx'].size} elements, TX yaw {TX_YAW_DEG:g}°, "
-        f"receivers are {ABOVE_M} m above their vehicles, the transmitter is where straight rays begin.",
+        f"receivers are {ABOVE_M} m above their vehicles, the transmitter is where straight rays begin, "
+        "and sends 0 dBm on 100 MHz.",
     )
 
 

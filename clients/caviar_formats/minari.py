@@ -50,6 +50,8 @@ class Minari(Format):
         if len(users) != len(dataset.users()):
             raise RunError("a decision is for all users: leave --carrier, --tx and --object-class out")
         scenario = msgspec.convert(dataset.settings["scenario"], Scenario)
+        if not any(spec.role == "agent" for spec in scenario.services.values()):
+            raise RunError(f"{dataset.location} has no agent, whose decisions are exported; was it imported?")
         self._flown = [
             str(spec.settings.get("prefix") or "") + flown["name"]
             for spec in scenario.services.values()

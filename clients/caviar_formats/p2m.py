@@ -44,8 +44,8 @@ class P2m(Format):
             scenes=[ImportedScene(episode=0, scene=0, devices=tuple(devices.values()), paths=paths)],
             carriers=(Carrier(name="carrier", frequency_hz=frequency_hz),),
             lacks="The files have no receivers without paths, arrays, orientations, objects, Doppler shifts.",
-            assumed="Powers are of transmitters that send 0 dBm, antennas are single elements. Phases that "
-            "version 3.2 does not write are those of the delays, −2πfτ.",
+            assumed="Powers are of transmitters that send 0 dBm on 100 MHz, antennas are single elements. "
+            "Phases that version 3.2 does not write are those of the delays, −2πfτ.",
         )
 
 

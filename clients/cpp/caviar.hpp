@@ -588,7 +588,7 @@ inline constexpr char TYPES[] = R"(
 Hello#HELLO version:Version! name:NewName! role:world|channel|sensors|link|agent|recorder|observer!
   inputs:[Input]<=256=[] outputs:[NewName]<=256=[] capabilities:[Word]<=256=[]
   implementation:Text="" max_in_flight:int>=1<=64=1 host:Text="" pid:Count=0
-  subscriptions:[Subscription]<=256=[]
+  subscriptions:[Subscription]<=32=[]
 Welcome#WELCOME version:Version! run:Text! epoch:Epoch! attempt:Attempt! capabilities:[Word]<=256=[]
   heartbeat_ns:Period! liveness_ns:Period! seed:Seed=0 settings:{plain}={} scenario:{plain}={}
   rejoin_ns:Duration=0

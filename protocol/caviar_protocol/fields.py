@@ -164,7 +164,9 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     """Topic, or ``*`` for every topic."""
     source: Text = ""
     """Service that they come from; empty: any."""
-    every: Annotated[int, quantity("frame", "frames from one to the next, at least", ge=1)] = 1
+    every: Annotated[
+        int, quantity("frame", "frames from one to the next, at least", ge=1, le=MAX_INTEGER)
+    ] = 1
 
 
 class Demand(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

@@ -95,7 +95,8 @@ class Hello(_Message, frozen=True, kw_only=True, tag="HELLO"):
     """Identifies kernel and process namespace, so that a broker on the same one can watch ``pid``."""
     pid: Count = 0
     """Process id on ``host``; 0: unknown."""
-    subscriptions: Annotated[tuple[Subscription, ...], few] = ()
+    # Looked through for each frame and observer, so fewer than of other lists.
+    subscriptions: Annotated[tuple[Subscription, ...], msgspec.Meta(max_length=32)] = ()
     """Observers: what they want to see; without any, they learn of each frame and of no product."""
 
 

@@ -28,7 +28,7 @@ PACKAGES = (
 )
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
-    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "PIL", "pyproj",
+    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "nanoarrow", "PIL", "pyproj",
 )  # fmt: skip
 
 IMPORT_EVERYTHING = f"""

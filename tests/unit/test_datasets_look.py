@@ -154,11 +154,13 @@ def test_a_channel_without_link_has_paths_and_no_beams(tmp_path: Path) -> None:
     text = Path(load_scenario("smoke").source.file).read_text()
     kept = re.sub(r"(?ms)^\[services\.(agent|link)\]\n.*?(?=^\[|\Z)", "", text)
     kept = re.sub(r"(?m)^record = .*$", 'record = ["scene", "channel"]', kept)
+    kept = re.sub(r"(?m)^bandwidth_hz = .*\n", "", kept)
     file = tmp_path / "channel.toml"
     file.write_text(kept)
     page = Page(write_page(make(tmp_path / "d", 2, 1, file)))
     assert "No link is recorded" in page.texts["beams"]
     assert "Episodes have one scene" in page.texts["correlation"]
+    assert "100 MHz" in page.texts["dataset"]
     assert page.pictures["coverage"] == 2
 
 

@@ -23,14 +23,17 @@ from caviar_clients.datasets.reader import Dataset
 from caviar_clients.datasets.verification.verify import verify
 from caviar_clients.envs.base import BeamSelectionEnv
 from caviar_clients.envs.uav_path import UavPathEnv
+from caviar_clients.learning.recorded import RecordedBeamsEnv
+from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
+from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, Ros2, lobe
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RecordingError, RunError, SetupError
-from caviar_protocol.scenario import Carrier, load_scenario
+from caviar_protocol.errors import RecordingError, RunError, ScenarioError, SetupError
+from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
 from caviar_view.world import World
@@ -143,6 +146,11 @@ role = "sensors"
 use = "lidar"
 budget_ms = 1000
 
+[services.camera]
+role = "sensors"
+use = "camera"
+budget_ms = 1000
+
 [[devices]]
 name = "lidar"
 kind = "lidar"
@@ -151,12 +159,20 @@ yaw_deg = 25.0
 pitch_deg = 4.0
 beams = 8
 azimuth_steps = 180
+"""
 
-[services.camera]
-role = "sensors"
-use = "camera"
-budget_ms = 1000
+CAMERA_ON_CAR = """
+[[devices]]
+name = "eye"
+kind = "camera"
+on = "car"
+position_m = [3.0, 0.0, 1.0]
+yaw_deg = -20.0
+size_px = [16, 12]
+field_of_view_deg = 80.0
+"""
 
+CAMERA_BESIDE_THE_ROAD = """
 [[devices]]
 name = "camera"
 kind = "camera"
@@ -167,13 +183,22 @@ size_px = [40, 32]
 """
 
 
+def with_sensors(place: Path, camera: str) -> Dataset:
+    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "camera", "depth", "scene"')
+    (place / "lidar.toml").write_text(text + LIDAR + camera)
+    return generated(place / "data", place / "lidar.toml")
+
+
 @pytest.fixture(scope="module")
 def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with a LIDAR, and a camera on the car."""
+    return with_sensors(tmp_path_factory.mktemp("clouds"), CAMERA_ON_CAR).directory.path
+
+
+@pytest.fixture(scope="module")
+def roadside(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset with a LIDAR and a camera beside the road, of a world that knows its place on the Earth."""
-    place = tmp_path_factory.mktemp("clouds")
-    text = SCENARIO.replace('record = ["scene"', 'record = ["lidar", "camera", "depth", "scene"') + LIDAR
-    (place / "lidar.toml").write_text(text)
-    data = generated(place / "data", place / "lidar.toml")
+    data = with_sensors(tmp_path_factory.mktemp("roadside"), CAMERA_BESIDE_THE_ROAD)
     (data.assets / "scenery").mkdir(parents=True)
     (data.assets / "scenery" / "town.json").write_text(
         '{"origin": {"latitude_deg": -33.4, "longitude_deg": -70.6}}'
@@ -191,7 +216,13 @@ def exported(data: Dataset, name: str, out: Path, flavour: str = "") -> Path:
     return out / name
 
 
-WITH_SENSORS = ("deepsense", "foxglove", "pcd", "ros2")
+SENSORS_OF = {
+    "deepsense": "roadside",
+    "foxglove": "clouds",
+    "pcd": "clouds",
+    "ros2": "clouds",
+    "viwi": "roadside",
+}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -210,7 +241,7 @@ class TestConformance(FormatConformance):
 
     @pytest.fixture
     def dataset(self, name: str, data: Dataset, request: pytest.FixtureRequest) -> Dataset:
-        return Dataset(request.getfixturevalue("clouds")) if name in WITH_SENSORS else data
+        return Dataset(request.getfixturevalue(SENSORS_OF[name])) if name in SENSORS_OF else data
 
 
 def response(a: Any, tau: Any) -> Any:
@@ -376,6 +407,14 @@ def test_an_imported_dataset_is_one_that_everything_takes(tmp_path: Path) -> Non
     assert "channel" in data.episode(0).topics
     assert "camera" not in data.episode(0).topics
     assert data.episode(0).metadata.notes == ("no sensors",)
+    recording = data.directory.episode(0)
+    run = RecordedRun(data.episode(0))
+    replay = plan_replay(run, request_of(run.scenario.services))
+    assert parse_scenario(scenario_text(replay.scenario)).run.frames == 2
+    training = RecordedBeamsEnv([recording], observe=("position",))
+    training.reset(seed=1)
+    info = training.step(training.action_space.sample())[-1]
+    assert info["best_abs_y"] == pytest.approx(users["link.top_abs_y"][0, :1])
 
 
 @pytest.mark.parametrize(
@@ -595,11 +634,11 @@ def test_beams_of_deepsense_turn_counter_clockwise(tmp_path: Path) -> None:
     assert np.allclose(east * prime * np.cos(np.radians(38.8907)), 80 * np.cos(turn), atol=0.01)
 
 
-def test_samples_of_deepsense_have_what_sensors_beside_the_road_saw(clouds: Path, tmp_path: Path) -> None:
+def test_samples_of_deepsense_have_what_sensors_beside_the_road_saw(roadside: Path, tmp_path: Path) -> None:
     from PIL import Image
 
     pytest.importorskip("pyproj")
-    data = Dataset(clouds)
+    data = Dataset(roadside)
     out = exported(data, "deepsense", tmp_path)
     with (out / "scenario00.csv").open() as file:
         row = list(csv.DictReader(file))[4]
@@ -678,11 +717,12 @@ def test_minari_has_what_the_environment_gave(folder: Path, tmp_path: Path) -> N
 
 
 def test_minari_itself_finds_what_the_environment_gave(
-    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    roadside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
-    scenario = clouds.parent / "lidar.toml"
-    env = BeamSelectionEnv(scenario, observe=(*OBSERVED, "camera:camera"), directory=tmp_path / "run")
+    scenario = roadside.parent / "lidar.toml"
+    observe = (*OBSERVED, "camera:camera", "depth:camera")
+    env = BeamSelectionEnv(scenario, observe=observe, directory=tmp_path / "run")
     right = played(env, 2)
     out = minari_file(tmp_path / "run", tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(out.parent))
@@ -693,6 +733,16 @@ def test_minari_itself_finds_what_the_environment_gave(
     for found, episode in zip(data, right, strict=True):
         assert all(equal(getattr(found, name), values) for name, values in episode.items())
         assert found.observations["aod"][0] in env.observation_space["aod"]
+
+
+def test_minari_needs_decisions(roadside: Path, tmp_path: Path) -> None:
+    data = Dataset(import_dataset(source_of(tmp_path / "files", imported_scenes()), tmp_path / "data"))
+    with pytest.raises(RunError, match="no agent"):
+        exported(data, "minari", tmp_path)
+    with pytest.raises(ScenarioError, match="which sends none"):
+        exported(Dataset(roadside), "minari", tmp_path, "delay")
+    with pytest.raises(RunError, match="leave --carrier"):
+        export_users(Dataset(roadside).users()[:2], find_format("minari"), tmp_path / "out")
 
 
 def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
@@ -713,6 +763,42 @@ def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
         speed = env._max_speed / np.maximum(1.0, np.linalg.norm(share, axis=1, keepdims=True))
         assert np.allclose(velocity, share * speed)
         assert len(group["rewards"]) == len(right["rewards"])
+
+
+# --- ViWi ---------------------------------------------------------------------------------------------------
+
+
+def test_readers_of_viwi_find_channels_places_and_pictures(
+    roadside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from PIL import Image
+
+    from caviar_formats import viwi
+
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.setattr(viwi, "LENGTH", SCENES)
+    data = Dataset(roadside)
+    users, out = data.users(), exported(data, "viwi", tmp_path)
+    with h5py.File(out / "raw_data.mat") as file:
+        struct = file[list(file)[1]]
+        channel, loc = (struct[name][:] for name in struct)
+    found = channel.view(np.double).reshape(*channel.shape, 2) @ [1, 1j]
+    assert found.shape == (1, len(users), 8, 8)  # transmitters, users, subcarriers, elements
+    right = users["channel.hf"][:, 0, :, 0]
+    order = [2 * y + 1 - z for z in range(2) for y in range(4)]  # of columns from +z to −z
+    assert np.array_equal(found[0], right[..., order])
+    assert np.array_equal(loc, np.stack([users[f"{axis}_m"] for axis in "xyz"], axis=1))
+    for picture in (out / "rgb").iterdir():
+        _, number, x, y = picture.stem.split("_")
+        at = int(np.abs(loc[:, :2] - [float(x), float(y)]).sum(axis=1).argmin())
+        rgb = data.episode(users["episode"][at])["camera"].rgb[users["scene"][at], 0]
+        assert (number, np.asarray(Image.open(picture)).tolist()) == ("1", rgb.tolist())
+    turns = [np.exp(-2j * np.pi * np.outer(np.arange(n), np.arange(n)) / n) for n in (2, 4)]
+    best = 1 + (np.abs(found[0] @ np.kron(*turns).conj()) ** 2).sum(axis=1).argmax(axis=1)
+    with (out / "beams.csv").open() as table:
+        rows = list(csv.reader(table))[1:]
+    assert [[int(beam) for beam in row[:SCENES]] for row in rows] == best.reshape(-1, SCENES).tolist()
+    assert all((out / name).is_file() for row in rows for name in row[SCENES:] if name)
 
 
 # --- Wireless InSite ----------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from caviar_protocol.scenario import load_scenario
 from caviar_space.imported_scenes import Georeference
 from caviar_space.meshes import box, ply
 from caviar_space.mitsuba_xml import read_scenery, world_mesh
+from caviar_space.scenery import scenery_assets
 from caviar_space.wireless_insite import read_project
 
 REFERENCE = """begin_<reference>
@@ -156,6 +157,7 @@ def test_a_project_becomes_scenery_with_its_materials_and_scenarios(project: Pat
     described = json.loads((out / "scene.json").read_text())
     assert described["origin"] == {"latitude_deg": 38.8907, "longitude_deg": -77.0787, "altitude_m": 0.0}
     assert len(described["sources"]) == 5
+    assert "scenery/scene.json" in scenery_assets(str(out / "scene.xml"))  # its place travels with it
     assert all(re.fullmatch(r"[0-9a-f]{64}", source["sha256"]) for source in described["sources"])
     mobile, fixed = load_scenario(out / "mobile.toml"), load_scenario(out / "fixed.toml")
     traffic = mobile.services["traffic"].settings

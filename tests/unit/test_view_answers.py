@@ -105,7 +105,7 @@ def test_lobes_are_the_array_factor(run: Path, answers: Answers) -> None:
     assert gain.shape == (len(lobe["elevations"]), len(lobe["azimuths"]))
     assert gain.max() > 0.98
     # Towards a single plane wave |y| of the beam is the lobe times the square root of the elements.
-    row, column = 30, 100
+    row, column = 30, 50
     elevation, azimuth = lobe["elevations"][row], lobe["azimuths"][column]
     from caviar_protocol.space.antenna_arrays import steering_vector
     from caviar_protocol.topics import AntennaArray
@@ -113,6 +113,8 @@ def test_lobes_are_the_array_factor(run: Path, answers: Answers) -> None:
     unit = np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )
+    if lobe["axis"] == "y":
+        unit = unit[[1, 2, 0]]
     h = steering_vector(device.array, unit)[None, :]
     y = beam_gains(h, device.array, AntennaArray(rows=1, columns=1))[3, 0]
     assert gain[row, column] == pytest.approx(y / np.sqrt(device.array.size), abs=1e-3)

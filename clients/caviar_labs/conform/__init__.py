@@ -32,7 +32,7 @@ def cases() -> tuple[Case, ...]:
 
     Example:
         >>> [case.name for case in cases()[:2]]
-        ['hello', 'attach']
+        ['hello', 'observe']
     """
     # In the order in which they need the fewest lives: those that end one come last, and `canonical` judges
     # what came in all others.

@@ -206,7 +206,37 @@ def reset(kit: Kit) -> str:
     return f"RESET_DONE of episode {kit.at(ACTIVE).episode}"
 
 
-JOINING = (hello, attach, heartbeats, ready, scenery, early_grant, reset)
+@case("observe", "Observers", "OBSERVED of each OBSERVE, and an end with status 0 after SHUTDOWN")
+def observe(kit: Kit) -> str:
+    """Each OBSERVE is acknowledged, with a product, without any, and with fields that are not known."""
+    session = kit.at(CONNECTING)
+    said = session.hello
+    if kit.rules.role != "observer":
+        raise NotApplicable("it is no observer (--role observer)")
+    if "observe" not in said.get("capabilities", []) or said.get("inputs") or said.get("outputs"):
+        raise Failed("the capability 'observe', and no inputs or outputs", str(said))
+    session.welcome()
+    entries, parts = Inputs().of([{"topic": "scene"}], 0)
+    frame = {"state": "running", "frame": 0, "inputs": entries}
+    news: tuple[tuple[Fields, list[bytes]], ...] = (
+        ({"state": "joining"}, []),
+        (frame, parts),
+        (frame | {"colour": {"of": [1, 2.5]}}, parts),
+        ({"state": "running", "paused": True, "frame": 0}, []),
+    )
+    for sequence, (fields, further) in enumerate(news):
+        session.send("OBSERVE", {"sequence": sequence, **fields}, *further)
+        answer = session.expect("OBSERVED")
+        if answer.fields["sequence"] != sequence:
+            raise Failed(f"OBSERVED with sequence {sequence}", str(answer.fields))
+    session.send("SHUTDOWN", {"reason": "the case ends here"})
+    end = session.ended(session.rules.timeout_s, "its end after SHUTDOWN")
+    if end.status not in (0, None):
+        raise Failed("status 0", str(end))
+    return f"OBSERVED of {len(news)}, {end}"
+
+
+JOINING = (hello, observe, attach, heartbeats, ready, scenery, early_grant, reset)
 
 
 SILENCE_S = 0.5
@@ -343,34 +373,4 @@ def canonical(kit: Kit) -> str:
     return "all of them"
 
 
-@case("observe", "Observers", "OBSERVED of each OBSERVE, and an end with status 0 after SHUTDOWN")
-def observe(kit: Kit) -> str:
-    """Each OBSERVE is acknowledged, with a product, without any, and with fields that are not known."""
-    if kit.rules.role != "observer":
-        raise NotApplicable("it is no observer (--role observer)")
-    session = kit.at(CONNECTING)
-    said = session.hello
-    if "observe" not in said.get("capabilities", []) or said.get("inputs") or said.get("outputs"):
-        raise Failed("the capability 'observe', and no inputs or outputs", str(said))
-    session.welcome()
-    entries, parts = Inputs().of([{"topic": "scene"}], 0)
-    frame = {"state": "running", "frame": 0, "inputs": entries}
-    news: tuple[tuple[Fields, list[bytes]], ...] = (
-        ({"state": "joining"}, []),
-        (frame, parts),
-        (frame | {"colour": {"of": [1, 2.5]}}, parts),
-        ({"state": "running", "paused": True, "frame": 0}, []),
-    )
-    for sequence, (fields, further) in enumerate(news):
-        session.send("OBSERVE", {"sequence": sequence, **fields}, *further)
-        answer = session.expect("OBSERVED")
-        if answer.fields["sequence"] != sequence:
-            raise Failed(f"OBSERVED with sequence {sequence}", str(answer.fields))
-    session.send("SHUTDOWN", {"reason": "the case ends here"})
-    end = session.ended(session.rules.timeout_s, "its end after SHUTDOWN")
-    if end.status not in (0, None):
-        raise Failed("status 0", str(end))
-    return f"OBSERVED of {len(news)}, {end}"
-
-
-LEAVING = (shutdown, early_shutdown, sigterm, silence, other_major, refused, later_minor, no_demand, observe)
+LEAVING = (shutdown, early_shutdown, sigterm, silence, other_major, refused, later_minor, no_demand)

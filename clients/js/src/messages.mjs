@@ -82,7 +82,7 @@ export const MESSAGES = {
     max_in_flight: optional(integer(1, 64), 1),
     host: optional(text, ""),
     pid: optional(count, 0),
-    subscriptions: optional(list(subscription, few), []),
+    subscriptions: optional(list(subscription, { most: 32 }), []),
   }),
   WELCOME: new Struct({
     version,

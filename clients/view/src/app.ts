@@ -16,10 +16,10 @@ import { Player } from "./player";
 import { differences, Run, usersOf } from "./run";
 import { overview } from "./scene/overview";
 import type { Pose } from "./scene/pose";
-import { Stage } from "./scene/stage";
+import { isSoftware, Stage } from "./scene/stage";
 import { DARK, LIGHT } from "./scene/theme";
 import type { Hit } from "./scene/view";
-import { isSaved, type Source } from "./source";
+import { isSaved, type Source, takeToken } from "./source";
 import { type Changed, fromFragment, type Mode, SPEEDS, type Store, toFragment, type ViewState } from "./state";
 import type { Timeline } from "./timeline";
 import type { About, News, User, Vector } from "./types";
@@ -60,12 +60,19 @@ export class App {
     this.timeline = this.runs[0].timeline;
     this.n = this.placeOf(store.state);
     this.player = new Player(this.timeline, store, (n) => this.go(n), () => this.updateTransport());
-    this.stage = new Stage(this.origin, () => this.keepCamera(), (hit) => this.pick(hit));
+    const { quality } = store.state;
+    const isFine = quality === "fine" || (quality === "auto" && !isSoftware());
+    this.stage = new Stage(this.origin, isFine, () => this.keepCamera(), (hit) => this.pick(hit));
     this.layers = new LayersPanel(store, about);
     this.inspector = new Inspector(() => store.set({ sel: null }));
     this.pictures = new Pictures(store, about);
     this.live = about.live
-      ? new Live(runs[0].source, (news) => void this.hear(news), (text) => this.report(text))
+      ? new Live(
+          runs[0].source,
+          (news) => void this.hear(news),
+          (reason) => this.banner.show(`The run has ended. ${reason}`),
+          (text) => this.report(text),
+        )
       : null;
     this.dock = new Dock(store, this.runs, (n) => this.seek(n), (name) => void this.live?.command(name));
     this.transport = new Transport(store, this.timeline, about.live, this.dock.tabs, {
@@ -89,7 +96,10 @@ export class App {
     );
     listenToKeys(actions);
     store.listen((state, changed) => this.changed(state, changed));
-    addEventListener("hashchange", () => store.set(fromFragment(location.hash)));
+    addEventListener("hashchange", () => {
+      takeToken();
+      store.set(fromFragment(location.hash));
+    });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.applyTheme());
   }
 
@@ -104,19 +114,16 @@ export class App {
     this.applyTheme();
     const report = (text: string) => this.report(text);
     await Promise.all(this.runs.map(({ view }) => view.load(report).catch((error: Error) => report(error.message))));
-    this.stage.setCovered(this.layers.element.offsetWidth + 10);
+    this.layers.element.hidden = !state.panel;
+    this.stage.setCovered(this.layers.element.offsetWidth);
     this.stage.setViews(this.runs.map(({ view }) => view));
     await this.show(this.n);
     for (const line of [...this.about.damage, ...(this.about.notes ?? [])]) report(line);
     if (state.cam) this.stage.setPlace(state.cam);
     else this.goHome(state.mode);
-    this.track();
-    this.stage.draw();
-    // After the first picture: it takes longer than all else.
-    setTimeout(() => {
-      for (const { view } of this.runs) view.world.addEdges();
-      this.stage.refresh();
-    }, 30);
+    this.track(state.cam !== null);
+    this.stage.start();
+    void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.render());
     void this.live?.listen();
   }
 
@@ -174,6 +181,9 @@ export class App {
     await this.correct(n, loaded[0].frame?.info ?? null);
     if (this.runs.length > 1) this.compare();
     this.banner.clear();
+    for (const { topic, reason, failed } of loaded.flatMap(({ frame }) => frame?.absent ?? [])) {
+      if (failed) this.report(`${topic} is not shown. ${reason}`);
+    }
     for (const run of this.runs) run.drawTrails(n);
     this.redraw();
     this.track();
@@ -228,6 +238,10 @@ export class App {
     const n = this.placeOf(state);
     if (changed.has("n") && n !== this.n) void this.show(n);
     else if (changed.has("layers") || changed.has("user") || changed.has("pics")) void this.show(this.n);
+    if (changed.has("panel")) {
+      this.layers.element.hidden = !state.panel;
+      this.stage.setCovered(this.layers.element.offsetWidth);
+    }
     if (changed.has("mode") || changed.has("sel")) this.track();
     this.redraw();
     this.writeAddress();
@@ -271,14 +285,14 @@ export class App {
   }
 
   /** Follow the selection with the camera, or look from it. */
-  private track(): void {
+  private track(keep = false): void {
     const { sel } = this.store.state;
     const { objects, devices } = this.runs[0].view;
     const object = sel === null ? undefined : objects.shown.get(sel);
     const device = sel === null ? undefined : devices.shown.get(sel);
     const pose: Pose | null = object?.pose ?? device?.pose ?? null;
     const fieldOfView = device?.device.type === "camera" ? device.device.field_of_view : null;
-    this.stage.track(pose, object?.size ?? [1, 1, 1], fieldOfView);
+    this.stage.track(pose, object?.size ?? [1, 1, 1], fieldOfView, keep);
   }
 
   private goHome(mode: Mode = "free"): void {
@@ -287,7 +301,7 @@ export class App {
     const covered = this.runs.length === 1 ? this.layers.element.offsetWidth : 0;
     const aspect = (clientWidth - covered) / clientHeight / this.runs.length;
     this.stage.setPlace(overview(this.runs[0].view, this.origin, aspect));
-    this.store.set({ cam: null });
+    this.keepCamera();
   }
 
   private keepCamera(): void {
@@ -310,23 +324,32 @@ export class App {
 
   /** A live run went on. */
   private async hear(news: News): Promise<void> {
-    const before = this.timeline.last;
-    this.timeline.grow(news.first, news.frames);
+    this.timeline.grow(news.first, news.added);
     this.dock.setNews(news);
-    if (this.timeline.last !== before && this.store.state.n === null) await this.show(this.timeline.last);
-    else this.redraw();
+    if (this.catchingUp) return;
+    // One frame after the other: each newer one would break off the one before, and none would be shown.
+    this.catchingUp = true;
+    while (this.store.state.n === null && this.n !== this.timeline.last) await this.show(this.timeline.last);
+    this.catchingUp = false;
+    this.redraw();
   }
+  private catchingUp = false;
 
   /** Report an error where the reader sees it. */
   report(text: string): void {
-    this.errors.push(text);
+    if (!this.errors.includes(text)) this.errors.push(text);
     this.banner.show(text);
   }
 
   private writeAddress(): void {
     clearTimeout(this.writing);
     // Browsers refuse more than some hundred a minute.
-    this.writing = setTimeout(() => history.replaceState(null, "", `#${toFragment(this.store.state)}`), 300);
+    this.writing = setTimeout(() => history.replaceState(null, "", this.address()), 300);
+  }
+
+  /** Fragment of the view, with the camera where it has followed to. */
+  private address(): string {
+    return `#${toFragment({ ...this.store.state, cam: this.stage.place })}`;
   }
 
   private announce(): void {
@@ -361,6 +384,7 @@ export class App {
       key(["b"], "B", "look from the selection", () => mode("board")),
       key(["c"], "C", "clock", () => this.dock.toggle("clock")),
       key(["v"], "V", "curves", () => this.dock.toggle("curves")),
+      key(["p"], "P", "panel of layers", () => store.set({ panel: !store.state.panel })),
       key(["d"], "D", "light, dark", () => toggleTheme(store)),
       key(["Escape"], "Esc", "clear the selection", () => store.set({ sel: null, mode: "free" })),
       key(["?"], "?", "this help", () => showHelp(this.keyActions())),

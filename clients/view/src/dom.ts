@@ -49,7 +49,7 @@ const ICONS = {
   theme: "M12 3a9 9 0 1 0 0 18zM12 3a9 9 0 0 1 0 18",
   close: "M6 4.6 12 10.6l6-6L19.4 6l-6 6 6 6-1.4 1.4-6-6-6 6L4.600 18l6-6-6-6z",
   home: "M12 3 2 12h3v9h5v-6h4v6h5v-9h3z",
-  link: "M8 7h3v2H8a3 3 0 0 0 0 6h3v2H8A5 5 0 0 1 8 7zm5 0h3a5 5 0 0 1 0 10h-3v-2h3a3 3 0 0 0 0-6h-3zM8 11h8v2H8z",
+  panel: "M3 5h18v14H3zm2 2v10h4V7z",
 } as const;
 export type Icon = keyof typeof ICONS;
 

@@ -14,8 +14,8 @@ export interface Frame {
   n: number;
   info: FrameInfo;
   products: Partial<{ [T in Topic]: Product<T>[] }>;
-  /** Topics that were wanted and are not there, and why. */
-  absent: { topic: Topic; source: string; reason: string }[];
+  /** Topics that were wanted and are not there, and why; some since a request failed. */
+  absent: { topic: Topic; source: string; reason: string; failed?: boolean }[];
 }
 
 /** The first product of a topic of a frame. */
@@ -69,7 +69,7 @@ export class Frames {
       list.push(product);
     } catch (error) {
       if (signal?.aborted) throw error;
-      frame.absent.push({ topic, source: source ?? "", reason: (error as Error).message });
+      frame.absent.push({ topic, source: source ?? "", reason: (error as Error).message, failed: true });
     }
   }
 

@@ -12,6 +12,7 @@ export class Live {
   constructor(
     private readonly source: Source,
     private readonly onNews: (news: News) => void,
+    private readonly onEnd: (reason: string) => void,
     private readonly onError: (text: string) => void,
   ) {}
 
@@ -23,6 +24,10 @@ export class Live {
       try {
         for await (const news of this.source.events<News>("news", signal)) {
           failures = 0;
+          if (news.ended !== undefined) {
+            this.onEnd(news.ended);
+            return;
+          }
           this.news = news;
           this.onNews(news);
         }

@@ -15,7 +15,7 @@ import type { AntennaDevice, Scene } from "../../js/src/types.d.ts";
 const TRAIL = 30;
 const AT_ONCE = 4;
 /** Length of the strongest direction of a lobe, of the distance between both ends: of TX and of RX. */
-const LOBE_SHARE = { tx: 0.4, rx: 0.15 };
+const LOBE_SHARE = { tx: 0.42, rx: 0.15 };
 
 export class Run {
   readonly timeline: Timeline;
@@ -115,15 +115,16 @@ export class Run {
     const wanted = ends.flatMap(({ name, share, chosen, best }, i) => {
       const device = scene.devices?.find((each): each is AntennaDevice => each.type === "antenna" && each.name === name);
       if (!device || !poses[i] || device.array.rows * device.array.columns < 2) return [];
-      const shown = { device, pose: poses[i], radius: Math.max(5, share * distance) };
+      const other = i === 0 ? to : from;
+      const shown = { device, pose: poses[i], towards: other.position, radius: Math.max(5, share * distance) };
       // Where the chosen beam is the best one, it is drawn once.
       const beams = [{ beam: best, best: true }, { beam: chosen, best: false }].filter(({ beam, best }) => beam >= 0 && (!best || beam !== chosen));
       return beams.map((beam) => ({ ...shown, ...beam }));
     });
     const found = await Promise.all(
-      wanted.map(async ({ device, beam, best, pose, radius }) => {
+      wanted.map(async ({ device, beam, best, ...shown }) => {
         const lobe = await this.lobe(frame, device, beam, signal);
-        return lobe && { lobe, pose, radius, best };
+        return lobe && { lobe, best, ...shown };
       }),
     );
     return found.filter((beam) => beam !== null);
@@ -138,7 +139,7 @@ export class Run {
         lobe = await this.source.json<Lobe>(`frames/${frame.n}/lobes`, { device: device.name, beam }, signal);
       } catch (error) {
         if (signal.aborted) throw error;
-        frame.absent.push({ topic: "link", source: device.name, reason: `lobe of beam ${beam}: ${(error as Error).message}` });
+        frame.absent.push({ topic: "link", source: device.name, reason: (error as Error).message, failed: true });
         return null;
       }
       this.lobes.set(key, lobe);

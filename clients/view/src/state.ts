@@ -10,8 +10,8 @@ export const LAYERS = {
   devices: "Devices",
   rays: "Rays",
   beams: "Beams",
-  lidar: "LIDAR points",
-  frusta: "Camera frusta",
+  lidar: "LIDAR",
+  frusta: "Frusta",
   pictures: "Pictures",
   grid: "Grid",
 } as const;
@@ -49,9 +49,13 @@ export interface ViewState {
   /** Topic of the pictures in the corner; null: the first that there is. */
   pics: PictureTopic | null;
   dock: Dock;
+  /** Whether the panel with layers and colours is there. */
+  panel: boolean;
   speed: number;
   loop: boolean;
   theme: "auto" | "light" | "dark";
+  /** Shadows and smooth edges: as the machine can, or in any case. */
+  quality: "auto" | "fine" | "plain";
 }
 
 export const INITIAL: Readonly<ViewState> = {
@@ -66,9 +70,11 @@ export const INITIAL: Readonly<ViewState> = {
   layers: new Set(DEFAULT_LAYERS),
   pics: null,
   dock: "none",
+  panel: true,
   speed: 1,
   loop: false,
   theme: "auto",
+  quality: "auto",
 };
 
 /** Write what differs from the initial view as a fragment, without `#`. */
@@ -92,9 +98,11 @@ export function toFragment(state: ViewState): string {
   put("layers", layers, DEFAULT_LAYERS.join(","));
   put("pics", state.pics, INITIAL.pics);
   put("dock", state.dock, INITIAL.dock);
+  put("panel", state.panel ? 1 : 0, 1);
   put("speed", state.speed, INITIAL.speed);
   put("loop", state.loop ? 1 : 0, 0);
   put("theme", state.theme, INITIAL.theme);
+  put("quality", state.quality, INITIAL.quality);
   // Commas, slashes and colons stay readable: a fragment may hold them.
   const coded = (text: string) => encodeURIComponent(text).replace(/%(2C|2F|3A)/g, decodeURIComponent);
   return parts.map(([name, value]) => `${name}=${coded(value)}`).join("&");
@@ -136,9 +144,11 @@ export function fromFragment(fragment: string): ViewState {
     layers: layers ? new Set(ALL.filter((layer) => layers.includes(layer))) : INITIAL.layers,
     pics: PICTURES.find((topic) => topic === given.get("pics")) ?? null,
     dock: one("dock", Object.keys(DOCKS) as Dock[], INITIAL.dock),
+    panel: given.get("panel") !== "0",
     speed: SPEEDS.find((value) => value === speed) ?? INITIAL.speed,
     loop: given.get("loop") === "1",
     theme: one("theme", ["auto", "light", "dark"], INITIAL.theme),
+    quality: one("quality", ["auto", "fine", "plain"], INITIAL.quality),
   };
 }
 

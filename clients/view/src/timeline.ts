@@ -78,14 +78,18 @@ export class Timeline {
       .map(({ episode, first }) => ({ episode, first }));
   }
 
-  /** Take in that a live run went on: places from `first` to before `end` are held now. */
-  grow(first: number, end: number): void {
-    const last = this.blocks.at(-1);
-    if (!last) {
-      this.blocks = [{ episode: 0, first_frame: first, first, count: Math.max(0, end - first) }];
-      return;
+  /** Take in that a live run went on by `added`, and that places before `first` are no longer held. */
+  grow(first: number, added: Block[]): void {
+    for (const block of added) {
+      const last = this.blocks.at(-1);
+      const end = last ? last.first + last.count : block.first;
+      if (block.first + block.count <= end) continue;
+      const known = Math.max(0, end - block.first);
+      const rest = { ...block, first: block.first + known, first_frame: block.first_frame + known, count: block.count - known };
+      const goesOn = last?.episode === rest.episode && last.first_frame + last.count === rest.first_frame && end === rest.first;
+      if (last && goesOn) last.count += rest.count;
+      else this.blocks.push(rest);
     }
-    last.count = Math.max(last.count, end - last.first);
     this.blocks = this.blocks
       .filter((block) => block.first + block.count > first)
       .map((block) => {

@@ -80,7 +80,12 @@ export interface Product<T extends Topic> {
 export interface Lobe {
   device: string;
   beam: number;
-  /** [rad], in the device's axes: counter-clockwise from +x, and from the xy plane. */
+  /** Axis of the device that directions are counted around. */
+  axis?: "y" | "z";
+  /**
+   * [rad]: around z counter-clockwise from +x, and from the xy plane; around y likewise from +z, and from the zx
+   * plane.
+   */
   azimuths: number[];
   elevations: number[];
   /** Amplitude, 1 at the greatest, Shape [elevations][azimuths]. */
@@ -125,5 +130,9 @@ export interface News {
   state: string;
   paused: boolean;
   waits: { service: string; what: string; elapsed_s: number }[];
-  events: (string | { n?: number; text: string })[];
+  /** Frames that came since the news before. */
+  added: Block[];
+  /** Why there are no more. */
+  ended?: string;
+  events?: (string | { n?: number; text: string })[];
 }

@@ -43,7 +43,7 @@ from caviar_clients.plots.rays import Footprints, footprints, obstacle_boxes, wi
 from caviar_protocol.errors import AssetError, CaviarError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.space.codebooks import beam_count
-from caviar_protocol.topics import AntennaArray
+from caviar_protocol.topics import AntennaArray, Carrier
 from caviar_space.mitsuba_xml import find_scenery, read_scenery
 
 CLASSES = 12
@@ -56,6 +56,7 @@ _MOST_BEAMS = 2**31
 """That a recorded index of a beam can number."""
 _NO_SPREAD_S = 1e-15
 """Delay spread [s] below which it is rounding, as of a single path."""
+_BANDWIDTH_HZ = Carrier(name="default", frequency_hz=1.0).bandwidth_hz  # a kept scenario lacks defaults
 _MAIN_VERSIONS = ("caviar-sim", "python", "numpy", "sionna", "sionna-rt", "mitsuba", "drjit", "eclipse-sumo")
 
 
@@ -227,7 +228,7 @@ def _description(content: Content) -> dict[str, Any]:
             (
                 c.get("name", ""),
                 f"{c.get('frequency_hz', 0) / 1e9:g} GHz",
-                f"{c.get('bandwidth_hz', 0) / 1e6:g} MHz",
+                f"{c.get('bandwidth_hz', _BANDWIDTH_HZ) / 1e6:g} MHz",
             )
             for c in scenario.get("carriers", ())
         ],

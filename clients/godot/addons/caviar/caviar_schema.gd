@@ -12,7 +12,7 @@ Depth images:l(DepthImage)
 Segmentation object_names:l(s) material_names:l(s)=[] images:l(SegmentationImage)
 Action commands:l(BeamChoice/WaypointCommand/VelocityCommand/UserSchedule/PathCommand/AttitudeCommand/DriveCommand/SignalCommand)
 Link tx:l(s) rx:l(s) carrier:l(s) has_path:a(|b1,U) los:a(|b1,U) tx_beam:a(<i4,U) rx_beam:a(<i4,U) abs_y:a(<f8,U) top_tx_beam:a(<i4,U,K) top_rx_beam:a(<i4,U,K) top_abs_y:a(<f8,U,K) baseline_abs_y:a(<f8,U) aod_azimuth:a(<f8,U) aoa_azimuth:a(<f8,U) snr:a(<f8,U) snr_best:a(<f8,U) spectral_efficiency:a(<f8,U) bit_rate:a(<f8,U) reward:a(<f8,U) buffered:a(<f8,U)=? no_path:i0=0 serving:a(|b1,U)=? arrived:a(<i8,U)=? sent:a(<i8,U)=? dropped:a(<i8,U)=? delivered:a(<i8,U)=? delay:a(<f8,U)=? waiting:a(<f8,U)=? sinr:a(<f8,U)=? throughput:a(<f8,U)=? blocks:a(<i8,U)=? block_errors:a(<i8,U)=?
-Hello:HELLO version:t2(i0) name:n role:e(world,channel,sensors,link,agent,recorder,observer) inputs:l256(Input)=[] outputs:l256(n)=[] capabilities:l256(s1..128)=[] implementation:s='' max_in_flight:i1..64=1 host:s='' pid:i0=0 subscriptions:l256(Subscription)=[]
+Hello:HELLO version:t2(i0) name:n role:e(world,channel,sensors,link,agent,recorder,observer) inputs:l256(Input)=[] outputs:l256(n)=[] capabilities:l256(s1..128)=[] implementation:s='' max_in_flight:i1..64=1 host:s='' pid:i0=0 subscriptions:l32(Subscription)=[]
 Welcome:WELCOME version:t2(i0) run:s epoch:i1 attempt:i1 capabilities:l256(s1..128)=[] heartbeat_ns:i1 liveness_ns:i1 seed:i0=0 settings:m(*)={} scenario:m(*)={} rejoin_ns:i0=0
 Refuse:REFUSE code:s1..128 message:s
 Prepare:PREPARE epoch:i1 attempt:i1 demand:l256(Demand)=[] assets:l(Asset)=[] producers:m(l(s1..128))={} prefixes:m(l(s))={} max_faces:i0=0

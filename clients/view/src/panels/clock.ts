@@ -63,7 +63,7 @@ export class ClockPanel {
     this.pause.lastChild!.textContent = label;
     const waits = news.waits.map(({ service, what, elapsed_s }) => `${service}: ${what}, ${fixed(elapsed_s, 1)} s`).join("; ");
     this.waits.textContent = `${news.state}${news.paused ? ", paused" : ""}${waits ? ` · waits for ${waits}` : ""}`;
-    if (news.events.length) {
+    if (news.events?.length) {
       const texts = news.events.map((event) => (typeof event === "string" ? event : event.text));
       fill(this.events, ...texts.slice(-5).map((text) => el("li", {}, text)));
     }

@@ -66,7 +66,8 @@ export class CurvesPanel {
       const lines = chart.lines.filter(({ series }) => curves.series[series]);
       return lines.length ? [this.chart(chart, lines, curves, other, first, last)] : [];
     });
-    if (charts.length) fill(this.element, ...charts);
+    const note = other && el("p", { class: "note" }, "dashed: the run on the right");
+    if (charts.length) fill(this.element, ...charts, note);
     else this.say("This run has no link whose curves could be shown.");
   }
 

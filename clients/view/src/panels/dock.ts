@@ -37,7 +37,8 @@ export class Dock {
     ] as const) {
       this.buttons.set(choice, el("button", { type: "button", class: "tab", title, click: () => this.toggle(choice) }, text));
     }
-    this.tabs = [...this.buttons.values()];
+    // A scenario that has not run has neither.
+    this.tabs = about.kind === "scenario" ? [] : [...this.buttons.values()];
   }
 
   toggle(choice: Choice): void {
@@ -54,7 +55,7 @@ export class Dock {
     if (this.element.firstChild !== panel.element) fill(this.element, panel.element);
     const [{ timeline }] = this.runs;
     const window = WINDOW * timeline.every;
-    const start = timeline.first + Math.floor((n - timeline.first) / window) * window;
+    const start = Math.max(timeline.first, Math.floor(n / window) * window);
     const key = dock === "clock" ? `clock ${start}` : `curves ${user && userKey(user)}`;
     const isOld = this.runs[0].about.live && performance.now() - this.refreshed > REFRESH_MS;
     if (key !== this.asked || isOld) {

@@ -22,6 +22,7 @@ export class Header {
       el("span", { class: "badge" }, `${saved ? "Saved recording" : KINDS[about.kind]}${breaks}${every}`),
       el("span", { class: "run" }, names.length > 1 ? `left ${names[0]}, right ${names[1]}` : (names[0] ?? "")),
       el("span", { class: "grow" }),
+      button("panel", "Panel of layers (P)", () => store.set({ panel: !store.state.panel })),
       button("home", "Show all (H)", goHome),
       button("theme", "Light or dark (D)", () => toggleTheme(store)),
       button(null, "Help (?)", help, "?"),

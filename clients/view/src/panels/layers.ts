@@ -53,7 +53,14 @@ export class LayersPanel {
       store.set({ min: value <= Number(this.slider.min) ? null : value });
     });
     this.gain = el("div", { class: "gain" }, this.slider, this.threshold);
-    const boxes = Object.entries(LAYERS).map(([layer, text]) => {
+    const needed: Partial<Record<Layer, (keyof About["topics"])[]>> = {
+      rays: ["channel"],
+      beams: ["link"],
+      lidar: ["lidar"],
+      pictures: ["camera", "depth", "segmentation"],
+    };
+    const there = (layer: string) => needed[layer as Layer]?.some((topic) => about.topics[topic]?.length) ?? true;
+    const boxes = Object.entries(LAYERS).filter(([layer]) => there(layer)).map(([layer, text]) => {
       const box = el("input", { type: "checkbox", change: () => store.toggleLayer(layer as Layer) });
       this.shown.set(layer, box);
       return el("label", { class: "check" }, box, text);
@@ -77,6 +84,7 @@ export class LayersPanel {
   }
 
   update(state: ViewState, input: LayersInput): void {
+    this.element.hidden = !state.panel;
     for (const [layer, box] of this.shown) box.checked = state.layers.has(layer as Layer);
     this.coloring.value = state.color;
     this.mode.value = state.mode;

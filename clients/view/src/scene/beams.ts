@@ -1,15 +1,23 @@
-// Beams as lobes: the distance from the array is the power gain in that direction, |array factor|².
-import { BufferAttribute, BufferGeometry, DoubleSide, Group, Mesh, MeshLambertMaterial } from "three";
+// Beams as lobes: the distance from the array is the power gain in that direction, |array factor|². A surface shows
+// it all around, and a slice what passes at the elevation of the other end, as maps do.
+import { BufferAttribute, BufferGeometry, DoubleSide, Group, Mesh, MeshBasicMaterial, MeshLambertMaterial } from "three";
+import { LineMaterial } from "three/examples/jsm/lines/LineMaterial.js";
+import { LineSegments2 } from "three/examples/jsm/lines/LineSegments2.js";
+import { LineSegmentsGeometry } from "three/examples/jsm/lines/LineSegmentsGeometry.js";
 import { BEST, CHOSEN } from "../colors";
 import type { Lobe, Vector } from "../types";
-import type { Pose } from "./pose";
+import { inverse, type Pose, rotate } from "./pose";
 
-/** Below this gain, 18 dB under the strongest direction, nothing is drawn. */
+/** Below this gain, 18 dB under the strongest direction, no surface is drawn. */
 const LEAST = 0.016;
+/** Directions of a slice. */
+const AROUND = 1440;
 
 export interface ShownBeam {
   lobe: Lobe;
   pose: Pose;
+  /** Place of the other end [m, world]. */
+  towards: Vector;
   /** Distance of the strongest direction [m]. */
   radius: number;
   best: boolean;
@@ -23,33 +31,40 @@ export class Beams {
 
   set(beams: ShownBeam[]): void {
     this.shown = beams;
-    for (const child of this.group.children as Mesh<BufferGeometry, MeshLambertMaterial>[]) {
+    this.group.traverse((child) => {
+      if (!(child instanceof Mesh)) return;
       child.geometry.dispose();
       child.material.dispose();
-    }
+    });
     this.group.clear();
-    for (const { lobe, pose, radius, best } of beams) {
-      const color = best ? BEST : CHOSEN;
-      const material = new MeshLambertMaterial({
-        color,
-        emissive: color,
-        emissiveIntensity: 0.35,
-        transparent: true,
-        opacity: best ? 0.34 : 0.42,
-        side: DoubleSide,
-        depthWrite: false,
-      });
-      const mesh = new Mesh(lobeGeometry(lobe, radius), material);
-      mesh.renderOrder = best ? 14 : 15;
-      mesh.position.set(...(pose.position.map((value, i) => value - this.origin[i]) as Vector));
-      const [w, x, y, z] = pose.orientation;
-      mesh.quaternion.set(x, y, z, w);
-      this.group.add(mesh);
-    }
+    for (const beam of beams) this.add(beam);
+  }
+
+  private add({ lobe, pose, towards, radius, best }: ShownBeam): void {
+    const color = best ? BEST : CHOSEN;
+    const at = pose.position.map((value, i) => value - this.origin[i]) as Vector;
+    const order = best ? 14 : 17;
+    const shared = { color, transparent: true, side: DoubleSide, depthWrite: false };
+    const surface = new Mesh(
+      surfaceGeometry(lobe, radius),
+      new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.14 }),
+    );
+    const [w, x, y, z] = pose.orientation;
+    surface.quaternion.set(x, y, z, w);
+    const outline = slice(lobe, pose, towards, radius);
+    const area = new Mesh(fan(outline), new MeshBasicMaterial({ ...shared, opacity: 0.45 }));
+    const geometry = new LineSegmentsGeometry();
+    geometry.setPositions(outline.flatMap((point, i) => [...point, ...outline[(i + 1) % outline.length]]));
+    const line = new LineSegments2(geometry, new LineMaterial({ color, linewidth: 2, transparent: true, depthWrite: false }));
+    [surface, area, line].forEach((object, i) => {
+      object.position.set(...at);
+      object.renderOrder = order + i;
+      this.group.add(object);
+    });
   }
 }
 
-/** Triangles of a lobe in the device's axes; places [m], Shape [elevations · azimuths, 3]. */
+/** Places of a lobe's surface in the device's axes [m], Shape [elevations · azimuths, 3], and its triangles. */
 export function lobeMesh(lobe: Lobe, radius: number): { places: Float32Array; triangles: number[] } {
   const { azimuths, elevations, gain } = lobe;
   const wide = azimuths.length;
@@ -59,9 +74,9 @@ export function lobeMesh(lobe: Lobe, radius: number): { places: Float32Array; tr
     azimuths.forEach((azimuth, j) => {
       const at = i * wide + j;
       const r = radius * gain[i][j] ** 2;
-      places[3 * at] = r * Math.cos(elevation) * Math.cos(azimuth);
-      places[3 * at + 1] = r * Math.cos(elevation) * Math.sin(azimuth);
-      places[3 * at + 2] = r * Math.sin(elevation);
+      const flat = r * Math.cos(elevation);
+      const place = [flat * Math.cos(azimuth), flat * Math.sin(azimuth), r * Math.sin(elevation)];
+      places.set(lobe.axis === "y" ? [place[1], place[2], place[0]] : place, 3 * at);
       if (i + 1 >= elevations.length || j + 1 >= wide) return;
       if (Math.max(gain[i][j], gain[i + 1][j], gain[i][j + 1], gain[i + 1][j + 1]) ** 2 < LEAST) return;
       triangles.push(at, at + 1, at + wide, at + 1, at + wide + 1, at + wide);
@@ -70,7 +85,45 @@ export function lobeMesh(lobe: Lobe, radius: number): { places: Float32Array; tr
   return { places, triangles };
 }
 
-function lobeGeometry(lobe: Lobe, radius: number): BufferGeometry {
+/** Amplitude of a lobe in a direction of the device's axes (unit vector), between its samples. */
+export function gainTowards({ axis, azimuths, elevations, gain }: Lobe, [x, y, z]: Vector): number {
+  const [u, v, w] = axis === "y" ? [z, x, y] : [x, y, z];
+  const place = (values: number[], value: number): [number, number] => {
+    // Samples are evenly spaced.
+    const share = (value - values[0]) / (values[values.length - 1] - values[0]);
+    const at = Math.max(0, Math.min(1, share)) * (values.length - 1);
+    const low = Math.min(Math.floor(at), values.length - 2);
+    return [low, at - low];
+  };
+  const [i, s] = place(elevations, Math.asin(Math.max(-1, Math.min(1, w))));
+  const [j, t] = place(azimuths, Math.atan2(v, u));
+  return (1 - s) * ((1 - t) * gain[i][j] + t * gain[i][j + 1]) + s * ((1 - t) * gain[i + 1][j] + t * gain[i + 1][j + 1]);
+}
+
+/** Outline of the lobe at the elevation of the other end, around the array [m, world axes]. */
+function slice(lobe: Lobe, pose: Pose, towards: Vector, radius: number): Vector[] {
+  const way = towards.map((value, i) => value - pose.position[i]);
+  const length = Math.hypot(...way) || 1;
+  const sine = way[2] / length;
+  const cosine = Math.sqrt(Math.max(0, 1 - sine * sine));
+  const turn = inverse(pose.orientation);
+  return Array.from({ length: AROUND }, (_, k) => {
+    const azimuth = (2 * Math.PI * k) / AROUND;
+    const direction: Vector = [cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), sine];
+    const r = radius * gainTowards(lobe, rotate(turn, direction)) ** 2;
+    return direction.map((value) => r * value) as Vector;
+  });
+}
+
+/** Triangles from the array to its outline. */
+function fan(outline: Vector[]): BufferGeometry {
+  const places = outline.flatMap((point, i) => [0, 0, 0, ...point, ...outline[(i + 1) % outline.length]]);
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
+  return geometry;
+}
+
+function surfaceGeometry(lobe: Lobe, radius: number): BufferGeometry {
   const { places, triangles } = lobeMesh(lobe, radius);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(places, 3));

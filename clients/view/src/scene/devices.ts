@@ -48,7 +48,7 @@ export class Devices {
   ) {
     const { low, high } = about.bounds;
     this.extent = Math.max(high[0] - low[0], high[1] - low[1]);
-    this.frusta = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ transparent: true, opacity: 0.85 }));
+    this.frusta = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ transparent: true, opacity: 0.55 }));
     this.frusta.frustumCulled = false;
     const marks = (sign: Sign) => {
       const points = new Points(

@@ -18,6 +18,11 @@ export function rotate([w, x, y, z]: Quaternion, [a, b, c]: Vector): Vector {
   return [a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx];
 }
 
+/** The turn back. */
+export function inverse([w, x, y, z]: Quaternion): Quaternion {
+  return [w, -x, -y, -z];
+}
+
 /** A pose given in the axes of another one, in the world. */
 export function compose(parent: Pose, { position, orientation }: Pose): Pose {
   const [w, x, y, z] = parent.orientation;

@@ -11,6 +11,15 @@ import type { Hit, RunView } from "./view";
 
 const FIELD_OF_VIEW = 50;
 
+/** Whether pictures are computed by the processor, which takes a second for each with shadows. */
+export function isSoftware(): boolean {
+  const context = el("canvas").getContext("webgl2");
+  const info = context?.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? String(context?.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
+  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+
 export class Stage {
   readonly element = el("div", { class: "stage" });
   readonly canvas = el("canvas", { tabindex: 0, role: "img", "aria-label": "3D view of the world" });
@@ -27,17 +36,19 @@ export class Stage {
 
   /**
    * @param origin world coordinates of the scene's zero [m]
+   * @param isFine whether there are shadows and smooth edges
    * @param onMove called when the reader has moved the camera
    * @param onPick called with what was clicked, and the number of the view
    */
   constructor(
     private readonly origin: Vector,
+    isFine: boolean,
     onMove: () => void,
     onPick: (hit: Hit | null, view: number) => void,
   ) {
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true });
+    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: isFine });
     this.renderer.outputColorSpace = SRGBColorSpace;
-    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.enabled = isFine;
     this.renderer.shadowMap.type = PCFShadowMap;
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.camera.up.set(0, 0, 1);
@@ -48,14 +59,25 @@ export class Stage {
     this.controls.addEventListener("change", () => this.render());
     this.controls.addEventListener("end", onMove);
     this.element.append(this.canvas, this.labels.element);
-    new ResizeObserver(() => this.resize()).observe(this.element);
+    new ResizeObserver(() => {
+      this.measure();
+      this.draw();
+    }).observe(this.element);
     this.listenForClicks(onPick);
   }
 
   setViews(views: RunView[]): void {
     this.views = views;
-    this.resize();
+    this.element.classList.toggle("two", views.length > 1);
+    this.measure();
   }
+
+  /** Draw from now on: what was asked for before has no camera. */
+  start(): void {
+    this.started = true;
+    this.draw();
+  }
+  private started = false;
 
   setState(state: ViewState): void {
     if (state.mode !== this.state?.mode) {
@@ -84,8 +106,14 @@ export class Stage {
     this.render();
   }
 
-  /** Follow a pose, or look from it, as the mode says. `size` is that of the object that has it [m]. */
-  track(pose: Pose | null, size: Vector, fieldOfView: number | null): void {
+  /**
+   * Follow a pose, or look from it, as the mode says.
+   *
+   * @param size of the object that has it [m]
+   * @param fieldOfView of a camera, horizontally [rad]
+   * @param keep whether the camera already is where it follows from
+   */
+  track(pose: Pose | null, size: Vector, fieldOfView: number | null, keep: boolean): void {
     const mode = this.state?.mode ?? "free";
     if (!pose || mode === "free") {
       this.followed = null;
@@ -97,11 +125,11 @@ export class Stage {
       if (this.followed) {
         const moved = at.clone().sub(this.followed);
         this.camera.position.add(moved);
-      } else {
-        // From behind and above, as near as shows the object in its street.
+      } else if (!keep) {
+        // From the same side, as near as shows the object in its street.
         const away = this.camera.position.clone().sub(this.controls.target).normalize();
-        const distance = Math.max(25, 6 * Math.max(...size));
-        this.camera.position.copy(at).addScaledVector(away, Math.min(distance, this.camera.position.distanceTo(at)));
+        const distance = Math.min(Math.max(25, 6 * Math.max(...size)), this.camera.position.distanceTo(at));
+        this.camera.position.copy(at).addScaledVector(away, distance);
       }
       this.controls.target.copy(at);
       this.followed = at;
@@ -110,8 +138,8 @@ export class Stage {
       this.controls.enabled = false;
       const ahead = new Vector3(...rotate(pose.orientation, [1, 0, 0]));
       const up = new Vector3(...rotate(pose.orientation, [0, 0, 1]));
-      // A camera looks from where it is, an object from above its roof.
-      if (fieldOfView === null) at.addScaledVector(up, 0.5 * size[2] + 0.4);
+      // A camera looks from where it is, an object from above the front of its roof.
+      if (fieldOfView === null) at.addScaledVector(ahead, 0.45 * size[0]).addScaledVector(up, 0.5 * size[2] + 0.4);
       this.camera.position.copy(at);
       this.camera.up.copy(up);
       this.controls.target.copy(at).addScaledVector(ahead, 10);
@@ -133,14 +161,16 @@ export class Stage {
   render(): void {
     if (this.asked) return;
     this.asked = true;
-    requestAnimationFrame(() => this.draw());
+    requestAnimationFrame(() => {
+      if (this.asked) this.draw();
+    });
   }
 
   /** Draw now. */
   draw(): void {
     this.asked = false;
     const { clientWidth: width, clientHeight: height } = this.element;
-    if (!width || !height || !this.state) return;
+    if (!width || !height || !this.state || !this.started) return;
     const each = width / Math.max(1, this.views.length);
     // Depth buffers resolve little far from a camera whose nearest place is very near.
     const near = Math.max(0.15, Math.min(5, 0.004 * this.camera.position.distanceTo(this.controls.target)));
@@ -164,11 +194,12 @@ export class Stage {
   /** Middle of the picture: right of panels that cover so much of its left [px]. */
   setCovered(left: number): void {
     this.covered = left;
-    this.resize();
+    this.measure();
   }
   private covered = 0;
 
-  private resize(): void {
+  /** Take in the size of the page. */
+  private measure(): void {
     const { clientWidth: width, clientHeight: height } = this.element;
     if (!width || !height) return;
     this.renderer.setSize(width, height, false);
@@ -176,7 +207,6 @@ export class Stage {
     if (this.views.length === 1) this.camera.setViewOffset(width, height, -this.covered / 2, 0, width, height);
     else this.camera.clearViewOffset();
     this.camera.updateProjectionMatrix();
-    this.draw();
   }
 
   /** A press that does not move is a click; the rest moves the camera. */

@@ -158,7 +158,7 @@ export class RunView {
     Object.assign(this.sun.shadow.camera, { left: -radius, right: radius, top: radius, bottom: -radius });
     Object.assign(this.sun.shadow.camera, { near: 0.1 * radius, far: 4 * radius });
     this.sun.shadow.autoUpdate = false;
-    this.sun.shadow.normalBias = radius / 1500;
+    this.sun.shadow.normalBias = radius / 700;
     this.sun.shadow.bias = -0.0012;
     this.sun.shadow.radius = 2.5;
   }

@@ -5,7 +5,6 @@ import {
   BufferGeometry,
   CircleGeometry,
   Color,
-  EdgesGeometry,
   Group,
   LineBasicMaterial,
   LineSegments,
@@ -15,11 +14,12 @@ import {
   SphereGeometry,
 } from "three";
 import { decodeMesh } from "../decode";
+import { edgesOf } from "./edges";
 import type { Source } from "../source";
 import type { About, MeshInfo, Vector } from "../types";
 import type { Theme } from "./theme";
 
-/** More triangles than this have no edges: finding them takes a second for each 200,000. */
+/** Meshes of more triangles than this have no edges, which would take seconds. */
 const MOST_EDGED = 150_000;
 
 const VARYING = "varying vec3 vPlace;";
@@ -95,12 +95,9 @@ export class World {
         const mesh = new Mesh(geometry, this.material("#888888", terrain ? GRID : CREVICE));
         mesh.castShadow = !terrain;
         mesh.receiveShadow = true;
-        if (terrain) {
-          // Roads and pavements lie on the ground within millimetres.
-          mesh.material.polygonOffset = true;
-          mesh.material.polygonOffsetFactor = 1;
-          mesh.material.polygonOffsetUnits = 1;
-        }
+        // Edges lie on buildings, and roads on the ground within millimetres.
+        mesh.material.polygonOffset = true;
+        mesh.material.polygonOffsetFactor = mesh.material.polygonOffsetUnits = terrain ? 2 : 1;
         this.pieces.push({ info, mesh });
         this.group.add(mesh);
       }),
@@ -108,16 +105,17 @@ export class World {
     if (this.theme) this.setTheme(this.theme);
   }
 
-  /** Add the edges of buildings; after the first picture, since it takes longer than all else. */
-  addEdges(): void {
+  /** Add the edges of buildings, with pauses in which the page answers: it takes longer than all else. */
+  async addEdges(): Promise<void> {
     for (const { info, mesh } of this.pieces) {
       if (info.kind !== "building" && info.kind !== "other") continue;
       if (info.triangles > MOST_EDGED) continue;
-      const lines = new LineSegments(
-        new EdgesGeometry(mesh.geometry, 20),
-        new LineBasicMaterial({ transparent: true, depthWrite: false }),
-      );
-      this.edges.add(lines);
+      await new Promise((resolve) => setTimeout(resolve));
+      const { position } = mesh.geometry.attributes;
+      const ends = edgesOf(position.array, mesh.geometry.index?.array ?? []);
+      const geometry = new BufferGeometry();
+      geometry.setAttribute("position", new BufferAttribute(ends, 3));
+      this.edges.add(new LineSegments(geometry, new LineBasicMaterial({ transparent: true, depthWrite: false })));
     }
     if (this.theme) this.setTheme(this.theme);
   }
@@ -197,6 +195,8 @@ function skyMaterial(): ShaderMaterial {
       void main() {
         vDirection = position;
         gl_Position = projectionMatrix * vec4(mat3(viewMatrix) * position, 1.0);
+        // Behind all else: its own distance may be before the nearest place.
+        gl_Position.z = 0.999 * gl_Position.w;
       }`,
     fragmentShader: `
       uniform vec3 uZenith, uHorizon;
