@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import zmq
@@ -216,11 +215,6 @@ class BrokerServer:
         if self.outcome is None:
             raise AssertionError("the loop ended before the run")
         return self.outcome
-
-    def scenery(self) -> dict[str, Path]:
-        """Files of the run's scenery by asset name; those that are on their way are left out."""
-        store = self._assets.store
-        return {asset.name: store.path(asset.digest) for asset in self.clock.scenery if store.holds(asset)}
 
     @property
     def cpu_s(self) -> float:

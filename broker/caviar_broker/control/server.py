@@ -218,8 +218,8 @@ class ControlServer:
         }
 
     def _scenery(self, _: Mapping[str, Any]) -> Answer:
-        files = self.server.scenery()
-        return {"ok": True, "assets": {name: str(path) for name, path in files.items()}}
+        assets = msgspec.to_builtins(self.server.clock.scenery)
+        return {"ok": True, "assets": assets, "store": str(self.server.store.folder)}
 
     def _answers(self, request: Mapping[str, Any]) -> Answer:
         """Answers to grants that came after the first so many of each service."""

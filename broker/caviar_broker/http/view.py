@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse, StreamingResponse
@@ -21,7 +22,9 @@ from caviar_broker.http.app import LocalOnly, may
 from caviar_broker.http.auth import Tokens, http_address
 from caviar_broker.http.server import http_server, listening_socket, place_of
 from caviar_broker.security.access import PAGE
+from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import CaviarError, RunError
+from caviar_protocol.fields import Asset
 from caviar_protocol.keys import VIEWER, Credentials
 from caviar_protocol.observer import EVERYTHING, Observer
 from caviar_protocol.run_directory import RunDirectory
@@ -115,11 +118,12 @@ class LiveView:
         if status["state"] in ("joining", "preparing"):
             waits = ", ".join(wait["service"] for wait in status["waits"])
             raise RunError(f"the run has not begun: it waits for {waits or 'its services'}")
-        files = (await self._ask(do="scenery"))["assets"]
+        scenery = await self._ask(do="scenery")
+        wanted = msgspec.convert(scenery["assets"], list[Asset])
+        assets = await asyncio.to_thread(AssetStore(Path(scenery["store"])).folder_of, wanted)
         record = json.loads(await asyncio.to_thread(self._record.read_text, "utf-8"))
         scenario = record["scenario"]
         seed = (scenario.get("run") or {}).get("seed", 0)
-        assets = {name: Path(file) for name, file in files.items()}
         self._frames = LiveFrames(scenario, status["run"], seed, assets)
         self._answers = Answers(self._frames, controls=True)
         threading.Thread(target=self._observe, args=(self._frames,), name="observer", daemon=True).start()

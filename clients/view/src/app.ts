@@ -19,7 +19,7 @@ import type { Pose } from "./scene/pose";
 import { isSoftware, Stage } from "./scene/stage";
 import { DARK, LIGHT } from "./scene/theme";
 import type { Hit } from "./scene/view";
-import { isSaved, type Source, takeToken } from "./source";
+import { isSaved, replaceFragment, type Source, takeToken } from "./source";
 import { type Changed, fromFragment, type Mode, SPEEDS, type Store, toFragment, type ViewState } from "./state";
 import type { Timeline } from "./timeline";
 import type { About, News, User, Vector } from "./types";
@@ -43,6 +43,7 @@ export class App {
   private readonly transport: Transport;
   private readonly dock: Dock;
   private readonly live: Live | null;
+  private readonly loadingNote = el("p", { class: "loading" }, "Loading the world …");
   private readonly announcer = el("p", { class: "hidden", role: "status", "aria-live": "polite" });
   private readonly origin: Vector;
   private loading: AbortController | null = null;
@@ -89,7 +90,7 @@ export class App {
         "div",
         { class: "page" },
         header.element,
-        el("main", { class: "main" }, this.stage.element, ...overlays, this.announcer),
+        el("main", { class: "main" }, this.stage.element, this.loadingNote, ...overlays, this.announcer),
         this.dock.element,
         this.transport.element,
       ),
@@ -119,13 +120,23 @@ export class App {
     this.stage.setViews(this.runs.map(({ view }) => view));
     await this.show(this.n);
     for (const line of [...this.about.damage, ...(this.about.notes ?? [])]) report(line);
-    if (state.cam) this.stage.setPlace(state.cam);
-    else this.goHome(state.mode);
-    this.track(state.cam !== null);
+    if (!this.placed) this.placeCamera();
+    this.loadingNote.remove();
     this.stage.start();
     void Promise.all(this.runs.map(({ view }) => view.world.addEdges())).then(() => this.stage.render());
     void this.live?.listen();
   }
+
+  /** Put the camera where the address says, or where it sees what there is. */
+  private placeCamera(): void {
+    const { cam, mode } = this.store.state;
+    if (cam) this.stage.setPlace(cam);
+    else this.goHome(mode);
+    this.track(cam !== null);
+    // A live run that has no frame yet is looked at again with its first one.
+    this.placed = this.runs[0].view.frame !== null;
+  }
+  private placed = false;
 
   /** Look at a place, which ends playing and following. */
   seek(n: number): void {
@@ -137,6 +148,11 @@ export class App {
   async go(n: number): Promise<void> {
     this.store.set({ n });
     await this.ready;
+  }
+
+  /** Draw at once, and not with the screen's next picture. */
+  draw(): void {
+    this.stage.draw();
   }
 
   private step(by: number): void {
@@ -186,7 +202,8 @@ export class App {
     }
     for (const run of this.runs) run.drawTrails(n);
     this.redraw();
-    this.track();
+    if (this.placed) this.track();
+    else this.placeCamera();
     this.stage.refresh();
     this.announce();
     if (!this.player.playing) setTimeout(() => void this.loadTrails(n, signal), IDLE_MS);
@@ -243,7 +260,9 @@ export class App {
       this.stage.setCovered(this.layers.element.offsetWidth);
     }
     if (changed.has("mode") || changed.has("sel")) this.track();
-    this.redraw();
+    // A new place is drawn when it is there: the old one again would only hold it up.
+    if (changed.size > 1 || !changed.has("n")) this.redraw();
+    this.updateTransport();
     this.writeAddress();
   }
 
@@ -326,6 +345,8 @@ export class App {
   private async hear(news: News): Promise<void> {
     this.timeline.grow(news.first, news.added);
     this.dock.setNews(news);
+    // What is looked at is forgotten: the oldest frame that is held stands for it.
+    if (this.n < this.timeline.first && this.store.state.n !== null) this.store.set({ n: this.timeline.first });
     if (this.catchingUp) return;
     // One frame after the other: each newer one would break off the one before, and none would be shown.
     this.catchingUp = true;
@@ -344,12 +365,12 @@ export class App {
   private writeAddress(): void {
     clearTimeout(this.writing);
     // Browsers refuse more than some hundred a minute.
-    this.writing = setTimeout(() => history.replaceState(null, "", this.address()), 300);
+    this.writing = setTimeout(() => replaceFragment(this.address()), 300);
   }
 
   /** Fragment of the view, with the camera where it has followed to. */
   private address(): string {
-    return `#${toFragment({ ...this.store.state, cam: this.stage.place })}`;
+    return toFragment({ ...this.store.state, cam: this.stage.place });
   }
 
   private announce(): void {
@@ -419,6 +440,11 @@ export class App {
       different: { objects: [...this.different.objects], receivers: [...this.different.receivers] },
       absent: view.frame?.absent ?? [],
     };
+  }
+
+  /** Where a place in the world [m] is in the window [px]. */
+  project(place: Vector): [number, number] {
+    return this.stage.project(place);
   }
 
   /** State of the page, for tests and for people at the console. */

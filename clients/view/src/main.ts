@@ -6,16 +6,27 @@ import { askToken } from "./panels/token";
 import { fromFragment, Store } from "./state";
 import type { About } from "./types";
 
+const LOADING = "the page is still loading: await caviar.ready";
+
 declare global {
   interface Window {
-    caviar?: { state(): ReturnType<App["state"]>; readonly ready: Promise<void> };
+    caviar?: {
+      /** What is shown. */
+      state(): ReturnType<App["state"]>;
+      /** Resolves when the newest frame is drawn. */
+      readonly ready: Promise<void>;
+      /** Where a place in the world [m] is in the window [px]. */
+      project: App["project"];
+      /** Show a place, and draw it: for videos. */
+      go(n: number): Promise<void>;
+    };
   }
 }
 
 async function start(): Promise<App> {
   takeToken();
   const source = new Source("data/", askToken);
-  const about = await source.json<About>("about");
+  const about = await whenBegun(source);
   const runs = [{ about, source }];
   if (about.beside) {
     const other = new Source("beside/data/", askToken);
@@ -26,15 +37,44 @@ async function start(): Promise<App> {
   return app;
 }
 
+/** Ask what there is, again where a run has not begun. */
+async function whenBegun(source: Source): Promise<About> {
+  const note = el("p", { class: "loading", role: "status" });
+  document.body.append(note);
+  for (;;) {
+    try {
+      const about = await source.json<About>("about");
+      note.remove();
+      return about;
+    } catch (error) {
+      if (!(error instanceof RequestError && error.status === 503)) throw error;
+      note.textContent = `${error.reason} …`;
+      await new Promise((resolve) => setTimeout(resolve, 500));
+    }
+  }
+}
+
 const begun = start();
 let app: App | null = null;
 window.caviar = {
   state: () => {
-    if (!app) throw new Error("the page is still loading: await caviar.ready");
+    if (!app) throw new Error(LOADING);
     return app.state();
   },
+  project: (place) => {
+    if (!app) throw new Error(LOADING);
+    return app.project(place);
+  },
   get ready() {
-    return begun.then((started) => started.ready);
+    return begun.then(async (started) => {
+      await started.ready;
+      started.draw();
+    });
+  },
+  go: async (n) => {
+    const started = await begun;
+    await started.go(n);
+    started.draw();
   },
 };
 begun.then(

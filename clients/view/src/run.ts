@@ -14,6 +14,8 @@ import type { AntennaDevice, Scene } from "../../js/src/types.d.ts";
 /** Frames of a trail, and requests for them at a time. */
 const TRAIL = 30;
 const AT_ONCE = 4;
+/** Lobes that are kept; one has up to 40,000 directions. */
+const MOST_LOBES = 64;
 /** Length of the strongest direction of a lobe, of the distance between both ends: of TX and of RX. */
 const LOBE_SHARE = { tx: 0.42, rx: 0.15 };
 
@@ -143,6 +145,8 @@ export class Run {
         return null;
       }
       this.lobes.set(key, lobe);
+      const oldest = this.lobes.keys().next().value;
+      if (this.lobes.size > MOST_LOBES && oldest !== undefined) this.lobes.delete(oldest);
     }
     return lobe;
   }

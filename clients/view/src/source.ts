@@ -26,13 +26,22 @@ export function takeToken(): void {
   if (found) {
     store(decodeURIComponent(found[1]));
     const rest = location.hash.replace(found[0], "").replace(/^[#&]*/, "");
-    history.replaceState(null, "", rest ? `#${rest}` : location.pathname + location.search);
+    replaceFragment(rest);
   } else {
     try {
       token = sessionStorage.getItem(STORED) ?? "";
     } catch {
       // Pages from a file may have no storage.
     }
+  }
+}
+
+/** Write the fragment of the address, without another entry in the history. */
+export function replaceFragment(fragment: string): void {
+  try {
+    history.replaceState(null, "", `#${fragment}`);
+  } catch {
+    // A page within a notebook has no address of its own.
   }
 }
 

@@ -10,6 +10,8 @@ import { inverse, type Pose, rotate } from "./pose";
 
 /** Below this gain, 18 dB under the strongest direction, no surface is drawn. */
 const LEAST = 0.016;
+/** Surfaces that the graphics card keeps. */
+const MOST_SURFACES = 32;
 /** Directions of a slice. */
 const AROUND = 1440;
 
@@ -26,6 +28,8 @@ export interface ShownBeam {
 export class Beams {
   readonly group = new Group();
   shown: ShownBeam[] = [];
+  /** Surfaces of radius 1: lobes come again, at other distances. */
+  private readonly surfaces = new Map<Lobe, BufferGeometry>();
 
   constructor(private readonly origin: Vector) {}
 
@@ -33,11 +37,17 @@ export class Beams {
     this.shown = beams;
     this.group.traverse((child) => {
       if (!(child instanceof Mesh)) return;
-      child.geometry.dispose();
+      if (!child.userData.kept) child.geometry.dispose();
       child.material.dispose();
     });
     this.group.clear();
     for (const beam of beams) this.add(beam);
+    for (const [lobe, geometry] of this.surfaces) {
+      if (this.surfaces.size <= MOST_SURFACES) break;
+      if (beams.some((beam) => beam.lobe === lobe)) continue;
+      geometry.dispose();
+      this.surfaces.delete(lobe);
+    }
   }
 
   private add({ lobe, pose, towards, radius, best }: ShownBeam): void {
@@ -45,17 +55,21 @@ export class Beams {
     const at = pose.position.map((value, i) => value - this.origin[i]) as Vector;
     const order = best ? 14 : 17;
     const shared = { color, transparent: true, side: DoubleSide, depthWrite: false };
+    let geometry = this.surfaces.get(lobe);
+    if (!geometry) this.surfaces.set(lobe, (geometry = surfaceGeometry(lobe)));
     const surface = new Mesh(
-      surfaceGeometry(lobe, radius),
+      geometry,
       new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.14 }),
     );
     const [w, x, y, z] = pose.orientation;
     surface.quaternion.set(x, y, z, w);
+    surface.scale.setScalar(radius);
+    surface.userData.kept = true;
     const outline = slice(lobe, pose, towards, radius);
     const area = new Mesh(fan(outline), new MeshBasicMaterial({ ...shared, opacity: 0.45 }));
-    const geometry = new LineSegmentsGeometry();
-    geometry.setPositions(outline.flatMap((point, i) => [...point, ...outline[(i + 1) % outline.length]]));
-    const line = new LineSegments2(geometry, new LineMaterial({ color, linewidth: 2, transparent: true, depthWrite: false }));
+    const lines = new LineSegmentsGeometry();
+    lines.setPositions(outline.flatMap((point, i) => [...point, ...outline[(i + 1) % outline.length]]));
+    const line = new LineSegments2(lines, new LineMaterial({ color, linewidth: 2, transparent: true, depthWrite: false }));
     [surface, area, line].forEach((object, i) => {
       object.position.set(...at);
       object.renderOrder = order + i;
@@ -123,8 +137,8 @@ function fan(outline: Vector[]): BufferGeometry {
   return geometry;
 }
 
-function surfaceGeometry(lobe: Lobe, radius: number): BufferGeometry {
-  const { places, triangles } = lobeMesh(lobe, radius);
+function surfaceGeometry(lobe: Lobe): BufferGeometry {
+  const { places, triangles } = lobeMesh(lobe, 1);
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(places, 3));
   geometry.setIndex(triangles);

@@ -209,6 +209,13 @@ export class Stage {
     this.camera.updateProjectionMatrix();
   }
 
+  /** Where a place in the world [m] is in the window [px]. */
+  project(place: Vector): [number, number] {
+    const at = new Vector3(...(place.map((value, i) => value - this.origin[i]) as Vector)).project(this.camera);
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
+    return [left + ((at.x + 1) / 2) * width, top + ((1 - at.y) / 2) * height];
+  }
+
   /** A press that does not move is a click; the rest moves the camera. */
   private listenForClicks(onPick: (hit: Hit | null, view: number) => void): void {
     let pressed: { x: number; y: number } | null = null;
