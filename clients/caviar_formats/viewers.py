@@ -1,7 +1,7 @@
 """Formats that viewers open: ``foxglove`` and ``ros2``, MCAP for Foxglove and ROS 2, and ``rerun``.
 
 All have a file or folder for each episode, of which `moments` collects what viewers show frame by frame.
-Times are those of the simulation, from 0.
+Times are those of the simulation.
 """
 
 from __future__ import annotations
@@ -223,10 +223,10 @@ class _Viewer(Format):
         """
 
 
-_FRAMES = (
-    "Lengths are in metres. Frames of reference are `world` (x to the\neast, y to the north, z up), objects "
-    "and devices by name (x forward, y left, z up), and `CAMERA_optical`\n(x right, y down, z forward)."
-)
+_FRAMES = """Lengths are in metres.
+
+Frames of reference are `world` (x to the east, y to the north, z up), objects and devices by name (x forward,
+y left, z up), and `CAMERA_optical` (x right, y down, z forward)."""
 
 
 def _series() -> str:
@@ -256,8 +256,8 @@ class Foxglove(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} for Foxglove
 
-`episode-N.mcap`: an episode, with times since its first frame. Messages have Foxglove's schemas in Protocol
-Buffers; those of `/users` are JSON. {_FRAMES}
+`episode-N.mcap`: an episode, with simulated times. Messages have Foxglove's schemas in Protocol Buffers;
+those of `/users` are JSON. {_FRAMES}
 
 - `/tf`: FrameTransforms of objects in the world, and of devices on their objects.
 - `/scenery`: SceneUpdate of the first frame, triangles by material.
@@ -446,8 +446,8 @@ class Ros2(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} as bags of ROS 2
 
-`episode-N`: a bag, `episode-N.mcap` and its `metadata.yaml`, with times since the first frame, as of
-`use_sim_time`. {_FRAMES}
+`episode-N`: a bag, `episode-N.mcap` and its `metadata.yaml`, with simulated times, as of `use_sim_time`.
+{_FRAMES}
 What is no letter, digit or slash in a name is an underscore in topics.
 
 - `/tf`: tf2_msgs/TFMessage of objects in the world, and of devices on their objects.
@@ -652,7 +652,7 @@ class Rerun(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} for Rerun
 
-`episode-N.rrd`: an episode, with times since its first frame on the timeline `time`. {_FRAMES}
+`episode-N.rrd`: an episode, with simulated times on the timeline `time`. {_FRAMES}
 
 - `world/scenery`: meshes by material.
 - `world/objects`: boxes, with names.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import warnings
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -310,12 +311,18 @@ def plot(
     camera: Annotated[
         str | None, typer.Option(help="camera whose images are drawn, in files with its name")
     ] = None,
+    style: Annotated[
+        Literal["screen", "paper"],
+        typer.Option(help="screen: PNG; paper: PDF and SVG of one and of two columns, and CSV"),
+    ] = "screen",
 ) -> None:
     """Draw a run: its map with rays and beam, |y|, delay spread, frequency response, LIDAR and cameras."""
     from caviar_clients.cli.plot import plot_run
+    from caviar_clients.plots.style import paper_style
 
-    for picture in plot_run(run, out, frame, user, camera):
-        typer.echo(picture)
+    with paper_style() if style == "paper" else nullcontext():
+        for picture in plot_run(run, out, frame, user, camera):
+            typer.echo(picture)
 
 
 @pictures.command("map")
