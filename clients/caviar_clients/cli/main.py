@@ -34,8 +34,8 @@ from caviar_clients.cli.shared import (
     ScenarioOrRun,
     Seed,
     Set,
+    Shown,
     SummaryFile,
-    complete_scenario,
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
@@ -141,14 +141,7 @@ def run(
 
 @app.command(rich_help_panel=LOOK)
 def view(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="directory of a run, dataset, or scenario by name or file",
-            show_default=False,
-            autocompletion=complete_scenario,
-        ),
-    ],
+    source: Shown,
     beside: Annotated[
         Path | None, typer.Option(help="a second run, at the same time and from the same place")
     ] = None,
