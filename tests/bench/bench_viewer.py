@@ -4,9 +4,9 @@
 
 Alternating pairs of runs of `street-canyon`, without and with so many pages that follow it live: frames a
 second and processor time of a frame, of the processes of the run alone; digests are compared. Then, of
-recordings: seconds from opening a page of `street-canyon` to its first picture; milliseconds of jumps to random
-frames among 10,000 of `smoke`; seconds until a scene of a million triangles is drawn, and how many triangles it
-is thinned to. Needs Playwright and Debian's chromium. The exit status is 1 where digests differ.
+recordings: seconds from opening a page of `street-canyon` to its first picture; milliseconds of jumps to
+random frames among 10,000 of `smoke`; seconds until a scene of a million triangles is drawn, and how many
+triangles it is thinned to. Needs Playwright and Debian's chromium. The exit status is 1 where digests differ.
 """
 
 from __future__ import annotations

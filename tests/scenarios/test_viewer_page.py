@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import time
+import urllib.error
 import urllib.request
 import uuid
 from collections.abc import Callable, Iterator
@@ -342,6 +343,37 @@ def test_a_damaged_product_is_said_and_not_shown(browser: Any, recorded: Path, t
         page.press("ArrowRight")
         page.until("s.n === 5 && s.shown.points > 0")
         page.raw.close()
+
+
+def status_of(url: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:  # noqa: S310
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_guests_are_turned_away(address: str, recorded: Path, tmp_path: Path) -> None:
+    assert status_of(f"{address}data/about") == 200
+    assert status_of(f"{address}data/about", Origin="http://evil.example") == 403
+    assert status_of(f"{address}data/about", Host="evil.example") == 403
+    for path in (
+        "../../etc/passwd",
+        "data/../../x",
+        "data/meshes/..%2f..%2fx",
+        "data/frames/99",
+        "secret.js",
+    ):
+        assert status_of(address + path) == 404, path
+    keys = tmp_path / "keys"
+    made = caviar("keys", "token", "ana", "--role", "viewer", "--directory", keys)
+    token = re.search(r"\S{30,}", made.output)
+    assert token, made.output
+    with served(recorded, "--keys", keys) as url:
+        assert status_of(url) == 200  # the page itself, which asks for a token
+        assert status_of(f"{url}data/about") == 401
+        assert status_of(f"{url}data/about", Authorization="Bearer of-another-run") == 401
+        assert status_of(f"{url}data/about", Authorization=f"Bearer {token[0]}") == 200
 
 
 def test_the_bundle_is_built_of_its_sources(repository: Path, tmp_path: Path) -> None:
