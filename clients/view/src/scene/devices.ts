@@ -1,4 +1,4 @@
-// Antennas, LIDARs and cameras: plates and posts in the world, marks of constant size on top, frusta.
+// Antennas, LIDARs and cameras: plates and posts in the world, marks of constant size on top.
 import {
   BoxGeometry,
   BufferAttribute,
@@ -6,8 +6,6 @@ import {
   CanvasTexture,
   CylinderGeometry,
   Group,
-  LineBasicMaterial,
-  LineSegments,
   Mesh,
   MeshLambertMaterial,
   Points,
@@ -34,7 +32,6 @@ export class Devices {
   readonly group = new Group();
   readonly shown = new Map<string, ShownDevice>();
   private readonly bodies = new Group();
-  private readonly frusta: LineSegments<BufferGeometry, LineBasicMaterial>;
   private readonly marks: Record<Sign, Points<BufferGeometry, PointsMaterial>>;
   private readonly plate = new MeshLambertMaterial({ color: "#f4f6f8", flatShading: true });
   private readonly post = new MeshLambertMaterial({ color: "#7b838c", flatShading: true });
@@ -48,8 +45,6 @@ export class Devices {
   ) {
     const { low, high } = about.bounds;
     this.extent = Math.max(high[0] - low[0], high[1] - low[1]);
-    this.frusta = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ transparent: true, opacity: 0.55 }));
-    this.frusta.frustumCulled = false;
     const marks = (sign: Sign) => {
       const points = new Points(
         new BufferGeometry(),
@@ -61,7 +56,7 @@ export class Devices {
       return points;
     };
     this.marks = { tx: marks("tx"), rx: marks("rx"), sensor: marks("sensor") };
-    this.group.add(this.bodies, this.frusta);
+    this.group.add(this.bodies);
   }
 
   /** Place the devices of a scene. */
@@ -74,17 +69,14 @@ export class Devices {
     this.names = { tx: [], rx: [], sensor: [] };
     for (const child of this.bodies.children) (child as Mesh).geometry.dispose();
     this.bodies.clear();
-    const frusta: number[] = [];
     for (const [name, { device, pose }] of this.shown) {
       this.names[device.type === "antenna" ? (device.role === "rx" ? "rx" : "tx") : "sensor"].push(name);
       if (device.type === "antenna" && device.role !== "rx" && !device.parent) this.addMast(pose, device.array);
-      if (device.type === "camera") frusta.push(...this.frustum(pose, device));
     }
     for (const sign of ["tx", "rx", "sensor"] as const) {
       const places = this.names[sign].flatMap((name) => this.local(this.shown.get(name)!.pose.position).toArray());
       replacePlaces(this.marks[sign], places);
     }
-    replacePlaces(this.frusta, frusta);
   }
 
   /** Receivers whose beams differ from those of the run beside. */
@@ -99,13 +91,11 @@ export class Devices {
       material.map = drawSign(sign, theme);
       material.needsUpdate = true;
     }
-    this.frusta.material.color.set(theme.ink);
   }
 
   show(layers: ReadonlySet<string>): void {
     for (const points of Object.values(this.marks)) points.visible = layers.has("devices");
     this.bodies.visible = layers.has("devices");
-    this.frusta.visible = layers.has("frusta");
   }
 
   /** Marks that can be picked, and the name of one's point. */
@@ -153,28 +143,9 @@ export class Devices {
 
   /** Height of the ground [m]. */
   ground = 0;
-
-  /** Edges of the pyramid that a camera sees. */
-  private frustum(pose: Pose, device: { width: number; height: number; field_of_view: number }): number[] {
-    const length = Math.min(Math.max(2, 0.03 * this.extent), 12);
-    const wide = length * Math.tan(device.field_of_view / 2);
-    const tall = (wide * device.height) / device.width;
-    const [w, x, y, z] = pose.orientation;
-    const turn = new Quaternion(x, y, z, w);
-    const apex = this.local(pose.position);
-    const corners = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([side, up]) =>
-      new Vector3(length, side * wide, up * tall).applyQuaternion(turn).add(apex),
-    );
-    return corners.flatMap((corner, i) => [
-      ...apex.toArray(),
-      ...corner.toArray(),
-      ...corner.toArray(),
-      ...corners[(i + 1) % 4].toArray(),
-    ]);
-  }
 }
 
-function replacePlaces(object: Points | LineSegments, places: number[]): void {
+function replacePlaces(object: Points, places: number[]): void {
   object.geometry.dispose();
   object.geometry = new BufferGeometry();
   object.geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));

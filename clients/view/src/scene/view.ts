@@ -6,6 +6,7 @@ import type { Source } from "../source";
 import type { ViewState } from "../state";
 import type { About, MeshInfo, User, Vector } from "../types";
 import { Beams } from "./beams";
+import { Cameras } from "./cameras";
 import { Devices } from "./devices";
 import type { Label } from "./labels";
 import { Points } from "./lidar";
@@ -28,6 +29,7 @@ export class RunView {
   readonly rays: Rays;
   readonly beams: Beams;
   readonly points: Points;
+  readonly cameras: Cameras;
   frame: Frame | null = null;
   private readonly hemisphere = new HemisphereLight();
   readonly sun = new DirectionalLight();
@@ -45,7 +47,8 @@ export class RunView {
     this.rays = new Rays(origin);
     this.beams = new Beams(origin);
     this.points = new Points(origin);
-    const layers = [this.world, this.objects, this.devices, this.rays, this.beams, this.points];
+    this.cameras = new Cameras(about, origin);
+    const layers = [this.world, this.objects, this.devices, this.rays, this.beams, this.points, this.cameras];
     this.scene.add(...layers.map(({ group }) => group), this.hemisphere, this.sun, this.sun.target);
     this.placeSun(origin);
   }
@@ -63,6 +66,7 @@ export class RunView {
     this.objects.update(scene);
     this.devices.update(scene);
     this.rays.setPaths(scene && channel ? pathsOf(channel, scene, user?.carrier ?? null) : []);
+    this.cameras.update(scene, first(frame, "camera"));
     this.points.update(first(frame, "lidar"), new Set(scene?.names));
   }
 
@@ -77,10 +81,12 @@ export class RunView {
     this.rays.group.visible = layers.has("rays");
     this.beams.group.visible = layers.has("beams");
     this.points.group.visible = layers.has("lidar");
+    // On board of a camera its picture would stand before the world.
+    this.cameras.group.visible = layers.has("frusta") && state.mode !== "board";
   }
 
   setTheme(theme: Theme): void {
-    for (const layer of [this.world, this.objects, this.devices, this.rays]) layer.setTheme(theme);
+    for (const layer of [this.world, this.objects, this.devices, this.rays, this.cameras]) layer.setTheme(theme);
     this.hemisphere.color.set(theme.sky);
     this.hemisphere.groundColor.set(theme.bounce);
     this.hemisphere.intensity = theme.ambient;
