@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,9 @@ from caviar_clients.datasets.user_rows import Users
 from caviar_clients.plots.rays import RANGE_DB, rays
 from caviar_clients.plots.style import SKY, VERMILION
 from caviar_formats.base import Format, Part
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import RecordedFrame
 from caviar_protocol.space.coordinates import Pose, compose, unit_vectors
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import (
@@ -38,12 +37,14 @@ from caviar_protocol.topics import (
     Depth,
     Lidar,
     Link,
+    Scene,
 )
 from caviar_protocol.topics.sensors import CameraImage, DepthImage, LidarScan
 from caviar_space.meshes import Mesh, joined, placed
 from caviar_view.answers import SERIES
 from caviar_view.world import World
 
+P = TypeVar("P", bound=Payload)
 WORLD = "world"
 """Frame of reference whose axes are those of the world."""
 LOBE_M, TICK_M = 10.0, 3.0
@@ -77,7 +78,23 @@ class Moment:
     images: list[CameraImage | DepthImage]
 
 
-def moment(frame: RecordedFrame) -> Moment:
+class ShownFrame(Protocol):
+    """A frame of a recording or of an observer."""
+
+    t_ns: int
+
+    @property
+    def products(self) -> Sequence[Any]:
+        """Products that are not absent, each with its ``provenance`` and ``payload``."""
+
+    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source."""
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one."""
+
+
+def moment(frame: ShownFrame) -> Moment:
     """Collect what viewers show of a frame.
 
     Args:
@@ -246,7 +263,7 @@ class Foxglove(_Viewer):
 
         context = foxglove.Context()
         with foxglove.open_mcap(place.with_suffix(".mcap"), allow_overwrite=True, context=context):
-            file = _FoxgloveFile(context)
+            file = FoxgloveMessages(context)
             for number, now in enumerate(moments):
                 file.stamp(now.t_ns)
                 if not number:
@@ -276,8 +293,12 @@ those of `/users` are JSON. {_FRAMES}
 """
 
 
-class _FoxgloveFile:
-    """Messages of an MCAP file: topics have channels from their first message on."""
+class FoxgloveMessages:
+    """Messages of Foxglove to a file or a server: topics have channels from their first message on.
+
+    Args:
+        context: Of the SDK, which the file or the server is of.
+    """
 
     def __init__(self, context: Any) -> None:
         import foxglove
@@ -288,10 +309,12 @@ class _FoxgloveFile:
         self._beams: list[tuple[str, int]] | None = None
 
     def stamp(self, t_ns: int) -> None:
+        """Set the time of what follows [ns]."""
         self._t_ns, self._stamp = t_ns, self.fg.Timestamp(*divmod(t_ns, 10**9))
 
     def scenery(self, world: World) -> None:
-        entities = []
+        """Show the scenery, and with the next frame all beams again: a viewer that comes has seen nothing."""
+        self._beams, entities = None, []
         for group in world.groups:
             about = {"triangles": len(group.mesh.faces), "of": group.of}
             surface = self._surface(group.mesh, rgb(group.color))
@@ -299,6 +322,7 @@ class _FoxgloveFile:
         self._update("/scenery", entities)
 
     def add(self, now: Moment) -> None:
+        """Show a frame."""
         fg = self.fg
         transforms = [(WORLD, name, pose) for name, _, pose, _ in now.objects] + now.mounts
         self._log("/tf", fg.FrameTransforms(transforms=[self._transform(*each) for each in transforms]))

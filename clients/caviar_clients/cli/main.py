@@ -156,10 +156,17 @@ def view(
     http: Annotated[str, typer.Option(help="HOST:PORT to serve at; port 0: any free one")] = "127.0.0.1:0",
     keys: Keys = None,
     browser: Annotated[bool, typer.Option(help="open a browser, where there is one")] = True,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="port at which Foxglove gets a run that goes on; 0: any"),
+    ] = None,
 ) -> None:
     """Show a run, an episode or a scenario in 3D in a browser: rays, beams, sensors, clock and curves."""
     from caviar_clients.cli import view as viewer
 
+    if foxglove is not None:
+        viewer.view_in_foxglove(source, foxglove)
+        return
     viewer.view(source, beside, http, keys, save, limit, episode, browser)
 
 
