@@ -97,24 +97,8 @@ class Page:
 
     def place_of(self, position: list[float]) -> tuple[float, float]:
         """Where a place in the world is on the screen [px]."""
-        return screen(self.state["camera"], position, self.raw.evaluate(
-            "(() => { const r = document.querySelector('canvas').getBoundingClientRect();"
-            " return [r.x, r.y, r.width, r.height]; })()"
-        ))  # fmt: skip
-
-
-FIELD_OF_VIEW = 45.0
-
-
-def screen(camera: dict[str, Any], position: list[float], canvas: list[float]) -> tuple[float, float]:
-    eye, target = np.array(camera["position"]), np.array(camera["target"])
-    ahead = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    towards = np.array(position) - eye
-    scale = canvas[3] / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2)) / (towards @ ahead)
-    x, y = towards @ right * scale, towards @ np.cross(right, ahead) * scale
-    return canvas[0] + canvas[2] / 2 + x, canvas[1] + canvas[3] / 2 - y
+        x, y = self.raw.evaluate("position => window.caviar.screen(position)", position) or (-1, -1)
+        return x, y
 
 
 @contextmanager

@@ -442,6 +442,11 @@ export class App {
     };
   }
 
+  /** Where a place in the world [m] is in the page [px]. */
+  screen(position: Vector): [number, number] | null {
+    return this.stage.screen(position);
+  }
+
   /** State of the page, for tests and for people at the console. */
   state() {
     const { state } = this.store;

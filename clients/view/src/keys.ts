@@ -19,7 +19,7 @@ export function listenToKeys(actions: KeyAction[]): void {
     if (target.matches("select, input:not([type=range]):not([type=checkbox])") && key !== "Escape") return;
     // Sliders have arrows, buttons and boxes the space key.
     if (isArrow && target.matches("input[type=range]")) return;
-    if (key === " " && target.matches("button, input, summary")) return;
+    if (key === " " && target.matches("button, input[type=checkbox], summary")) return;
     const action = known.get(event.shiftKey && isArrow ? `Shift+${key}` : key);
     if (!action) return;
     event.preventDefault();

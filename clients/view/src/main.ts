@@ -4,7 +4,7 @@ import { el } from "./dom";
 import { RequestError, Source, takeToken } from "./source";
 import { askToken } from "./panels/token";
 import { fromFragment, Store } from "./state";
-import type { About } from "./types";
+import type { About, Vector } from "./types";
 
 declare global {
   interface Window {
@@ -15,6 +15,8 @@ declare global {
       readonly ready: Promise<void>;
       /** Show a place, and draw it: for videos. */
       go(n: number): Promise<void>;
+      /** Where a place in the world [m] is in the page [px]; null: behind the camera. */
+      screen(position: Vector): [number, number] | null;
     };
   }
 }
@@ -52,11 +54,13 @@ async function whenBegun(source: Source): Promise<About> {
 
 const begun = start();
 let app: App | null = null;
+const loaded = () => {
+  if (!app) throw new Error("the page is still loading: await caviar.ready");
+  return app;
+};
 window.caviar = {
-  state: () => {
-    if (!app) throw new Error("the page is still loading: await caviar.ready");
-    return app.state();
-  },
+  state: () => loaded().state(),
+  screen: (position) => loaded().screen(position),
   get ready() {
     return begun.then(async (started) => {
       await started.ready;
