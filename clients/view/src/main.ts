@@ -45,7 +45,7 @@ async function whenBegun(source: Source): Promise<About> {
       note.remove();
       return about;
     } catch (error) {
-      if (!(error instanceof RequestError && error.status === 409)) throw error;
+      if (!(error instanceof RequestError && [409, 503].includes(error.status))) throw error;
       note.textContent = `${error.reason} …`;
       await new Promise((resolve) => setTimeout(resolve, 2000));
     }
