@@ -154,7 +154,8 @@ see_to_llvm() {
 # Debian's package of each program; tests that lack one are skipped by its name.
 see_to_engines() {
   local program missing=()
-  for program in g++:g++ node:nodejs mcs:mono-mcs mono:mono-runtime godot3-server:godot3-server; do
+  for program in g++:g++ node:nodejs mcs:mono-mcs mono:mono-runtime godot3-server:godot3-server \
+    chromium:chromium; do
     command -v "${program%%:*}" >/dev/null || missing+=("${program##*:}")
   done
   [ -e /usr/include/zmq.h ] || missing+=(libzmq3-dev)
@@ -163,7 +164,7 @@ see_to_engines() {
     if [ "$program" = mono-runtime ]; then missing+=(libmono-posix4.0-cil libmono-system4.0-cil); fi
   done
   if [ ${#missing[@]} -gt 0 ]; then
-    need_packages "the tests of the client libraries use ${missing[*]}" "${missing[@]}"
+    need_packages "the tests of client libraries and of the viewer use ${missing[*]}" "${missing[@]}"
   fi
 }
 

@@ -1,7 +1,7 @@
 """Formats that viewers open: ``foxglove`` and ``ros2``, MCAP for Foxglove and ROS 2, and ``rerun``.
 
 All have a file or folder for each episode, of which `moments` collects what viewers show frame by frame.
-Times are those of the simulation, from 0.
+Times are those of the simulation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,9 @@ from caviar_clients.datasets.user_rows import Users
 from caviar_clients.plots.rays import RANGE_DB, rays
 from caviar_clients.plots.style import SKY, VERMILION
 from caviar_formats.base import Format, Part
-from caviar_protocol.arrays import Float64Array
+from caviar_protocol.arrays import Float64Array, Payload
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
-from caviar_protocol.recording import RecordedFrame
 from caviar_protocol.space.coordinates import Pose, compose, unit_vectors
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import (
@@ -38,12 +37,14 @@ from caviar_protocol.topics import (
     Depth,
     Lidar,
     Link,
+    Scene,
 )
 from caviar_protocol.topics.sensors import CameraImage, DepthImage, LidarScan
 from caviar_space.meshes import Mesh, joined, placed
 from caviar_view.answers import SERIES
 from caviar_view.world import World
 
+P = TypeVar("P", bound=Payload)
 WORLD = "world"
 """Frame of reference whose axes are those of the world."""
 LOBE_M, TICK_M = 10.0, 3.0
@@ -77,7 +78,23 @@ class Moment:
     images: list[CameraImage | DepthImage]
 
 
-def moment(frame: RecordedFrame) -> Moment:
+class ShownFrame(Protocol):
+    """A frame of a recording or of an observer."""
+
+    t_ns: int
+
+    @property
+    def products(self) -> Sequence[Any]:
+        """Products that are not absent, each with its ``provenance`` and ``payload``."""
+
+    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
+        """Payloads of a topic by source."""
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one."""
+
+
+def moment(frame: ShownFrame) -> Moment:
     """Collect what viewers show of a frame.
 
     Args:
@@ -223,10 +240,10 @@ class _Viewer(Format):
         """
 
 
-_FRAMES = (
-    "Lengths are in metres. Frames of reference are `world` (x to the\neast, y to the north, z up), objects "
-    "and devices by name (x forward, y left, z up), and `CAMERA_optical`\n(x right, y down, z forward)."
-)
+_FRAMES = """Lengths are in metres.
+
+Frames of reference are `world` (x to the east, y to the north, z up), objects and devices by name (x forward,
+y left, z up), and `CAMERA_optical` (x right, y down, z forward)."""
 
 
 def _series() -> str:
@@ -246,7 +263,7 @@ class Foxglove(_Viewer):
 
         context = foxglove.Context()
         with foxglove.open_mcap(place.with_suffix(".mcap"), allow_overwrite=True, context=context):
-            file = _FoxgloveFile(context)
+            file = FoxgloveMessages(context)
             for number, now in enumerate(moments):
                 file.stamp(now.t_ns)
                 if not number:
@@ -256,8 +273,8 @@ class Foxglove(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} for Foxglove
 
-`episode-N.mcap`: an episode, with times since its first frame. Messages have Foxglove's schemas in Protocol
-Buffers; those of `/users` are JSON. {_FRAMES}
+`episode-N.mcap`: an episode, with simulated times. Messages have Foxglove's schemas in Protocol Buffers;
+those of `/users` are JSON. {_FRAMES}
 
 - `/tf`: FrameTransforms of objects in the world, and of devices on their objects.
 - `/scenery`: SceneUpdate of the first frame, triangles by material.
@@ -276,8 +293,12 @@ Buffers; those of `/users` are JSON. {_FRAMES}
 """
 
 
-class _FoxgloveFile:
-    """Messages of an MCAP file: topics have channels from their first message on."""
+class FoxgloveMessages:
+    """Messages of Foxglove to a file or a server: topics have channels from their first message on.
+
+    Args:
+        context: Of the SDK, which the file or the server is of.
+    """
 
     def __init__(self, context: Any) -> None:
         import foxglove
@@ -288,10 +309,12 @@ class _FoxgloveFile:
         self._beams: list[tuple[str, int]] | None = None
 
     def stamp(self, t_ns: int) -> None:
+        """Set the time of what follows [ns]."""
         self._t_ns, self._stamp = t_ns, self.fg.Timestamp(*divmod(t_ns, 10**9))
 
     def scenery(self, world: World) -> None:
-        entities = []
+        """Show the scenery, and with the next frame all beams again: a viewer that comes has seen nothing."""
+        self._beams, entities = None, []
         for group in world.groups:
             about = {"triangles": len(group.mesh.faces), "of": group.of}
             surface = self._surface(group.mesh, rgb(group.color))
@@ -299,6 +322,7 @@ class _FoxgloveFile:
         self._update("/scenery", entities)
 
     def add(self, now: Moment) -> None:
+        """Show a frame."""
         fg = self.fg
         transforms = [(WORLD, name, pose) for name, _, pose, _ in now.objects] + now.mounts
         self._log("/tf", fg.FrameTransforms(transforms=[self._transform(*each) for each in transforms]))
@@ -446,8 +470,8 @@ class Ros2(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} as bags of ROS 2
 
-`episode-N`: a bag, `episode-N.mcap` and its `metadata.yaml`, with times since the first frame, as of
-`use_sim_time`. {_FRAMES}
+`episode-N`: a bag, `episode-N.mcap` and its `metadata.yaml`, with simulated times, as of `use_sim_time`.
+{_FRAMES}
 What is no letter, digit or slash in a name is an underscore in topics.
 
 - `/tf`: tf2_msgs/TFMessage of objects in the world, and of devices on their objects.
@@ -652,7 +676,7 @@ class Rerun(_Viewer):
     def readme(self, users: Users) -> str:
         return f"""# {users.dataset.name} for Rerun
 
-`episode-N.rrd`: an episode, with times since its first frame on the timeline `time`. {_FRAMES}
+`episode-N.rrd`: an episode, with simulated times on the timeline `time`. {_FRAMES}
 
 - `world/scenery`: meshes by material.
 - `world/objects`: boxes, with names.

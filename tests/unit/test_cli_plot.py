@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import csv
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import recording_builders
 from recording_builders import channel, frame_of, lidar, link, record, scene
+from typer.testing import CliRunner
 
+from caviar_clients.cli.main import app
 from caviar_clients.cli.plot import plot_run, scenery
+from caviar_clients.plots.style import figure, legend_below, paper_style, saved_files
 from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.recording import Recording
 
@@ -42,6 +48,59 @@ def test_all_pictures_go_into_the_run_directory(tmp_path):
         "lidar.png",
     ]
     assert all(file.parent == tmp_path and file.stat().st_size > 5000 for file in files)
+
+
+def test_figures_for_papers_are_as_wide_as_columns_with_their_fonts_and_numbers(tmp_path):
+    made = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        with paper_style(), figure(folder / "curve.png", 9.0, 6.0) as drawn:
+            axes = drawn.subplots()
+            axes.plot([0.0, 1.5], [2.0, np.nan], label="a long name of a curve, of 40 characters")
+            axes.scatter([1.0], [2.0], c=[7.0])
+            axes.pcolormesh([0.0, 2.0], [0.0, 4.0, 6.0], [[3.0], [5.0]])
+            axes.set_title("of the caption")
+            legend_below(drawn, axes)
+        made.append({file.name: file.read_bytes() for file in folder.iterdir()})
+    assert made[0] == made[1], "no dates"
+    assert sorted(made[0]) == sorted(file.name for file in paper_files("curve"))
+    for name, points in (("1col", 3.5 * 72), ("2col", 7.16 * 72)):
+        pdf, svg = made[0][f"curve-{name}.pdf"], made[0][f"curve-{name}.svg"].decode()
+        (width,) = re.findall(rb"/MediaBox \[ ?0 0 ([\d.]+) ", pdf)
+        assert float(width) == pytest.approx(points, abs=0.01)
+        assert b"/FontFile2" in pdf
+        assert b"/Type3" not in pdf
+        assert float(re.findall(r'width="([\d.]+)pt"', svg)[0]) == pytest.approx(points, abs=0.01)
+        assert "<text" not in svg
+    with (tmp_path / "a" / "curve.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {row["panel"] for row in rows} == {"of the caption"}
+    found = [(row["kind"], row["x"], row["y"], row["value"]) for row in rows]
+    assert found == [
+        ("line", "0.0", "2.0", ""),
+        ("line", "1.5", "nan", ""),
+        ("points", "1.0", "2.0", "7.0"),
+        ("cells", "1.0", "2.0", "3.0"),
+        ("cells", "1.0", "5.0", "5.0"),
+    ]
+
+
+def paper_files(stem):
+    with paper_style():
+        return saved_files(Path(f"{stem}.png"))
+
+
+def test_a_run_is_drawn_for_papers(tmp_path):
+    done = CliRunner().invoke(
+        app, ["plot", str(record(tmp_path / "run")), "--style", "paper", "--out", str(tmp_path)]
+    )
+    assert done.exit_code == 0, done.output
+    names = {file.name for file in tmp_path.iterdir()} - {"run"}
+    pictures = ("map", "beams-over-time", "beams-over-angle")
+    assert names == {file.name for stem in pictures for file in paper_files(stem)}
+    assert {Path(line).name for line in done.output.split()} == names
+    with (tmp_path / "beams-over-time.csv").open(encoding="utf-8") as stream:
+        assert "optimum" in {row["label"].partition(",")[0] for row in csv.DictReader(stream)}
+    assert paper_files("map") != saved_files(Path("map.png")), "of the block alone"
 
 
 def test_what_was_not_recorded_is_not_drawn(tmp_path):

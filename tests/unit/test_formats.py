@@ -1016,7 +1016,7 @@ def test_a_reader_of_foxglove_finds_what_was_recorded(clouds: Path, tmp_path: Pa
         assert xyz(car.cubes[0].pose.position) == tuple(world.position[0])
         assert xyz(car.cubes[0].size) == (4.5, 1.8, 1.5)
         poses = {t.child_frame_id: t for t in found["/tf"][scene][1].transforms}
-        assert set(poses) == {"car", "bs", "car/rx", "lidar", "camera", "camera_optical"}
+        assert set(poses) == {"car", "bs", "car/rx", "lidar", "car/eye", "car/eye_optical"}
         assert poses["car/rx"].parent_frame_id == "car"
         assert xyz(poses["car/rx"].translation) == (0.3, 0.2, 1.0)
         assert len(found["/rays"][scene][1].entities) == drawn_paths(data, scene)
@@ -1026,21 +1026,21 @@ def test_a_reader_of_foxglove_finds_what_was_recorded(clouds: Path, tmp_path: Pa
         assert np.array_equal(rows[:, :3], scan.points[0, 0])
         assert xyz(cloud.pose.position) == (16.0, 10.0, 3.0)
         camera = recording["camera"].select(frames=[scene])
-        image = found["/camera/camera/image"][scene][1]
-        assert (image.width, image.height, image.encoding) == (40, 32, "rgb8")
+        image = found["/camera/car/eye/image"][scene][1]
+        assert (image.width, image.height, image.encoding) == (16, 12, "rgb8")
         assert image.data == camera.rgb[0, 0].tobytes()
         link = recording["link"].select(frames=[scene])
         user = found["/users/car/rx/bs/mm"][scene][1]
         assert user["snr_db"] == pytest.approx(10 * np.log10(link.snr[0, 0]))
         assert user["tx_beam"] == link.tx_beam[0, 0]
     # Straight ahead of the camera is z of its optical axes.
-    optical = poses["camera_optical"]
+    optical = poses["car/eye_optical"]
     turned = optical.rotation
     ahead = rotation_matrix((turned.w, turned.x, turned.y, turned.z))[:, 2]
     assert np.allclose(ahead, rotation_matrix(camera.orientation[0, 0].tolist())[:, 0])
-    calibration = found["/camera/camera/calibration"][0][1]
-    assert calibration.K[0] == pytest.approx(20.0)
-    assert calibration.K[2] == 19.5
+    calibration = found["/camera/car/eye/calibration"][0][1]
+    assert calibration.K[0] == pytest.approx(8 / np.tan(np.radians(40)))
+    assert calibration.K[2] == 7.5
 
 
 def test_beams_of_viewers_point_where_the_codebook_does() -> None:
@@ -1062,8 +1062,8 @@ def test_a_reader_of_ros_finds_what_was_recorded(clouds: Path, tmp_path: Path) -
             found.setdefault(connection.topic, []).append((time, message))
     assert {topic: len(messages) for topic, messages in found.items() if "users" not in topic} == {
         "/scenery": 1, "/tf": 3, "/objects": 3, "/objects/car/pose": 3, "/rays": 3,
-        "/lidar/lidar/points": 3, "/camera/camera/image": 3, "/camera/camera/depth": 3,
-        "/camera/camera/camera_info": 3,
+        "/lidar/lidar/points": 3, "/camera/car/eye/image": 3, "/camera/car/eye/depth": 3,
+        "/camera/car/eye/camera_info": 3,
     }  # fmt: skip
     places = np.array([xyz(pose.pose.position) for _, pose in found["/objects/car/pose"]])
     assert np.array_equal(places, recording["scene"].position[:, 0])
@@ -1075,12 +1075,12 @@ def test_a_reader_of_ros_finds_what_was_recorded(clouds: Path, tmp_path: Path) -
         rows = np.frombuffer(cloud.data.tobytes(), "<f4").reshape(cloud.width, 4)
         assert np.array_equal(rows[:, :3], recording["lidar"].select(frames=[scene]).points_world[0, 0])
         assert len(found["/rays"][scene][1].markers) == 1 + drawn_paths(data, scene)
-        image = found["/camera/camera/image"][scene][1]
+        image = found["/camera/car/eye/image"][scene][1]
         right = recording["camera"].select(frames=[scene]).rgb[0, 0]
         assert np.array_equal(image.data.reshape(image.height, image.width, 3), right)
-        depth = found["/camera/camera/depth"][scene][1]
+        depth = found["/camera/car/eye/depth"][scene][1]
         assert np.array_equal(
-            np.frombuffer(depth.data.tobytes(), "<f4").reshape(32, 40),
+            np.frombuffer(depth.data.tobytes(), "<f4").reshape(12, 16),
             recording["depth"].select(frames=[scene]).depth[0, 0],
         )
     snr = [message.data for _, message in found["/users/car/rx/bs/mm/snr_db"]]

@@ -16,9 +16,9 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from caviar_broker.control.socket import Ask, ask_in_thread, call_at_end, connect
 from caviar_broker.http.auth import Tokens, http_address
@@ -141,7 +141,7 @@ async def serve(
             await ask(do="note", service=service if service in known else "", text=text[:1000], kind=kind)
 
     remedy = f"{REMEDY} --directory {keys}" if keys is not None else REMEDY
-    gateway = Gateway(_reachable(status["endpoint"]), tokens, tell, credentials, remedy)
+    gateway = Gateway(reachable(status["endpoint"]), tokens, tell, credentials, remedy)
     listening = listening_socket(host, port)
     notices: set[asyncio.Task[None]] = set()
 
@@ -152,7 +152,7 @@ async def serve(
         task.add_done_callback(notices.discard)
 
     app = make_app(ask, run, tokens, gateway)
-    live = LiveView(ask, run, _reachable(status["endpoint"]), credentials)
+    live = LiveView(ask, run, reachable(status["endpoint"]), credentials)
     app.include_router(view_router({"": live.answers}, [Depends(may(VIEWER, tokens))], live))
     server = http_server(app, notify_soon, own_process=True)
 
@@ -181,11 +181,17 @@ async def _keys_of_broker(ask: Ask, keys: Path | None) -> tuple[Path | None, Cre
     directory = Path(answer["keys"])
     if keys is not None and keys.resolve() != directory:
         raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
-    pair = Pair(public=answer["public"], secret=answer["secret"])
-    return directory, Credentials(pair, answer["broker"])
+    return directory, gateway_credentials(answer)
 
 
-def _reachable(endpoint: str) -> str:
+def gateway_credentials(answer: Mapping[str, Any]) -> Credentials | None:
+    """Make the credentials of a broker's answer to ``gateway``; None where it has no keys."""
+    if answer["keys"] is None:
+        return None
+    return Credentials(Pair(public=answer["public"], secret=answer["secret"]), answer["broker"])
+
+
+def reachable(endpoint: str) -> str:
     """Replace the address of a broker that listens at all of this machine's by that of the loopback."""
     return endpoint.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
 

@@ -121,7 +121,10 @@ class LiveView:
         scenery = await self._ask(do="scenery")
         wanted = msgspec.convert(scenery["assets"], list[Asset])
         assets = await asyncio.to_thread(AssetStore(Path(scenery["store"])).folder_of, wanted)
-        record = json.loads(await asyncio.to_thread(self._record.read_text, "utf-8"))
+        try:
+            record = json.loads(await asyncio.to_thread(self._record.read_text, "utf-8"))
+        except OSError as error:
+            raise RunError(f"cannot read {self._record}: {error.strerror}") from None
         scenario = record["scenario"]
         seed = (scenario.get("run") or {}).get("seed", 0)
         self._frames = LiveFrames(scenario, status["run"], seed, assets)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import warnings
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -33,8 +34,8 @@ from caviar_clients.cli.shared import (
     ScenarioOrRun,
     Seed,
     Set,
+    Shown,
     SummaryFile,
-    complete_scenario,
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
@@ -140,14 +141,7 @@ def run(
 
 @app.command(rich_help_panel=LOOK)
 def view(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="directory of a run, dataset, or scenario by name or file",
-            show_default=False,
-            autocompletion=complete_scenario,
-        ),
-    ],
+    source: Shown,
     beside: Annotated[
         Path | None, typer.Option(help="a second run, at the same time and from the same place")
     ] = None,
@@ -162,10 +156,17 @@ def view(
     http: Annotated[str, typer.Option(help="HOST:PORT to serve at; port 0: any free one")] = "127.0.0.1:0",
     keys: Keys = None,
     browser: Annotated[bool, typer.Option(help="open a browser, where there is one")] = True,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="port at which Foxglove gets a run that goes on; 0: any"),
+    ] = None,
 ) -> None:
     """Show a run, an episode or a scenario in 3D in a browser: rays, beams, sensors, clock and curves."""
     from caviar_clients.cli import view as viewer
 
+    if foxglove is not None:
+        viewer.view_in_foxglove(source, foxglove)
+        return
     viewer.view(source, beside, http, keys, save, limit, episode, browser)
 
 
@@ -310,12 +311,18 @@ def plot(
     camera: Annotated[
         str | None, typer.Option(help="camera whose images are drawn, in files with its name")
     ] = None,
+    style: Annotated[
+        Literal["screen", "paper"],
+        typer.Option(help="screen: PNG; paper: PDF and SVG of one and of two columns, and CSV"),
+    ] = "screen",
 ) -> None:
     """Draw a run: its map with rays and beam, |y|, delay spread, frequency response, LIDAR and cameras."""
     from caviar_clients.cli.plot import plot_run
+    from caviar_clients.plots.style import paper_style
 
-    for picture in plot_run(run, out, frame, user, camera):
-        typer.echo(picture)
+    with paper_style() if style == "paper" else nullcontext():
+        for picture in plot_run(run, out, frame, user, camera):
+            typer.echo(picture)
 
 
 @pictures.command("map")

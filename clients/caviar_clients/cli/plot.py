@@ -21,7 +21,7 @@ from caviar_clients.plots.moving import MovingMap, Plan, key_colours
 from caviar_clients.plots.packets import draw_traffic, packet_series
 from caviar_clients.plots.rays import Footprints, View, footprints, obstacle_boxes, rays, scale, with_boxes
 from caviar_clients.plots.sensors import CameraView, draw_grid, draw_scan, draw_view
-from caviar_clients.plots.style import common_prefix
+from caviar_clients.plots.style import common_prefix, saved_files
 from caviar_clients.plots.user_curves import (
     UserSeries,
     choose_user,
@@ -69,8 +69,8 @@ def plot_run(
             are fixed if there are any.
 
     Returns:
-        The files, in the order map, |y|, traffic, dispersion, LIDAR, camera. What was not recorded is not
-        drawn.
+        The files, in the order map, |y|, traffic, dispersion, LIDAR, camera; in `style.paper_style` those
+        for papers. What was not recorded is not drawn.
 
     Raises:
         RecordingError: It is not a recording, it holds nothing to draw, or frame, user or camera are not in
@@ -128,7 +128,7 @@ def plot_run(
         raise RecordingError(f"{run} holds no images of a camera; leave out --camera")
     if not files:
         raise RecordingError(f"{run} holds nothing to draw: neither scene, link, lidar nor camera")
-    return files
+    return [made for file in files for made in saved_files(file)]
 
 
 def beam_amplitude(array: AntennaArray, beam: int, directions: Float64Array) -> Float64Array:

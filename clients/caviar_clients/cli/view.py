@@ -9,6 +9,7 @@ import os
 import sys
 import webbrowser
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -88,6 +89,22 @@ def view(
 
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve_views(views, http, keys, announce))
+
+
+def view_in_foxglove(run: Path, port: int) -> None:
+    """Serve a run to Foxglove until it ends.
+
+    Args:
+        run: Directory of the run, which goes on.
+        port: To serve at; 0: any.
+
+    Raises:
+        CaviarError: No broker runs there, or the SDK of Foxglove is missing.
+    """
+    # By name: formats are made of what clients have, and none of these imports them.
+    serve = resolve_name("caviar_formats.live:serve_foxglove")
+    with contextlib.suppress(KeyboardInterrupt):
+        serve(run, port, lambda url: print_line(Console(), f"{url} shows {run} to Foxglove; Ctrl-C ends it"))
 
 
 def live_page(run: Path) -> str:

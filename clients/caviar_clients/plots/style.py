@@ -6,9 +6,11 @@ has hundreds.
 
 from __future__ import annotations
 
+import csv
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -50,6 +52,54 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
+_PAPER: dict[str, Any] = {
+    **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 8.0),
+    **dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 7.0),
+    "lines.linewidth": 1.0,
+    "axes.linewidth": 0.6,
+    "grid.linewidth": 0.4,
+    "pdf.fonttype": 42,  # TrueType: publishers refuse type 3
+    "svg.fonttype": "path",  # outlines, since SVG embeds no fonts
+    "svg.hashsalt": "caviar",
+    "savefig.dpi": 600,
+}
+COLUMNS_IN = {"1col": 3.5, "2col": 7.16}
+"""Widths of one and of two columns of IEEE's journals [inches], by what ends the names of their files."""
+DENSE = 2000
+"""Points above which a cloud is pixels in a figure for a paper: viewers draw vectors one by one."""
+_for_paper: ContextVar[bool] = ContextVar("for_paper", default=False)
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Save the figures of a block as `saved_files` names them: for papers, with what they draw as numbers."""
+    token = _for_paper.set(True)
+    try:
+        yield
+    finally:
+        _for_paper.reset(token)
+
+
+def saved_files(file: Path) -> list[Path]:
+    """List the files that `figure` makes.
+
+    Args:
+        file: PNG that it is asked for.
+
+    Returns:
+        This one; in `paper_style` PDF and SVG in the widths of `COLUMNS_IN`, without titles, and CSV.
+
+    Example:
+        >>> with paper_style():
+        ...     [file.name for file in saved_files(Path("map.png"))]
+        ['map-1col.pdf', 'map-1col.svg', 'map-2col.pdf', 'map-2col.svg', 'map.csv']
+    """
+    if not _for_paper.get():
+        return [file]
+    made = [file.with_name(f"{file.stem}-{name}.{kind}") for name in COLUMNS_IN for kind in ("pdf", "svg")]
+    return [*made, file.with_suffix(".csv")]
+
+
 @contextmanager
 def styled() -> Iterator[None]:
     """Apply the settings of all pictures within a block.
@@ -64,13 +114,13 @@ def styled() -> Iterator[None]:
         raise SetupError(
             f"pictures need {error.name!r}, which is not installed; run: {install_command('plot')}"
         ) from error
-    with rc_context(_SETTINGS):
+    with rc_context(_SETTINGS | (_PAPER if _for_paper.get() else {})):
         yield
 
 
 @contextmanager
 def figure(file: Path, width: float, height: float, layout: Layout = "constrained") -> Iterator[Any]:
-    """Make a figure that is saved as PNG, cut to what is drawn, when the block ends.
+    """Make a figure that is saved when the block ends: as PNG, cut to what is drawn, or as `saved_files`.
 
     Args:
         file: Where it is saved; folders that are missing are made.
@@ -97,7 +147,79 @@ def figure(file: Path, width: float, height: float, layout: Layout = "constraine
         drawn = Figure(figsize=(width, height), layout=layout)
         yield drawn
         with writing(file):
-            drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
+            if _for_paper.get():
+                _save_for_paper(drawn, file)
+            else:
+                drawn.savefig(file, format="png", bbox_inches="tight", pad_inches=0.15)
+
+
+def _save_for_paper(drawn: Any, file: Path) -> None:
+    from matplotlib.collections import Collection
+    from matplotlib.transforms import Bbox
+
+    with saved_files(file)[-1].open("w", newline="", encoding="utf-8") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(("panel", "kind", "label", "number", "x", "y", "value"))
+        rows.writerows(_drawn_points(drawn))
+    # Captions have what titles say.
+    drawn.suptitle("")
+    for axes in drawn.axes:
+        axes.set_title("")
+    for cloud in drawn.findobj(Collection):
+        cloud.set_rasterized(len(cloud.get_offsets()) > DENSE)
+    (width, height), columns = drawn.get_size_inches(), [legend._ncols for legend in drawn.legends]
+    engine = drawn.get_layout_engine()
+    for name, wide in COLUMNS_IN.items():
+        # Texts are as large in both widths: a narrow figure is higher for them.
+        drawn.set_size_inches(wide, height * wide / width * (1.0 if wide > 5 else 1.4))
+        for legend, most in zip(drawn.legends[:], columns, strict=True):
+            handles, labels = legend.legend_handles, [text.get_text() for text in legend.get_texts()]
+            # A character of 7 points is about 3.6 points wide; handle and margins take those of 8.
+            fitting = max(1, int(72 * wide / 3.6 / (max(map(len, labels)) + 8)))
+            legend.remove()
+            drawn.legend(handles, labels, loc="outside lower center", ncols=min(most, fitting))
+        drawn.set_layout_engine(engine)
+        drawn.draw_without_rendering()
+        drawn.set_layout_engine("none")  # the layout stays: it takes longer than all else
+        low, high = drawn.get_tightbbox().intervaly
+        cut = Bbox.from_extents(0, low - 0.03, wide, high + 0.03)
+        for kind, date in (("pdf", "CreationDate"), ("svg", "Date")):
+            picture = file.with_name(f"{file.stem}-{name}.{kind}")
+            drawn.savefig(picture, metadata={date: None}, bbox_inches=cut)
+
+
+def _drawn_points(drawn: Any) -> Iterator[tuple[str | int | float, ...]]:
+    """Rows of what a figure draws, in the units of its axes: lines, points, areas, cells; no pictures."""
+    from matplotlib.collections import LineCollection, QuadMesh
+
+    for axes in drawn.axes:
+        panel = (axes.get_title() or axes.get_ylabel()).replace("\n", " ")
+        shown: list[tuple[str, Any, Any, Any]] = [
+            ("line", line, line.get_xydata(), None)
+            for line in axes.lines
+            if line.get_transform() == axes.transData
+        ]
+        for made in axes.collections:
+            values = None if made.get_array() is None else np.ravel(made.get_array())
+            if isinstance(made, QuadMesh):
+                corners: Any = made.get_coordinates()
+                centres = (corners[:-1, :-1] + corners[1:, 1:]) / 2
+                shown.append(("cells", made, centres.reshape(-1, 2), values))
+            elif made.get_offset_transform() == axes.transData:
+                shown.append(("points", made, made.get_offsets(), values))
+            else:
+                kind = "line" if isinstance(made, LineCollection) else "area"
+                parts = [path.vertices for path in made.get_paths()]
+                shown += [
+                    (kind, made, part, None if values is None else np.full(len(part), values[n]))
+                    for n, part in enumerate(parts)
+                ]
+        for number, (kind, made, points, values) in enumerate(shown):
+            label = "" if str(made.get_label()).startswith("_") else made.get_label()
+            table = np.ma.filled(np.ma.asarray(points, dtype=float), np.nan).tolist()
+            for at, (x, y) in enumerate(table):
+                value = "" if values is None else float(np.ma.filled(values, np.nan)[at])
+                yield panel, kind, label, number, x, y, value
 
 
 def legend_below(drawn: Any, axes: Any, columns: int = 3) -> None:
@@ -148,7 +270,7 @@ class Labels:
         sides: Side of each name in the frame before: above, below, right, left.
     """
 
-    width: float = 570.0
+    width: float = field(default_factory=lambda: 210.0 if _for_paper.get() else 570.0)
     prefix: str | None = None
     marked: str = ""
     sides: dict[str, int] = field(default_factory=dict)

@@ -442,9 +442,9 @@ export class App {
     };
   }
 
-  /** Where a place in the world [m] is in the page [px]. */
-  screen(position: Vector): [number, number] | null {
-    return this.stage.screen(position);
+  /** Where a place in the world [m] is in the window [px]. */
+  project(place: Vector): [number, number] {
+    return this.stage.project(place);
   }
 
   /** State of the page, for tests and for people at the console. */

@@ -4,7 +4,7 @@ import { el } from "./dom";
 import { RequestError, Source, takeToken } from "./source";
 import { askToken } from "./panels/token";
 import { fromFragment, Store } from "./state";
-import type { About, Vector } from "./types";
+import type { About } from "./types";
 
 declare global {
   interface Window {
@@ -13,10 +13,10 @@ declare global {
       state(): ReturnType<App["state"]>;
       /** Resolves when the newest frame is drawn. */
       readonly ready: Promise<void>;
+      /** Where a place in the world [m] is in the window [px]. */
+      project: App["project"];
       /** Show a place, and draw it: for videos. */
       go(n: number): Promise<void>;
-      /** Where a place in the world [m] is in the page [px]; null: behind the camera. */
-      screen(position: Vector): [number, number] | null;
     };
   }
 }
@@ -45,9 +45,9 @@ async function whenBegun(source: Source): Promise<About> {
       note.remove();
       return about;
     } catch (error) {
-      if (!(error instanceof RequestError && [409, 503].includes(error.status))) throw error;
+      if (!(error instanceof RequestError && error.status === 503)) throw error;
       note.textContent = `${error.reason} …`;
-      await new Promise((resolve) => setTimeout(resolve, 2000));
+      await new Promise((resolve) => setTimeout(resolve, 500));
     }
   }
 }
@@ -60,7 +60,7 @@ const loaded = () => {
 };
 window.caviar = {
   state: () => loaded().state(),
-  screen: (position) => loaded().screen(position),
+  project: (place) => loaded().project(place),
   get ready() {
     return begun.then(async (started) => {
       await started.ready;

@@ -98,17 +98,6 @@ export class Stage {
     return { position: world(this.camera.position), target: world(this.controls.target) };
   }
 
-  /** Where a place in the world [m] is in the page [px], in the first view; null: behind the camera. */
-  screen(position: Vector): [number, number] | null {
-    const place = new Vector3(...(position.map((value, i) => value - this.origin[i]) as Vector));
-    this.camera.updateMatrixWorld();
-    place.project(this.camera);
-    if (place.z > 1) return null;
-    const { left, top, width, height } = this.canvas.getBoundingClientRect();
-    const each = width / Math.max(1, this.views.length);
-    return [left + ((place.x + 1) / 2) * each, top + ((1 - place.y) / 2) * height];
-  }
-
   /** Move the camera [m, world]. */
   setPlace({ position, target }: { position: Vector; target: Vector }): void {
     this.camera.position.set(...(position.map((value, i) => value - this.origin[i]) as Vector));
@@ -218,6 +207,13 @@ export class Stage {
     if (this.views.length === 1) this.camera.setViewOffset(width, height, -this.covered / 2, 0, width, height);
     else this.camera.clearViewOffset();
     this.camera.updateProjectionMatrix();
+  }
+
+  /** Where a place in the world [m] is in the window [px]. */
+  project(place: Vector): [number, number] {
+    const at = new Vector3(...(place.map((value, i) => value - this.origin[i]) as Vector)).project(this.camera);
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
+    return [left + ((at.x + 1) / 2) * width, top + ((1 - at.y) / 2) * height];
   }
 
   /** A press that does not move is a click; the rest moves the camera. */
