@@ -133,7 +133,7 @@ export class CurvesPanel {
       key.style.borderColor = color;
       return key;
     });
-    return el("section", { class: "chart" }, el("div", { class: "head" }, el("h3", {}, title, " ", text), el("span", {}, ...keys)), drawing);
+    return el("section", { class: "chart" }, el("div", { class: "head" }, el("h2", {}, title, " ", text), el("span", {}, ...keys)), drawing);
   }
 
   /** Lines that break where there is no value, and between episodes. */
