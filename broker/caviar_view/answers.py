@@ -298,7 +298,8 @@ class Answers:
     def _clock(self, query: Mapping[str, str]) -> dict[str, Any]:
         first = _number(query, "first", self.frames.first, self.frames.first)
         count = _number(query, "count", 60, 1)
-        places = range(first, min(first + min(count, 1000), self.frames.end))
+        every = _number(query, "every", 1, 1)
+        places = range(first, min(first + min(count, 1000) * every, self.frames.end), every)
         services: Mapping[str, Any] = self.frames.scenario.get("services") or {}
         answered = {
             name: {(episode, frame): (at, took) for episode, frame, at, took in table}
