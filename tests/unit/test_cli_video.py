@@ -329,9 +329,9 @@ def test_a_path_of_unknown_route_is_two_ticks_in_its_directions_and_no_line():
     np.testing.assert_allclose(np.sort(found.tick_gains), np.sort(np.repeat(10 * np.log10(power), 2)))
     for path in range(4):
         tick = int(np.argmin(np.abs(found.tick_gains - 10 * np.log10(power[path]))))
-        np.testing.assert_allclose(found.ends[tick], [0.0, 20.0])
+        np.testing.assert_allclose(found.ends[tick, :2], [0.0, 20.0])
         np.testing.assert_allclose(
-            found.towards[tick : tick + 2], unit_vectors(np.stack([aod[path], aoa[path]]))[:, :2]
+            found.towards[tick : tick + 2], unit_vectors(np.stack([aod[path], aoa[path]]))
         )
     np.testing.assert_allclose(found.ticks(3.0)[:, 1] - found.ticks(3.0)[:, 0], 3.0 * found.towards)
 
