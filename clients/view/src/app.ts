@@ -280,6 +280,7 @@ export class App {
       names: { objects: [...view.objects.shown.keys()], devices: [...view.devices.shown.keys()] },
       range: view.rays.range,
       drawn: view.rays.drawn.length,
+      ticks: view.rays.drawn.filter(({ known }) => !known).length,
       paths: view.rays.paths.length,
       of: channel?.kept.paths?.[1] ?? view.rays.paths.length,
       points: view.points.count ? (points ?? [view.points.count, view.points.count]) : null,
