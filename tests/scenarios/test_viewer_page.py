@@ -15,6 +15,7 @@ import urllib.request
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from node_project import node_project
 from scenarios_support import caviar, started
 
 import caviar as package
+from caviar_clients.cli.page import FLAGS
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Channel, Lidar, Link
 
@@ -38,8 +40,6 @@ pytestmark = [
 SIZE = (1280, 720)
 ORANGE, SKY = (230, 159, 0), (86, 180, 233)
 """Colours of objects with and without a device (Okabe and Ito, 2008)."""
-# Without these flags Chromium asks the hosts of its vendor at every start.
-FLAGS = ["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
 
 
 @pytest.fixture(scope="module")
@@ -299,6 +299,33 @@ def test_it_is_accessible(opened: Callable[..., Page], tmp_path_factory: pytest.
         found = page.raw.evaluate("axe.run()")["violations"]
         serious = [rule["id"] for rule in found if rule["impact"] in ("serious", "critical")]
         assert serious == [], [node["html"] for rule in found for node in rule["nodes"]]
+
+
+def test_pictures_and_films_of_the_page(opened: Callable[..., Page], recorded: Path, tmp_path: Path) -> None:
+    link = "#n=5&quality=fine&panel=0&layers=buildings,terrain,objects,rays"
+    file, film = tmp_path / "page.png", tmp_path / "page.gif"
+    assert (
+        caviar("view", recorded, "--picture", file, "--link", f"http://any/view/{link}").output == f"{file}\n"
+    )
+    page = opened(link)
+    page.until("s.shown.paths > 0")
+    drawn, shown = (
+        np.asarray(PIL.open(picture).convert("RGB"), int)
+        for picture in (file, io.BytesIO(page.raw.screenshot()))
+    )
+    assert np.abs(drawn - shown).mean() < 2
+    words = ("plot", "video", recorded, "--link", link, "--frames", "2:5", "--width", "640", "--out", film)
+    done = caviar(*words)
+    assert "3 frames of 640×360" in done.output
+    with PIL.open(film) as animation:
+        assert animation.n_frames == 3
+        pictures = []
+        for number in range(3):
+            animation.seek(number)
+            pictures.append(np.asarray(animation.convert("RGB"), int))
+    assert all((a != b).any() for a, b in pairwise(pictures))
+    assert all((np.abs(picture - ORANGE).max(-1) <= 40).sum() > 50 for picture in pictures)
+    assert caviar(*words, "--user", "bs").status != 0
 
 
 HOSTILE = "<script>window.hacked = 1;<img src=x onerror='window.hacked = 2'>"

@@ -145,6 +145,17 @@ def test_without_ffmpeg_the_default_is_a_gif_in_the_run_directory(tmp_path, monk
         film_run(run, tmp_path / "x.mp4")
 
 
+def test_without_a_browser_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("playwright")
+    run = record(tmp_path / "run", 2)
+    monkeypatch.setattr(film.shutil, "which", lambda _: str(tmp_path / "none"))
+    with pytest.raises(SetupError, match="apt-get install chromium"):
+        film_run(run, tmp_path / "x.gif", link="#n=1")
+    monkeypatch.setitem(sys.modules, "playwright.sync_api", None)
+    with pytest.raises(SetupError, match=r"Playwright.*caviar-sim\[film\]"):
+        film_run(run, tmp_path / "x.gif", link="#n=1")
+
+
 def fake_ffmpeg(folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """An ``ffmpeg`` first on the path that knows one encoder and otherwise runs ``program``."""
     folder.mkdir()
