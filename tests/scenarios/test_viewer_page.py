@@ -256,6 +256,11 @@ def test_a_saved_page_needs_no_server(browser: Any, recorded: Path, tmp_path: Pa
     finished = caviar("view", recorded, "--save", file, "--limit", "4")
     assert finished.status == 0, finished.output
     assert file.stat().st_size <= 4e6
+    for wrong in (tmp_path, tmp_path / "nowhere" / "page.html"):
+        refused = caviar("view", recorded, "--save", wrong)
+        assert refused.status == 1
+        assert str(wrong) in refused.output
+        assert "Traceback" not in refused.output
     page = Page(browser, file.as_uri())
     page.until("s.shown.paths > 0")
     page.press("End")
