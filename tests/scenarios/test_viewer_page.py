@@ -188,7 +188,7 @@ def test_it_is_steered_by_mouse_keyboard_and_link(opened: Callable[..., Page]) -
     page.until("s.n === 3")
     page.raw.mouse.move(640, 300)
     page.raw.mouse.wheel(0, 240)
-    page.holds("location.hash.includes('cam')")
+    page.holds("location.hash.includes('cam') && location.hash.includes('n=3')")
     link, state = page.raw.evaluate("location.href"), page.state
     again = opened(url=link)
     assert (again.state["n"], again.state["selected"]) == (3, nearest)
