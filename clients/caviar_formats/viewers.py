@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,10 @@ from caviar_clients.datasets.user_rows import Users
 from caviar_clients.plots.rays import RANGE_DB, rays
 from caviar_clients.plots.style import SKY, VERMILION
 from caviar_formats.base import Format, Part
-from caviar_protocol.arrays import Float64Array, Payload
+from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
+from caviar_protocol.recording import RecordedFrame
 from caviar_protocol.space.coordinates import Pose, compose, unit_vectors
 from caviar_protocol.space.scene import device_pose, object_pose
 from caviar_protocol.topics import (
@@ -37,14 +38,12 @@ from caviar_protocol.topics import (
     Depth,
     Lidar,
     Link,
-    Scene,
 )
 from caviar_protocol.topics.sensors import CameraImage, DepthImage, LidarScan
 from caviar_space.meshes import Mesh, joined, placed
 from caviar_view.answers import SERIES
 from caviar_view.world import World
 
-P = TypeVar("P", bound=Payload)
 WORLD = "world"
 """Frame of reference whose axes are those of the world."""
 LOBE_M, TICK_M = 10.0, 3.0
@@ -78,23 +77,7 @@ class Moment:
     images: list[CameraImage | DepthImage]
 
 
-class ShownFrame(Protocol):
-    """A frame of a recording or of an observer."""
-
-    t_ns: int
-
-    @property
-    def products(self) -> Sequence[Any]:
-        """Products that are not absent, each with its ``provenance`` and ``payload``."""
-
-    def payloads(self, topic: str, cls: type[P]) -> dict[str, P]:
-        """Payloads of a topic by source."""
-
-    def scene(self) -> Scene | None:
-        """The scenes of all worlds as one."""
-
-
-def moment(frame: ShownFrame) -> Moment:
+def moment(frame: RecordedFrame) -> Moment:
     """Collect what viewers show of a frame.
 
     Args:
