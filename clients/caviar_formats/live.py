@@ -13,7 +13,8 @@ import msgspec
 from caviar_broker.control.socket import ask
 from caviar_broker.http.process import gateway_credentials, reachable
 from caviar_broker.security.access import PAGE
-from caviar_formats.viewers import FoxgloveMessages, moment
+from caviar_formats.foxglove import FoxgloveMessages
+from caviar_formats.viewers import moment
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import SetupError
 from caviar_protocol.fields import Asset
