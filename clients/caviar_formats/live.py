@@ -72,7 +72,7 @@ def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> Non
     Args:
         run: Directory of the run.
         port: To serve at; 0: any.
-        announce: Called with the address that Foxglove opens.
+        announce: Called with the address that Foxglove opens, once there is a frame.
 
     Raises:
         RunError: No broker runs there, or it refuses the observer.
@@ -92,9 +92,8 @@ def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> Non
         )
     except (OSError, RuntimeError) as error:
         raise SetupError(f"--foxglove {port}: {error}; choose another port, or 0 for any") from error
-    messages = FoxgloveMessages(context)
+    messages, is_announced = FoxgloveMessages(context), False
     try:
-        announce(f"ws://127.0.0.1:{server.port}")
         name = PAGE if credentials is not None else "Foxglove"
         endpoint = reachable(status["endpoint"])
         with Observer(endpoint, name, credentials=credentials, period_s=PERIOD_S) as observer:
@@ -106,6 +105,9 @@ def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> Non
                     guests.has_come = False
                     messages.scenery(world)
                 messages.add(moment(ObservedFrame(seen)))
+                if not is_announced:  # with its topics: the SDK refuses who subscribes to one as it appears
+                    is_announced = True
+                    announce(f"ws://127.0.0.1:{server.port}")
     finally:
         server.stop()
 
