@@ -298,8 +298,11 @@ class Answers:
     def _clock(self, query: Mapping[str, str]) -> dict[str, Any]:
         first = _number(query, "first", self.frames.first, self.frames.first)
         count = _number(query, "count", 60, 1)
-        places = range(first, min(first + min(count, 1000), self.frames.end))
+        every = _number(query, "every", 1, 1)
+        places = range(first, min(first + min(count, 1000) * every, self.frames.end), every)
         services: Mapping[str, Any] = self.frames.scenario.get("services") or {}
+        span = range(first, min(first + len(places) * every, self.frames.end))
+        shown = {(e.episode, e.frame): n for n in span for e in [self.frames.entry(n)]}
         answered = {
             name: {(episode, frame): (at, took) for episode, frame, at, took in table}
             for name in services
@@ -308,6 +311,11 @@ class Answers:
         return {
             "services": [_service(name, spec) for name, spec in services.items()],
             "frames": [_lanes(place, self.frames.entry(place), services, answered) for place in places],
+            "events": [
+                {"n": shown[event["episode"], event["frame"]], "text": event["text"]}
+                for event in self.frames.events()
+                if (event["episode"], event["frame"]) in shown
+            ],
         }
 
 

@@ -26,6 +26,9 @@ _DETAILS = (
 )
 _SAMPLE = 5
 _LOBES = 100
+_LANES = 40
+"""Frames of the clock that a page shows at once (clients/view/src/panels/clock.ts)."""
+_LANE_BYTES = 300
 _LOBE_BYTES = 12_000
 FRAMES_FIRST = 200
 """Frames below which a page is rather saved with fewer points than with fewer frames."""
@@ -54,6 +57,9 @@ def saved_page(answers: Answers, limit: int, progress: Progress = lambda done, o
     room = limit - len(page) - sum(map(len, kept.values())) - _LOBES * _LOBE_BYTES
     first, end = answers.frames.first, answers.frames.end
     detail, every = _fitting(answers, room, first, end)
+    for place in range(first, end, _LANES * every):
+        query = {"first": str(place), "count": str(_LANES), "every": str(every)}
+        kept[f"clock/{place}"] = _packed(answers.get("clock", query))
     places, lobes = range(first, end, every), 0
     for done, place in enumerate(places, 1):
         kept |= _frame(answers, place, detail)
@@ -78,7 +84,8 @@ def _fitting(answers: Answers, room: int, first: int, end: int) -> tuple[dict[st
     chosen: tuple[dict[str, str], int] | None = None
     sample = sorted({first + i * (end - first) // _SAMPLE for i in range(_SAMPLE)})
     for detail in _DETAILS:
-        sizes = [sum(len(k) + len(v) + 8 for k, v in _frame(answers, n, detail).items()) for n in sample]
+        frames = [_frame(answers, place, detail).items() for place in sample]
+        sizes = [_LANE_BYTES + sum(len(name) + len(text) + 8 for name, text in frame) for frame in frames]
         count = int(room / (1.15 * max(max(sizes), 1)))
         if count < 1:
             continue

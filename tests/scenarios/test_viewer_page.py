@@ -10,10 +10,12 @@ import shutil
 import signal
 import subprocess
 import time
+import urllib.error
 import urllib.request
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from node_project import node_project
 from scenarios_support import caviar, started
 
 import caviar as package
+from caviar_clients.cli.page import FLAGS
 from caviar_protocol.recording import Recording
 from caviar_protocol.topics import Channel, Lidar, Link
 
@@ -37,8 +40,6 @@ pytestmark = [
 SIZE = (1280, 720)
 ORANGE, SKY = (230, 159, 0), (86, 180, 233)
 """Colours of objects with and without a device (Okabe and Ito, 2008)."""
-# Without these flags Chromium asks the hosts of its vendor at every start.
-FLAGS = ["--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +188,7 @@ def test_it_is_steered_by_mouse_keyboard_and_link(opened: Callable[..., Page]) -
     page.until("s.n === 3")
     page.raw.mouse.move(640, 300)
     page.raw.mouse.wheel(0, 240)
-    page.holds("location.hash.includes('cam')")
+    page.holds("location.hash.includes('cam') && location.hash.includes('n=3')")
     link, state = page.raw.evaluate("location.href"), page.state
     again = opened(url=link)
     assert (again.state["n"], again.state["selected"]) == (3, nearest)
@@ -300,6 +301,33 @@ def test_it_is_accessible(opened: Callable[..., Page], tmp_path_factory: pytest.
         assert serious == [], [node["html"] for rule in found for node in rule["nodes"]]
 
 
+def test_pictures_and_films_of_the_page(opened: Callable[..., Page], recorded: Path, tmp_path: Path) -> None:
+    link = "#n=5&quality=fine&panel=0&layers=buildings,terrain,objects,rays"
+    file, film = tmp_path / "page.png", tmp_path / "page.gif"
+    assert (
+        caviar("view", recorded, "--picture", file, "--link", f"http://any/view/{link}").output == f"{file}\n"
+    )
+    page = opened(link)
+    page.until("s.shown.paths > 0")
+    drawn, shown = (
+        np.asarray(PIL.open(picture).convert("RGB"), int)
+        for picture in (file, io.BytesIO(page.raw.screenshot()))
+    )
+    assert np.abs(drawn - shown).mean() < 2
+    words = ("plot", "video", recorded, "--link", link, "--frames", "2:5", "--width", "640", "--out", film)
+    done = caviar(*words)
+    assert "3 frames of 640×360" in done.output
+    with PIL.open(film) as animation:
+        assert animation.n_frames == 3
+        pictures = []
+        for number in range(3):
+            animation.seek(number)
+            pictures.append(np.asarray(animation.convert("RGB"), int))
+    assert all((a != b).any() for a, b in pairwise(pictures))
+    assert all((np.abs(picture - ORANGE).max(-1) <= 40).sum() > 50 for picture in pictures)
+    assert caviar(*words, "--user", "bs").status != 0
+
+
 HOSTILE = "<script>window.hacked = 1;<img src=x onerror='window.hacked = 2'>"
 
 
@@ -342,6 +370,37 @@ def test_a_damaged_product_is_said_and_not_shown(browser: Any, recorded: Path, t
         page.press("ArrowRight")
         page.until("s.n === 5 && s.shown.points > 0")
         page.raw.close()
+
+
+def status_of(url: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:  # noqa: S310
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_guests_are_turned_away(address: str, recorded: Path, tmp_path: Path) -> None:
+    assert status_of(f"{address}data/about") == 200
+    assert status_of(f"{address}data/about", Origin="http://evil.example") == 403
+    assert status_of(f"{address}data/about", Host="evil.example") == 403
+    for path in (
+        "../../etc/passwd",
+        "data/../../x",
+        "data/meshes/..%2f..%2fx",
+        "data/frames/99",
+        "secret.js",
+    ):
+        assert status_of(address + path) == 404, path
+    keys = tmp_path / "keys"
+    made = caviar("keys", "token", "ana", "--role", "viewer", "--directory", keys)
+    token = re.search(r"\S{30,}", made.output)
+    assert token, made.output
+    with served(recorded, "--keys", keys) as url:
+        assert status_of(url) == 200  # the page itself, which asks for a token
+        assert status_of(f"{url}data/about") == 401
+        assert status_of(f"{url}data/about", Authorization="Bearer of-another-run") == 401
+        assert status_of(f"{url}data/about", Authorization=f"Bearer {token[0]}") == 200
 
 
 def test_the_bundle_is_built_of_its_sources(repository: Path, tmp_path: Path) -> None:

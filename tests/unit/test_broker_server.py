@@ -80,6 +80,8 @@ def test_latencies_are_kept_for_every_frame_and_service(tmp_path: Path) -> None:
             "finished_ns",
             "latency_ns/world",
             "latency_ns/sensors",
+            "answers/world",
+            "answers/sensors",
             "decision_lateness_ns",
         }
         assert len(figures["decision_lateness_ns"]) == 0

@@ -145,6 +145,17 @@ def test_without_ffmpeg_the_default_is_a_gif_in_the_run_directory(tmp_path, monk
         film_run(run, tmp_path / "x.mp4")
 
 
+def test_without_a_browser_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("playwright")
+    run = record(tmp_path / "run", 2)
+    monkeypatch.setattr(film.shutil, "which", lambda _: str(tmp_path / "none"))
+    with pytest.raises(SetupError, match="apt-get install chromium"):
+        film_run(run, tmp_path / "x.gif", link="#n=1")
+    monkeypatch.setitem(sys.modules, "playwright.sync_api", None)
+    with pytest.raises(SetupError, match=r"Playwright.*caviar-sim\[film\]"):
+        film_run(run, tmp_path / "x.gif", link="#n=1")
+
+
 def fake_ffmpeg(folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """An ``ffmpeg`` first on the path that knows one encoder and otherwise runs ``program``."""
     folder.mkdir()
@@ -318,9 +329,9 @@ def test_a_path_of_unknown_route_is_two_ticks_in_its_directions_and_no_line():
     np.testing.assert_allclose(np.sort(found.tick_gains), np.sort(np.repeat(10 * np.log10(power), 2)))
     for path in range(4):
         tick = int(np.argmin(np.abs(found.tick_gains - 10 * np.log10(power[path]))))
-        np.testing.assert_allclose(found.ends[tick], [0.0, 20.0])
+        np.testing.assert_allclose(found.ends[tick, :2], [0.0, 20.0])
         np.testing.assert_allclose(
-            found.towards[tick : tick + 2], unit_vectors(np.stack([aod[path], aoa[path]]))[:, :2]
+            found.towards[tick : tick + 2], unit_vectors(np.stack([aod[path], aoa[path]]))
         )
     np.testing.assert_allclose(found.ticks(3.0)[:, 1] - found.ticks(3.0)[:, 0], 3.0 * found.towards)
 

@@ -34,8 +34,8 @@ from caviar_clients.cli.shared import (
     ScenarioOrRun,
     Seed,
     Set,
+    Shown,
     SummaryFile,
-    complete_scenario,
     keys_set,
 )
 from caviar_protocol.errors import CaviarError, RunError
@@ -141,14 +141,7 @@ def run(
 
 @app.command(rich_help_panel=LOOK)
 def view(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="directory of a run, dataset, or scenario by name or file",
-            show_default=False,
-            autocompletion=complete_scenario,
-        ),
-    ],
+    source: Shown,
     beside: Annotated[
         Path | None, typer.Option(help="a second run, at the same time and from the same place")
     ] = None,
@@ -159,6 +152,13 @@ def view(
         float,
         typer.Option(min=0.5, help="MB of that file: fewer frames, points and pixels where it needs them"),
     ] = 25.0,
+    picture: Annotated[
+        Path | None, typer.Option(help="write one PNG of the page, by a Chromium without a window")
+    ] = None,
+    link: Annotated[
+        str, typer.Option(help="link to the page, or its part from # on, that says what is seen")
+    ] = "",
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="of the picture [pixels]")] = "1280x720",
     episode: Annotated[int | None, typer.Option(min=0, help="of a dataset; default: its first")] = None,
     http: Annotated[str, typer.Option(help="HOST:PORT to serve at; port 0: any free one")] = "127.0.0.1:0",
     keys: Keys = None,
@@ -173,8 +173,11 @@ def view(
 
     if foxglove is not None:
         viewer.view_in_foxglove(source, foxglove)
-        return
-    viewer.view(source, beside, http, keys, save, limit, episode, browser)
+    elif picture is not None:
+        viewer.take_picture(source, picture, link, size, episode)
+        typer.echo(picture)
+    else:
+        viewer.view(source, beside, http, keys, save, limit, episode, browser)
 
 
 @app.command(rich_help_panel=RUN)
@@ -391,11 +394,15 @@ def video(
     camera: Annotated[str | None, typer.Option(help="camera whose pictures are shown")] = None,
     width: Annotated[int | None, typer.Option(help="pixels, even; by default 1280, of a GIF 960")] = None,
     user: Annotated[str | None, typer.Option(help="receiver whose |y| and beam are shown")] = None,
+    link: Annotated[
+        str | None,
+        typer.Option(help="film the page of caviar view as this link to it shows it, such as '#panel=0'"),
+    ] = None,
 ) -> None:
-    """Make a video of a run: the map with rays and beam, |y| over time, and what a camera saw."""
+    """Make a video of a run: map with rays and beam, |y| over time, a camera; or the page of caviar view."""
     from caviar_clients.cli.plot import film_run
 
-    film = film_run(run, out, fps, frames, camera, width, user, _errors)
+    film = film_run(run, out, fps, frames, camera, width, user, _errors, link)
     pace = f"{film.fps:g} frames/s, {film.speed:.3g} times real time"
     typer.echo(f"{film.file}: {film.frames} frames of {film.size[0]}×{film.size[1]}, {pace}")
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
+from caviar_clients.cli.page import opened_page
 from caviar_clients.cli.shared import progress_bar
 from caviar_clients.files import file_in, make_folder_of, require_folder
 from caviar_clients.plots.film import GIF_FPS, WRITERS, Reel, find_ffmpeg, needed_ffmpeg
@@ -43,6 +46,8 @@ from caviar_protocol.space.scene import antennas
 from caviar_protocol.topics import AntennaArray, Camera, Channel, Depth, Lidar, Link, Segmentation
 from caviar_services.channel.propagation.patterns import element_amplitude
 from caviar_space.mitsuba_xml import find_scenery, read_scenery
+from caviar_view.answers import Answers
+from caviar_view.frames import RecordedFrames
 
 
 def plot_run(
@@ -375,8 +380,9 @@ def film_run(
     width: int | None = None,
     user: str | None = None,
     console: Console | None = None,
+    link: str | None = None,
 ) -> Film:
-    """Make a video of a recording: the map, |y| of one user, and what a camera saw.
+    """Make a video of a recording: the map, |y| of one user, and what a camera saw; or the viewer's page.
 
     Args:
         run: Run directory or segment.
@@ -390,43 +396,64 @@ def film_run(
         width: Pixels, even; by default 1280, and 960 of a GIF.
         user: Receiver, or its object, for |y| and the beam; by default the one that was there longest.
         console: Where progress is shown; by default nowhere.
+        link: To the page of ``caviar view``, or its part from ``#`` on: the page is shown, 16:9, as the link
+            has it, without ``n``; None: the map is.
 
     Raises:
         RecordingError: It is not a recording, or frames, camera or user are not in it.
-        SetupError: Matplotlib or ffmpeg is missing, or format, speed and width do not go together.
+        SetupError: Matplotlib, ffmpeg or a browser is missing, or format, speed and width do not go together.
         RunError: The file cannot be written; there is none then, not even half of one.
     """
     recording = Recording(run)
     file = out or recording.directory / ("video.mp4" if find_ffmpeg() else "video.gif")
     suffix = file.suffix.lower()
     rate, pixels = _format(file, suffix, fps, width, recording.metadata.sampling_period_ns)
-    chosen = choose_user(recording, user or "") if "link" in recording.topics else None
-    plan, indices = _survey(recording, _indices(recording, frames), chosen, camera)
-    make_folder_of(file)
-    # Frames pass one by one, twice: limits and scales of the first pass hold in all pictures of the second.
-    moving = MovingMap(plan, pixels)
+    indices = _indices(recording, frames)
+    size = pixels, pixels * 9 // 32 * 2
+    pictures: Callable[[Iterable[int]], Iterator[UInt8Array]]
+    with ExitStack() as stack:
+        if link is None:
+            chosen = choose_user(recording, user or "") if "link" in recording.topics else None
+            plan, indices = _survey(recording, indices, chosen, camera)
+            # Frames pass one by one, twice: limits and scales of the first pass hold in all of the second.
+            moving = MovingMap(plan, pixels)
+            size = moving.size
 
-    def pictures(steps: Iterable[int]) -> Iterator[UInt8Array]:
-        # Cameras may see every n-th frame: between two pictures the earlier one stands.
-        last = None
-        for step in steps:
-            frame = RecordedFrame(recording, indices[step])
-            data = map_data(recording, frame, chosen, None)
-            if plan.camera is not None:
-                last = _seen(frame).get(plan.camera, last)
-            if data is not None:
-                yield moving.draw(data, step, last)
+            def pictures(steps: Iterable[int]) -> Iterator[UInt8Array]:
+                # Cameras may see every n-th frame: between two pictures the earlier one stands.
+                last = None
+                for step in steps:
+                    frame = RecordedFrame(recording, indices[step])
+                    data = map_data(recording, frame, chosen, None)
+                    if plan.camera is not None:
+                        last = _seen(frame).get(plan.camera, last)
+                    if data is not None:
+                        yield moving.draw(data, step, last)
+        elif user is not None or camera is not None:
+            raise SetupError("user and cameras of the page are in its link; leave out --user and --camera")
+        else:
+            draw = stack.enter_context(opened_page(Answers(RecordedFrames(recording)), link, size))
 
-    count = len(indices)
-    spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
-    samples = list(pictures(spread)) if suffix == ".gif" else []
-    samples = samples or list(pictures(spread[:1]))
-    columns = (MofNCompleteColumn(), TimeRemainingColumn())
-    with progress_bar(console or Console(quiet=True), *columns) as bar:
-        drawn = iter(bar.track(pictures(range(count)), total=count, description="drawing"))
-        WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
+            def pictures(steps: Iterable[int]) -> Iterator[UInt8Array]:
+                return (_pixels(draw(indices[step])) for step in steps)
+
+        make_folder_of(file)
+        count = len(indices)
+        spread = sorted({round(i) for i in np.linspace(0, count - 1, min(_SAMPLES, count))})
+        samples = list(pictures(spread)) if suffix == ".gif" else []
+        samples = samples or list(pictures(spread[:1]))
+        columns = (MofNCompleteColumn(), TimeRemainingColumn())
+        with progress_bar(console or Console(quiet=True), *columns) as bar:
+            drawn = iter(bar.track(pictures(range(count)), total=count, description="drawing"))
+            WRITERS[suffix](Reel(drawn, count, rate, samples, key_colours()), file)
     speed = rate * recording.metadata.sampling_period_ns * 1e-9
-    return Film(file, count, rate, speed, moving.size)
+    return Film(file, count, rate, speed, size)
+
+
+def _pixels(png: bytes) -> UInt8Array:
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
 
 def _format(

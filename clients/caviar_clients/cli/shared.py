@@ -91,6 +91,15 @@ RunDirectory = Annotated[
         default_factory=_newest_run,
     ),
 ]
+Shown = Annotated[
+    Path,
+    typer.Argument(
+        help="directory of a run, dataset, or scenario by name or file",
+        show_default="the newest run in ./runs",
+        default_factory=_newest_run,
+        autocompletion=complete_scenario,
+    ),
+]
 Frames = Annotated[int | None, typer.Option(min=1, help="frames of an episode, instead of the scenario's")]
 Seed = Annotated[int | None, typer.Option(min=0, max=2**63 - 1, help="seed, instead of the scenario's")]
 Pace = Annotated[

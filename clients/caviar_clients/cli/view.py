@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import sys
 import webbrowser
 from pathlib import Path
@@ -16,6 +17,7 @@ import msgspec
 from rich.console import Console
 
 from caviar_clients.cli.shared import print_line, progress_bar
+from caviar_clients.files import writing
 from caviar_protocol.errors import CaviarError, RecordingError, SetupError
 from caviar_protocol.files import read_regular
 from caviar_protocol.run_directory import RunDirectory, runs_below
@@ -105,6 +107,31 @@ def view_in_foxglove(run: Path, port: int) -> None:
     serve = resolve_name("caviar_formats.live:serve_foxglove")
     with contextlib.suppress(KeyboardInterrupt):
         serve(run, port, lambda url: print_line(Console(), f"{url} shows {run} to Foxglove; Ctrl-C ends it"))
+
+
+def take_picture(source: Path, file: Path, link: str, size: str, episode: int | None) -> None:
+    """Write a picture of the page, with shadows and smooth edges unless the link has ``quality=plain``.
+
+    Args:
+        source: As of `view`, and no run that goes on.
+        file: PNG.
+        link: To the page, or its part from ``#`` on.
+        size: ``WIDTHxHEIGHT`` [pixels].
+        episode: As of `view`.
+
+    Raises:
+        CaviarError: There is no such picture; the text says why.
+    """
+    from caviar_clients.cli.page import fragment, opened_page
+    from caviar_view.answers import Answers
+
+    found = re.fullmatch(r"(\d{3,4})x(\d{3,4})", size)
+    if found is None:
+        raise SetupError(f"--size is {size!r}; write WIDTHxHEIGHT in pixels, each from 100 to 9999")
+    answers = Answers(_frames(source, episode))
+    shown = f"#quality=fine&{fragment(link)}"
+    with opened_page(answers, shown, (int(found[1]), int(found[2]))) as draw, writing(file):
+        file.write_bytes(draw(None))
 
 
 def live_page(run: Path) -> str:

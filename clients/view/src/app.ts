@@ -64,6 +64,7 @@ export class App {
     const { quality } = store.state;
     const isFine = quality === "fine" || (quality === "auto" && !isSoftware());
     this.stage = new Stage(this.origin, isFine, () => this.keepCamera(), (hit) => this.pick(hit));
+    this.stage.canvas.addEventListener("webglcontextlost", () => this.report("The browser gave up the picture: reload the page."));
     this.layers = new LayersPanel(store, about);
     this.inspector = new Inspector(() => store.set({ sel: null }));
     this.pictures = new Pictures(store, about);
@@ -280,6 +281,7 @@ export class App {
       names: { objects: [...view.objects.shown.keys()], devices: [...view.devices.shown.keys()] },
       range: view.rays.range,
       drawn: view.rays.drawn.length,
+      ticks: view.rays.drawn.filter(({ known }) => !known).length,
       paths: view.rays.paths.length,
       of: channel?.kept.paths?.[1] ?? view.rays.paths.length,
       points: view.points.count ? (points ?? [view.points.count, view.points.count]) : null,

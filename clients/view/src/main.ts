@@ -6,8 +6,6 @@ import { askToken } from "./panels/token";
 import { fromFragment, Store } from "./state";
 import type { About } from "./types";
 
-const LOADING = "the page is still loading: await caviar.ready";
-
 declare global {
   interface Window {
     caviar?: {
@@ -56,15 +54,13 @@ async function whenBegun(source: Source): Promise<About> {
 
 const begun = start();
 let app: App | null = null;
+const loaded = () => {
+  if (!app) throw new Error("the page is still loading: await caviar.ready");
+  return app;
+};
 window.caviar = {
-  state: () => {
-    if (!app) throw new Error(LOADING);
-    return app.state();
-  },
-  project: (place) => {
-    if (!app) throw new Error(LOADING);
-    return app.project(place);
-  },
+  state: () => loaded().state(),
+  project: (place) => loaded().project(place),
   get ready() {
     return begun.then(async (started) => {
       await started.ready;

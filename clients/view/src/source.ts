@@ -66,9 +66,11 @@ export function isSaved(): boolean {
   return saved !== null;
 }
 
-/** Place of an answer in a saved page: lobes are those of all frames, and users have curves of their own. */
+/** Place of an answer in a saved page: lobes are those of all frames, users have curves of their own, and lanes stand
+ * by their first frame. */
 function savedKey(path: string, query: Query): string {
   if (path.endsWith("/lobes")) return `lobes/${query.device}/${query.beam}`;
+  if (path === "clock") return `clock/${query.first}`;
   return path === "curves" ? `curves/${query.user ?? 0}` : path;
 }
 

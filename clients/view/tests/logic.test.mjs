@@ -108,6 +108,7 @@ test("paths have their gains, kinds and points; those of unknown route say so", 
     tau: array([1e-7, 1.2e-7, 1e-7], 3),
     aod: array([[Math.PI / 2, 0], side, side], 3, 2),
     interactions: array([[0, 0], [1, 2], [0, 0]], 3, 2),
+    aoa: array([[Math.PI / 2, Math.PI], side, side], 3, 2),
     points: array([0, 0, 0, 0, 0, 0, 10, 10, 10, 20, 10, 10, 0, 0, 0, 0, 0, 0], 3, 2, 3),
   };
   const paths = pathsOf(channel, scene, "a");
@@ -115,6 +116,8 @@ test("paths have their gains, kinds and points; those of unknown route say so", 
   assert.deepEqual(paths.map(({ key }) => key), ["tx>rx#9", "tx>rx#8", "tx>rx#7"]);
   assert.deepEqual(paths.map(({ known }) => known), [false, true, true]);
   assert.deepEqual(paths[1].points, [[0, 0, 10], [10, 10, 10], [20, 10, 10], [30, 0, 10]]);
+  near(paths[0].leaving, [0, 1, 0]);
+  near(paths[2].coming, [-1, 0, 0]);
   assert.equal(kindOf(paths[1]), 2);
   assert.deepEqual(gainRange(paths), [-120, -80]);
 });

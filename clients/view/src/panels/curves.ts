@@ -102,7 +102,9 @@ export class CurvesPanel {
     ]);
     const all = drawn.flatMap((line) => line.values).filter((value) => value !== null);
     let [low, high] = all.length ? [Math.min(...all), Math.max(...all)] : [0, 1];
-    if (high - low < 1e-9 * Math.max(1, Math.abs(high))) [low, high] = [low - 0.5 * (Math.abs(low) || 1), high + 0.5 * (Math.abs(high) || 1)];
+    // Curves that do not change lie in the middle, those of zeros at the bottom.
+    if (high === 0 && low === 0) high = 1;
+    else if (high - low < 1e-9 * Math.abs(high)) [low, high] = [low - 0.5 * Math.abs(low), high + 0.5 * Math.abs(high)];
     const y = (value: number) => TOP + ((high - value) / (high - low)) * (HEIGHT - TOP - BOTTOM);
     const cursor = svg("line", { class: "cursor", y1: TOP, y2: HEIGHT - BOTTOM });
     const time = (n: number) => `${(this.timeline.at(n)?.t_s ?? 0).toFixed(1)} s`;
@@ -125,7 +127,7 @@ export class CurvesPanel {
       this.go(first + ((x - LEFT) / (WIDTH - LEFT - RIGHT)) * (last - first));
     });
     const text = el("span", { class: "value" });
-    const shown = lines[lines.length - 1];
+    const shown = lines.find(({ name }) => name === "chosen") ?? lines[0];
     const list = values(curves, shown.series);
     this.cursors.push({ line: cursor, text, at: (n) => si(list[nearest(curves.n, n)], unit) });
     const keys = lines.map(({ name, color }) => {
@@ -133,7 +135,7 @@ export class CurvesPanel {
       key.style.borderColor = color;
       return key;
     });
-    return el("section", { class: "chart" }, el("div", { class: "head" }, el("h3", {}, title, " ", text), el("span", {}, ...keys)), drawing);
+    return el("section", { class: "chart" }, el("div", { class: "head" }, el("h2", {}, title, " ", text), el("span", {}, ...keys)), drawing);
   }
 
   /** Lines that break where there is no value, and between episodes. */

@@ -80,7 +80,9 @@ export class Dock {
   }
 
   private async loadClock(first: number, signal: AbortSignal): Promise<void> {
-    this.clock.draw(await this.runs[0].source.json<Clock>("clock", { first, count: WINDOW }, signal));
+    const [{ source, timeline }] = this.runs;
+    const query = { first, count: WINDOW, every: timeline.every };
+    this.clock.draw(await source.json<Clock>("clock", query, signal));
   }
 
   private async loadCurves(user: User | null, signal: AbortSignal): Promise<void> {

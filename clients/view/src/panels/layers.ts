@@ -9,6 +9,8 @@ export interface LayersInput {
   user: User | null;
   range: [number, number];
   drawn: number;
+  /** Of these, how many have a tick at either end. */
+  ticks: number;
   /** Paths of the frame, and of how many the server kept these. */
   paths: number;
   of: number;
@@ -102,7 +104,8 @@ export class LayersPanel {
     const points = input.points ? ` · ${input.points[0]} of ${input.points[1]} points` : "";
     const paths = this.about.topics.channel ? `${input.drawn} of ${input.paths} paths${kept}${points} · ` : "";
     const differ = input.different ? ` · ${input.different.objects.size} objects and the beams of ${input.different.receivers.size} receivers differ` : "";
-    this.counts.textContent = `${paths}grid ${input.gridSize} m${differ}`;
+    const unknown = input.ticks ? `${input.ticks} of unknown route have a tick at either end · ` : "";
+    this.counts.textContent = `${paths}${unknown}grid ${input.gridSize} m${differ}`;
     fill(
       this.absent,
       ...input.absent.map(({ topic, source, reason }) =>

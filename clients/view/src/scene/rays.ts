@@ -24,10 +24,15 @@ export interface Path {
   points: Vector[];
   /** Whether the line is its route; otherwise it has a tick at either end. */
   known: boolean;
+  /** Unit vectors from TX along the departure, and from RX to where it arrives from. */
+  leaving: Vector;
+  coming: Vector;
 }
 
 /** Paths weaker than the strongest by more than this have the last colour [dB], as on maps. */
 const RANGE_DB = 50;
+/** Length of a tick, of the distance between both ends. */
+const TICK = 0.08;
 /** Cosine of the angle by which a straight path may leave the straight line. */
 const STRAIGHT = Math.cos((0.5 * Math.PI) / 180);
 
@@ -39,7 +44,7 @@ export function pathsOf(channel: Channel, scene: Scene, carrier: string | null):
   const kinds = numbers(channel.interactions);
   const places = numbers(channel.points);
   const offsets = numbers(channel.offsets);
-  const aod = numbers(channel.aod);
+  const [aod, aoa] = [numbers(channel.aod), numbers(channel.aoa)];
   const chosen = channel.carriers.findIndex(({ name }) => name === carrier);
   const power = (c: number, path: number) => {
     const at = 2 * (c * count + path);
@@ -74,6 +79,8 @@ export function pathsOf(channel: Channel, scene: Scene, carrier: string | null):
           kinds: own,
           points: [from.position, ...between, to.position],
           known: own.length > 0 || isStraight(from.position, to.position, leaving),
+          leaving,
+          coming: direction(aoa[2 * path], aoa[2 * path + 1]),
         });
       }
     }),
@@ -174,12 +181,12 @@ export class Rays {
     for (const path of this.drawn) {
       const color = new Color().setRGB(...colorOf(path, state.color, this.range), "srgb");
       const local = path.points.map((point) => point.map((value, i) => value - this.origin[i]));
-      for (let i = 1; i < local.length; i++) {
-        if (!path.known) continue;
-        lines.push(...local[i - 1], ...local[i]);
+      const pieces = path.known ? local.slice(1).map((point, i) => [local[i], point]) : ticks(path, local);
+      for (const [a, b] of pieces) {
+        lines.push(...a, ...b);
         colors.push(color.r, color.g, color.b, color.r, color.g, color.b);
         this.segments.push(path);
-        if (path.key === state.sel) marked.push(...local[i - 1], ...local[i]);
+        if (path.key === state.sel) marked.push(...a, ...b);
       }
       path.kinds.forEach((kind, i) => {
         dots.push(...local[i + 1]);
@@ -208,6 +215,17 @@ export class Rays {
   pathOf(segment: number): Path | null {
     return this.segments[segment] ?? null;
   }
+}
+
+/** Pieces at either end of a path of unknown route: along its departure, and to where it arrives from. */
+function ticks({ leaving, coming }: Path, ends: number[][]): number[][][] {
+  const [from, to] = [ends[0], ends[ends.length - 1]];
+  const length = TICK * Math.hypot(...from.map((value, i) => value - to[i]));
+  const along = (place: number[], way: Vector) => place.map((value, i) => value + length * way[i]);
+  return [
+    [from, along(from, leaving)],
+    [to, along(to, coming)],
+  ];
 }
 
 function fillLines(object: LineSegments2, places: number[], colors?: number[]): void {

@@ -1,5 +1,5 @@
 // The scene of one run: everything that a frame of it shows.
-import { DirectionalLight, Fog, HemisphereLight, PerspectiveCamera, Raycaster, Scene, Vector2 } from "three";
+import { DirectionalLight, Fog, HemisphereLight, PerspectiveCamera, Raycaster, Scene, Vector2, type Vector3 } from "three";
 import type { Frame } from "../frames";
 import { first } from "../frames";
 import type { Source } from "../source";
@@ -118,22 +118,25 @@ export class RunView {
     const scenery = caster.intersectObjects(pieces.map(({ mesh }) => mesh), false)[0];
     const ray = this.pickRay(caster, size);
     const near = Math.min(solid?.distance ?? Infinity, scenery?.distance ?? Infinity);
-    // A thin line is aimed at, what is behind it is hit by chance: it wins unless it is hidden.
-    if (ray && ray.distance < near + 0.5) return { kind: "path", path: ray.path };
-    if (solid && solid.distance <= near) return { kind: "object", name: solid.object.userData.name as string };
+    const name = solid && solid.distance <= near ? (solid.object.userData.name as string) : null;
+    const size3 = name === null ? 0 : Math.max(...(objects.shown.get(name)?.size ?? [0]));
+    const ends = name !== null && ray !== null && solid.object.position.distanceTo(ray.point) < size3;
+    // A thin line is aimed at, what is behind it is hit by chance: it wins unless it is hidden, or ends there.
+    if (ray && !ends && ray.distance < near + 0.5) return { kind: "path", path: ray.path };
+    if (name !== null) return { kind: "object", name };
     const piece = pieces.find(({ mesh }) => mesh === scenery?.object);
     if (!piece || !scenery) return null;
     return { kind: "piece", info: piece.info, name: this.world.pieceName(piece.info, scenery.faceIndex ?? 0) };
   }
 
-  private pickRay(caster: Raycaster, size: Vector2): { path: Path; distance: number } | null {
+  private pickRay(caster: Raycaster, size: Vector2): { path: Path; distance: number; point: Vector3 } | null {
     const { pickable, group } = this.rays;
     if (!group.visible || !pickable.visible) return null;
     pickable.material.resolution.copy(size);
     caster.params.Line2 = { threshold: 6 };
     const hit = caster.intersectObject(pickable, false)[0];
     const path = hit && this.rays.pathOf(hit.faceIndex ?? -1);
-    return path ? { path, distance: hit.distance } : null;
+    return path ? { path, distance: hit.distance, point: hit.point } : null;
   }
 
   /** Marks have a constant size in the picture: what counts is the distance in pixels. */
@@ -145,10 +148,18 @@ export class RunView {
       for (let i = 0; i < (places?.count ?? 0); i++) {
         const p = this.projected.set(places.getX(i), places.getY(i), places.getZ(i)).project(camera);
         const pixels = Math.hypot(((p.x - at.x) * size.x) / 2, ((p.y - at.y) * size.y) / 2);
-        if (p.z < 1 && pixels < 9 && (!nearest || pixels < nearest.pixels)) nearest = { name: names[i], pixels };
+        if (p.z < 1 && pixels < this.reach(names[i], camera, size) && (!nearest || pixels < nearest.pixels)) nearest = { name: names[i], pixels };
       }
     }
     return nearest && { kind: "device", name: nearest.name };
+  }
+  /** Distance from a mark at which a click means it [px]: one on a small object would leave nothing of that to click. */
+  private reach(device: string, camera: PerspectiveCamera, size: Vector2): number {
+    const parent = this.objects.shown.get(this.devices.shown.get(device)?.device.parent ?? "");
+    if (!parent) return 9;
+    const distance = camera.position.distanceTo(parent.mesh.position);
+    const pixels = (Math.max(...parent.size) * size.y) / (2 * distance * Math.tan((camera.fov * Math.PI) / 360));
+    return pixels > 60 ? 6 : 0;
   }
   private readonly projected = this.sun.position.clone();
 
