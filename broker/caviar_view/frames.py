@@ -40,6 +40,8 @@ class Frames(ABC):
     damage: Sequence[str]
     """What cannot be shown, a line each."""
     complete: bool
+    radio_map: Path | None = None
+    """Arrays of a map of coverage (``caviar plot map``); None: there is none."""
     first: int
     """Place of the oldest frame that is held."""
     end: int
@@ -108,6 +110,8 @@ class RecordedFrames(Frames):
         self.assets, self.topics = recording.assets if assets is None else assets, recording.topics
         self.damage, self.complete = recording.damage, recording.complete
         self.end = len(recording)
+        found = recording.directory / "radio-map.npz"
+        self.radio_map = found if found.is_file() else None
 
     def entry(self, place: int) -> FrameEntry:
         """Record of a frame."""

@@ -6,31 +6,53 @@ import json
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 
 from caviar_broker.control.socket import ask
-from caviar_broker.http.process import reachable
-from caviar_formats.viewers import FoxgloveMessages, moment
+from caviar_broker.http.process import gateway_credentials, reachable
+from caviar_broker.security.access import PAGE
+from caviar_formats.foxglove import FoxgloveMessages
+from caviar_formats.viewers import moment
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import SetupError
 from caviar_protocol.fields import Asset
 from caviar_protocol.host import install_command
-from caviar_protocol.observer import Observation, Observer
-from caviar_protocol.recording import RecordedFrame
+from caviar_protocol.observer import Observation, ObservedProduct, Observer
 from caviar_protocol.run_directory import RunDirectory
+from caviar_protocol.space.scene import merge_scenes
+from caviar_protocol.topics import Scene
 from caviar_view.world import World
 
 PERIOD_S = 0.05
 """Least time from one frame that is shown to the next [s]."""
-MESSAGES = 256
-"""Messages that are held for a viewer; one that is slower does without the oldest."""
+
+
+class ObservedFrame:
+    """A frame of an observer, as `moment` takes it.
+
+    Args:
+        seen: By the observer.
+    """
+
+    def __init__(self, seen: Observation) -> None:
+        self.t_ns = seen.message.t_ns
+        self.products: tuple[ObservedProduct, ...] = tuple(seen.products.values())
+
+    def payloads(self, topic: str, cls: type[Any]) -> dict[str, Any]:
+        """Payloads of a topic by source, as of `RecordedFrame.payloads`."""
+        found = [p for p in self.products if p.provenance.topic == topic]
+        return {product.provenance.source: product.payload for product in found}
+
+    def scene(self) -> Scene | None:
+        """The scenes of all worlds as one; None where there is none."""
+        scenes = self.payloads("scene", Scene)
+        return merge_scenes(scenes) if scenes else None
 
 
 class _Guests:
-    """Listener of the server: notes that a viewer has come, which has seen nothing yet."""
+    """Listener of the server: notes that a viewer has come, which has not seen the scenery."""
 
     has_come = True
 
@@ -50,64 +72,44 @@ def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> Non
     Args:
         run: Directory of the run.
         port: To serve at; 0: any.
-        announce: Called with the address that Foxglove opens.
+        announce: Called with the address that Foxglove opens, once there is a frame.
 
     Raises:
         RunError: No broker runs there, or it refuses the observer.
-        SetupError: The SDK of Foxglove is not installed, the port is taken, or the broker asks for keys.
+        SetupError: The SDK of Foxglove is not installed, or the port is taken.
     """
     if find_spec("foxglove") is None:
         raise SetupError(f"--foxglove needs foxglove; run: {install_command('viewers')}")
     import foxglove
-    from foxglove.websocket import Capability
 
-    if ask(run, do="gateway")["keys"] is not None:
-        raise SetupError(
-            f"the broker in {run} asks for keys, and any program of this machine could read the run from a "
-            "server without them; leave out --foxglove, or export the recording with --to foxglove"
-        )
-    status = ask(run, do="status")["status"]
+    status, keys = ask(run, do="status")["status"], ask(run, do="gateway")
     world = World(_assets(run), json.loads(RunDirectory(run).record.read_text("utf-8"))["scenario"])
+    credentials = gateway_credentials(keys)
     context, guests = foxglove.Context(), _Guests()
     try:
         server = foxglove.start_server(
-            name=status["run"], host="127.0.0.1", port=port, server_listener=guests, context=context,
-            capabilities=[Capability.Time], message_backlog_size=MESSAGES,
-        )  # fmt: skip
+            name=status["run"], host="127.0.0.1", port=port, server_listener=guests, context=context
+        )
     except (OSError, RuntimeError) as error:
         raise SetupError(f"--foxglove {port}: {error}; choose another port, or 0 for any") from error
-    messages = FoxgloveMessages(context)
+    messages, is_announced = FoxgloveMessages(context), False
     try:
-        announce(f"ws://127.0.0.1:{server.port}")
-        now, episode = None, 0
-        with Observer(reachable(status["endpoint"]), "Foxglove", period_s=PERIOD_S) as observer:
-            while not observer.ended:
-                seen = observer.receive(timeout_s=0.5)
-                # News of a run that pauses, or has no frame yet, have no products.
-                is_new = seen is not None and bool(seen.products)
-                if seen is not None and is_new:
-                    now = moment(_frame(seen))
-                    if seen.episode != episode:  # time begins again
-                        episode = seen.episode
-                        server.clear_session()
-                # A viewer that has come sees a run that stands still, too.
-                if now is None or not (is_new or guests.has_come):
+        name = PAGE if credentials is not None else "Foxglove"
+        endpoint = reachable(status["endpoint"])
+        with Observer(endpoint, name, credentials=credentials, period_s=PERIOD_S) as observer:
+            for seen in observer:
+                if seen.frame < 0 or not seen.products:  # a run that begins, or pauses
                     continue
-                messages.stamp(now.t_ns)
+                messages.stamp(seen.message.t_ns)
                 if guests.has_come:
                     guests.has_come = False
                     messages.scenery(world)
-                messages.add(now)
-                server.broadcast_time(now.t_ns)
+                messages.add(moment(ObservedFrame(seen)))
+                if not is_announced:  # with its topics: the SDK refuses who subscribes to one as it appears
+                    is_announced = True
+                    announce(f"ws://127.0.0.1:{server.port}")
     finally:
         server.stop()
-
-
-def _frame(seen: Observation) -> RecordedFrame:
-    """Frame of an observer, with the methods of one that was recorded."""
-    products = tuple(seen.products.values())
-    recording: Any = SimpleNamespace(entry=lambda _: seen.message, products_of=lambda _: products)
-    return RecordedFrame(recording, 0)
 
 
 def _assets(run: Path) -> Mapping[str, Path]:

@@ -28,9 +28,10 @@ from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
+from caviar_formats.ros2 import Ros2
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
-from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, Ros2, lobe
+from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, lobe
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import RecordingError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
