@@ -66,8 +66,8 @@ class _Guests:
 def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> None:
     """Serve a run to Foxglove on this machine until it ends: the newest frames, as an observer sees them.
 
-    The server of Foxglove's SDK asks nobody for a token: it is reached from this machine alone, and a run whose
-    broker asks for keys is not served.
+    The server of Foxglove's SDK asks nobody for a token: it is reached from this machine alone, and a run of
+    which the broker asks for keys is not served.
 
     Args:
         run: Directory of the run.
