@@ -62,7 +62,7 @@ class PaceStatistics(msgspec.Struct, frozen=True, kw_only=True):
 class Statistics:
     """Collects latencies [ns] and frame times, and sums them up.
 
-    A frame costs 32 bytes a service and 8 for itself. A latency counts from the GRANT that is sent
+    A frame costs 40 bytes a service and 8 for itself. A latency counts from the GRANT that is sent
     to the DONE that is received, or to the deadline where the frame went on without it.
     """
 
@@ -93,7 +93,7 @@ class Statistics:
             now: The time [ns].
         """
         self._latencies[service].append(elapsed_ns)
-        self._answers[service].extend((episode, frame, now))
+        self._answers[service].extend((episode, frame, now, missed))
         self._misses[service] += missed
         self._totals[service] += elapsed_ns
 
@@ -207,9 +207,9 @@ class Statistics:
         """Grants of a service in the order of their answers, from the ``first``-th on.
 
         Returns:
-            Episode, frame, when it was answered and latency [ns], Shape ``[grants, 4]``.
+            Episode, frame, when it was answered [ns], 1 for a miss, latency [ns], Shape ``[grants, 5]``.
         """
-        known = np.asarray(self._answers[service][3 * first :], np.int64).reshape(-1, 3)
+        known = np.asarray(self._answers[service][4 * first :], np.int64).reshape(-1, 4)
         return np.column_stack([known, np.asarray(self._latencies[service][first:], np.int64)])
 
     def figures(self) -> dict[str, Any]:

@@ -332,7 +332,7 @@ class Answers:
         span = range(first, min(first + len(places) * every, self.frames.end))
         shown = {(e.episode, e.frame): n for n in span for e in [self.frames.entry(n)]}
         answered = {
-            name: {(episode, frame): (at, took) for episode, frame, at, took in table}
+            name: {(episode, frame): (at, missed, took) for episode, frame, at, missed, took in table}
             for name in services
             if (table := self.frames.answers().get(f"answers/{name}")) is not None
         }
@@ -356,18 +356,17 @@ def _lanes(
     place: int,
     entry: FrameEntry,
     services: Mapping[str, Any],
-    answered: Mapping[str, Mapping[tuple[int, int], tuple[int, int]]],
+    answered: Mapping[str, Mapping[tuple[int, int], tuple[int, int, int]]],
 ) -> dict[str, Any]:
     """Lanes of one frame: when each service was granted and answered, from the frame's first grant on."""
     key = (entry.episode, entry.frame)
     known = {name: table[key] for name, table in answered.items() if key in table}
-    begin = min((at - took for at, took in known.values()), default=0)
+    begin = min((at - took for at, _, took in known.values()), default=0)
     work = {report.source: report.measured.get("step") for report in entry.reports}
     lanes = []
-    for name, spec in services.items():
+    for name in services:
         states = {item.status for item in entry.inputs if item.source == name}
-        at, took = known.get(name, (None, None))
-        budget = _service(name, spec)["budget_ms"]
+        at, missed, took = known.get(name, (None, 0, None))
         step = work.get(name)
         lanes.append(
             {
@@ -375,7 +374,7 @@ def _lanes(
                 "start_ms": None if at is None or took is None else (at - took - begin) / 1e6,
                 "end_ms": None if at is None else (at - begin) / 1e6,
                 "work_ms": None if step is None else step / 1e6,
-                "missed": bool(budget) and took is not None and took > budget * 1e6,
+                "missed": bool(missed),
                 "held": Status.HELD in states,
                 "absent": Status.ABSENT in states,
             }

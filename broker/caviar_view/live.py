@@ -131,7 +131,7 @@ class LiveFrames(Frames):
 
     def known_answers(self) -> dict[str, int]:
         """Number of answers of each service up to the newest that `add_answers` has got."""
-        return {name: int(rows[-1][4]) + 1 for name, rows in self._answered.items() if rows}
+        return {name: int(rows[-1][-1]) + 1 for name, rows in self._answered.items() if rows}
 
     def add_answers(self, found: Mapping[str, Any]) -> None:
         """Take in what the broker's control channel says of ``answers``."""
@@ -141,4 +141,4 @@ class LiveFrames(Frames):
 
     def answers(self) -> Mapping[str, Any]:
         """Grants that were answered, of the newest frames."""
-        return {f"answers/{name}": [row[:4] for row in rows] for name, rows in self._answered.items()}
+        return {f"answers/{name}": [row[:-1] for row in rows] for name, rows in self._answered.items()}

@@ -16,7 +16,7 @@ def test_percentiles_and_misses_are_those_of_numpy() -> None:
     statistics = Statistics({"link": 20 * MS, "idle": MS})
     latencies = np.random.default_rng(1).integers(1, 50 * MS, 1000)
     for latency in latencies:
-        statistics.latency("link", int(latency), latency > 20 * MS)
+        statistics.latency("link", int(latency), bool(latency > 20 * MS))
     (name, figures), *others = statistics.services().items()
     assert (name, others) == ("link", [])
     assert figures.p50_ms == pytest.approx(float(np.percentile(latencies, 50)) / MS)
@@ -48,7 +48,7 @@ def test_every_figure_is_saved(tmp_path: Path) -> None:
             "decision_lateness_ns": [3],
             "latency_ns/file": [5],
             "latency_ns/idle": [],
-            "answers/file": [[1, 2, 30, 5]],
+            "answers/file": [[1, 2, 30, 0, 5]],
             "answers/idle": [],
         }
 

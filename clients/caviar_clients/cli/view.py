@@ -54,6 +54,8 @@ def view(
     from caviar_view.answers import Answers
 
     console = Console()
+    if save is not None and beside is not None:
+        raise SetupError("a saved page shows one run: leave out --beside, or --save")
     if save is not None:
         from caviar_view.save import saved_page
 
