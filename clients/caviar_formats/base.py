@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
@@ -69,8 +72,8 @@ class Format:
     """Extra that brings them."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
-    needs_users: ClassVar[bool] = True
-    """Whether there is no export of scenes without users."""
+    of_all_users: ClassVar[bool] = False
+    """Whether a file is of all users, so that none are chosen, or of scenes without any."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
     temporary: ClassVar[Sequence[str]] = ()
@@ -209,9 +212,10 @@ def export_users(
             or a file cannot be written.
         RecordingError, RunError: As of `Format.begin`.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RunError(f"{out} is there and not empty; choose another folder with --out")
-    if not len(users) and to.needs_users:
+    _require_free(out)
+    if to.of_all_users and len(users) != len(users.dataset.users()):
+        raise RunError("this format is of all users: leave --carrier, --tx and --object-class out")
+    if not len(users) and not to.of_all_users:
         raise RunError(f"{users.dataset.location} has no such users to export; record scene and channel")
     if lacking := [name for name in to.needs if name not in users.recorded()]:
         users.check_names(lacking)
@@ -223,8 +227,7 @@ def export_users(
     to.begin(users)
     parts = _parts(users, to.whole_episodes)
     folder = out.with_name(f"{out.name}.part")
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder), _held(folder, out):
         state = _continued(folder, _identity(users, to))
         scenes, of = 0, len(users.dataset.table("scenes"))
         for part in parts:
@@ -243,6 +246,29 @@ def export_users(
         (folder / "README.md").write_text(_readme(users, to), encoding="utf-8")
         folder.replace(out)
         (out / STATE).unlink()
+
+
+def _require_free(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out} is there and not empty; choose another folder with --out")
+
+
+@contextmanager
+def _held(folder: Path, out: Path) -> Iterator[None]:
+    """Make a folder and lock it, which a rename keeps, for as long as the block lasts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(
+                f"another export writes {out} now: wait for it, or choose another --out"
+            ) from error
+        _require_free(out)  # of an export that has ended in between
+        yield
+    finally:
+        os.close(lock)
 
 
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:

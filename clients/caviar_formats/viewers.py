@@ -68,7 +68,8 @@ class Moment:
     mounts: list[tuple[str, str, Pose]]
     """Parent, name and pose in the parent's axes of devices and, with x right and y down, of pictures."""
     rays: list[tuple[Float64Array, float, list[float]]]
-    """Points [m], Shape ``[N, 3]``, gain [dB], and colour by it, of the strongest paths of each pair."""
+    """Points [m], Shape ``[N, 3]``, gain [dB] on the first carrier that the pair uses, and colour by it, of
+    the strongest paths of each pair."""
     beams: list[tuple[AntennaDevice, Pose, int]]
     """Arrays of several elements, their poses in the world, and beams that were chosen for them."""
     users: dict[str, dict[str, float]]
@@ -209,9 +210,10 @@ class _Viewer(Format):
     """A format with a file or folder for each episode."""
 
     extra = "viewers"
-    needs_users = False
+    of_all_users = True
     whole_episodes = True
     loses = (
+        "Paths on other carriers than the first that a pair uses, and those of a second channel service. "
         "Matrices, impulse responses, and all but the 25 strongest paths of a pair; meshes of objects, which "
         "are boxes; labels of pictures, normals; scenery of more than 150,000 triangles is thinned; products "
         "that were held are there once."
@@ -279,8 +281,9 @@ those of `/users` are JSON. {_FRAMES}
 - `/tf`: FrameTransforms of objects in the world, and of devices on their objects.
 - `/scenery`: SceneUpdate of the first frame, triangles by material.
 - `/objects`: SceneUpdate, a box for each object, with its class.
-- `/rays`: SceneUpdate, a line for each path, yellow for the strongest; metadata has its gain [dB]. A path
-  whose route is not known has a tick of {TICK_M:g} m at either end.
+- `/rays`: SceneUpdate, a line for each path on the first carrier that its pair uses, yellow for the
+  strongest; metadata has its gain [dB] there. A path whose route is not known has a tick of {TICK_M:g} m at
+  either end.
 - `/beams`: SceneUpdate when a beam changes: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m
   at the most.
 - `/lidar/SENSOR`: PointCloud in the axes of the sensor, with ranges [m] and the pose of the sensor.
@@ -478,8 +481,8 @@ What is no letter, digit or slash in a name is an underscore in topics.
 - `/scenery`: visualization_msgs/MarkerArray of the first frame, triangles by material.
 - `/objects`: visualization_msgs/MarkerArray, a box for each object.
 - `/objects/NAME/pose`: geometry_msgs/PoseStamped of the centre of the box.
-- `/rays`: visualization_msgs/MarkerArray, lines of paths, yellow for the strongest. A path whose route is not
-  known has a tick of {TICK_M:g} m at either end.
+- `/rays`: visualization_msgs/MarkerArray, lines of paths on the first carrier that their pair uses, yellow
+  for the strongest. A path whose route is not known has a tick of {TICK_M:g} m at either end.
 - `/lidar/SENSOR/points`: sensor_msgs/PointCloud2 in the world, with ranges [m].
 - `/camera/SENSOR/image`, `depth`, `camera_info`: sensor_msgs/Image `rgb8`, Image `32FC1` [m], CameraInfo.
 - `/users/RX/TX/CARRIER/NAME`: std_msgs/Float64, without what is not finite,
@@ -680,8 +683,8 @@ class Rerun(_Viewer):
 
 - `world/scenery`: meshes by material.
 - `world/objects`: boxes, with names.
-- `world/rays`: paths, yellow for the strongest. One whose route is not known has a tick of {TICK_M:g} m at
-  either end.
+- `world/rays`: paths on the first carrier that their pair uses, yellow for the strongest. One whose route is
+  not known has a tick of {TICK_M:g} m at either end.
 - `world/beams`: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m at the most.
 - `world/lidar/SENSOR`: points. `world/camera/CAMERA`: `image`, and `depth` [m].
 - `users/RX/TX/CARRIER/NAME`: for plots, without what is not finite,

@@ -741,8 +741,6 @@ def test_minari_needs_decisions(roadside: Path, tmp_path: Path) -> None:
         exported(data, "minari", tmp_path)
     with pytest.raises(ScenarioError, match="which sends none"):
         exported(Dataset(roadside), "minari", tmp_path, "delay")
-    with pytest.raises(RunError, match="leave --carrier"):
-        export_users(Dataset(roadside).users()[:2], find_format("minari"), tmp_path / "out")
 
 
 def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
@@ -846,6 +844,8 @@ def test_paths_of_wireless_insite_become_users_and_npz(
     phase: str, of_first: float | None, tmp_path: Path
 ) -> None:
     source = insite(p2m(tmp_path, P2M.format(phase=phase)))
+    # λ / 4πd of 50 m at 60 GHz is −101.98 dB.
+    assert "from t001_05 to r006-00001 is +20.99 dB from free space at 60 GHz" in source.assumed
     data = Dataset(import_dataset(source, tmp_path / "data"))
     assert list(verify(tmp_path / "data")) == []
     with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
@@ -1095,8 +1095,40 @@ def test_names_that_are_one_topic_of_ros_are_refused(tmp_path: Path) -> None:
         Ros2().write_episode(tmp_path / "bag", World({}, {}), iter([now]))
 
 
-def test_scenes_without_users_are_exported_where_a_format_needs_none(clouds: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["foxglove", "minari", "pcd", "rerun", "ros2"])
+def test_formats_of_all_users_refuse_a_choice(name: str, clouds: Path, tmp_path: Path) -> None:
+    try:
+        form = find_format(name)
+    except SetupError as error:
+        pytest.skip(str(error))
+    with pytest.raises(RunError, match="leave --carrier"):
+        export_users(Dataset(clouds).users()[:2], form, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_export_refuses_a_folder_that_another_writes(data: Dataset, tmp_path: Path) -> None:
+    out, refused = tmp_path / "npz", list[str]()
+
+    def again(*_: int) -> None:
+        for name in ("npz", "parquet"):
+            with pytest.raises(RunError, match=r"another export writes .*npz now") as error:
+                exported_to(out, name)
+            refused.append(str(error.value))
+
+    def exported_to(out: Path, name: str, on_part: Any = lambda *_: None) -> None:
+        export_users(data.users(), find_format(name), out, on_part)
+
+    exported_to(out, "npz", again)
+    assert len(refused) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["npz"]
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", "users-00000.npz"]
+
+
+def test_scenes_without_users_are_exported_where_a_format_needs_none(
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     users = Dataset(clouds).users()[:0]
+    monkeypatch.setattr(users.dataset, "users", lambda: users)
     export_users(users, find_format("pcd"), tmp_path / "pcd")
     assert len(list((tmp_path / "pcd").rglob("*.pcd"))) == EPISODES * SCENES
     with pytest.raises(RunError, match="no such users"):
