@@ -80,8 +80,12 @@ class Format:
     """Folders of the export that are removed once `finish` has made files of them."""
     frequency_hz: float | None = None
     """Of the carrier, where the files that are read do not have it [Hz]."""
+    takes_origin: ClassVar[bool] = False
+    """Whether `origin` is of use."""
     origin: tuple[float, float] | None = None
     """Latitude and longitude of the origin of the world [°], where the dataset does not have them."""
+    name: str = ""
+    """NAME of the commands, of `find_format`."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -112,7 +116,7 @@ class Format:
         Raises:
             RecordingError, RunError: As of `begin`.
         """
-        raise RunError(f"datasets are imported from {type(self).__name__}, not exported to it")
+        raise NotImplementedError
 
     def finish(self, users: Users, folder: Path) -> None:
         """Write what only the whole says, once all parts are there.
@@ -139,7 +143,7 @@ class Format:
         Raises:
             RunError: They are damaged, or none of the format; names file and place. So does their iterator.
         """
-        raise RunError(f"datasets are exported to {type(self).__name__}, not imported from it")
+        raise RunError(f"datasets are exported to {self.name or type(self).__name__}, not imported from it")
 
 
 FORMATS: Mapping[str, str] = {
@@ -178,10 +182,15 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     place = FORMATS.get(name)
     cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
     if cls is None:
-        raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
+        way = "write" if option == "--to" else "read"
+        known = [
+            key for key, at in FORMATS.items() if getattr(resolve_name(at), way) is not getattr(Format, way)
+        ]
+        raise RunError(f"{option} {name!r}: {suggestion(name, [*known, *plugins(FORMAT_PLUGINS)])}")
     if lacking := [module for module in cls.packages if find_spec(module) is None]:
         raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command(cls.extra)}")
     found: Format = cls(flavour)
+    found.name = name
     return found
 
 
@@ -213,6 +222,8 @@ def export_users(
         RecordingError, RunError: As of `Format.begin`.
     """
     _require_free(out)
+    if type(to).write is Format.write:
+        raise RunError(f"datasets are imported from {to.name or type(to).__name__}, not exported to it")
     if to.of_all_users and len(users) != len(users.dataset.users()):
         raise RunError("this format is of all users: leave --carrier, --tx and --object-class out")
     if not len(users) and not to.of_all_users:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
@@ -27,12 +30,13 @@ from caviar_clients.learning.recorded import RecordedBeamsEnv
 from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
+from caviar_formats.cli import export_command, import_command
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, Ros2, lobe
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RecordingError, RunError, ScenarioError, SetupError
+from caviar_protocol.errors import CaviarError, RecordingError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
@@ -1122,6 +1126,46 @@ def test_an_export_refuses_a_folder_that_another_writes(data: Dataset, tmp_path:
     assert len(refused) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["npz"]
     assert sorted(path.name for path in out.iterdir()) == ["README.md", "users-00000.npz"]
+
+
+def test_an_export_of_a_run_names_the_run(folder: Path) -> None:
+    run = str(next((folder / "episodes").iterdir()))
+    text = f"^{re.escape(run)} has no users of carrier 'low'"
+    with pytest.raises(RecordingError, match=text), open_source(run) as data:
+        data.users(carrier="low")
+    runs = folder.parent / "runs"
+    runs.mkdir()
+    for name in ("a", "b"):
+        (runs / name).symlink_to(run)
+    text = r"is no run, it holds 2: give one of them, as .*runs/a"
+    with pytest.raises(RecordingError, match=text), open_source(str(runs)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["export", "DATA", "--to", "npz", "--origin", "1,2"], "--origin: npz has no places on the Earth"),
+        (["export", "DATA", "--to", "npz", "--out", "DATA/npz"], "is in DATA, which is read"),
+        (["export", "DATA", "--to", "matlab"], "known: deepmimo, deepsense,"),
+        (["export", "DATA", "--to", "p2m"], "imported from p2m, not exported"),
+        (["export", "DATA", "--to", "npz", "--object-class", "tram"], "known: car"),
+        (["import", "nosuch", "--from", "p2m"], "nosuch: there is no such file or folder"),
+        (["import", "DATA", "--from", "npz"], "exported to npz, not imported"),
+        (["import", "DATA", "--from", "matlab"], "known: deepmimo, itu, p2m"),
+    ],
+)
+def test_refusals_of_the_commands(arguments: list[str], text: str, folder: Path, tmp_path: Path) -> None:
+    words = [word.replace("DATA", str(folder)) for word in arguments]
+    if "--out" not in words:
+        words += ["--out", str(tmp_path / "out")]
+    function, name = (export_command, "export") if words[0] == "export" else (import_command, "import")
+    app = typer.Typer()
+    app.command(name)(function)
+    error = CliRunner().invoke(app, words[1:]).exception
+    assert isinstance(error, CaviarError)
+    assert text.replace("DATA", str(folder)) in str(error)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_scenes_without_users_are_exported_where_a_format_needs_none(
