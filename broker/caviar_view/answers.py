@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import encode_payload, join_parts
-from caviar_protocol.errors import CaviarError
+from caviar_protocol.errors import CaviarError, RecordingError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import FrameEntry
 from caviar_protocol.space.codebooks import codebook_of
@@ -43,6 +43,8 @@ BINARY = "application/octet-stream"
 
 PATHS, POINTS, PIXELS = 25, 20_000, 320
 """Paths of a pair, points of all scans, and width of a picture [px], unless a query says otherwise."""
+CELLS = 40_000
+"""Cells of a radio map."""
 CURVE_POINTS = 400
 """Frames of curves: each costs a chunk of the recording."""
 
@@ -110,6 +112,8 @@ class Answers:
                 if content is None:
                     raise NotThereError(f"there is no mesh {name!r}")
                 return Answer(content, BINARY)
+            case ["radio-map"]:
+                return _json(self._radio_map())
             case ["frames", place]:
                 return _json(self._frame(self._place(place)))
             case ["frames", place, "lobes"]:
@@ -141,6 +145,7 @@ class Answers:
             "complete": frames.complete,
             "damage": list(frames.damage),
             "every": 1,
+            "radio_map": frames.radio_map is not None,
             **self._flags,
             **self.world.about(),
         }
@@ -242,6 +247,29 @@ class Answers:
     def _scene(self, place: int, items: Sequence[GrantInput]) -> Scene:
         return merge_scenes({item.source: cast(Scene, self._payload(place, item)) for item in items})
 
+    def _radio_map(self) -> dict[str, Any]:
+        """Gain of the strongest transmitter in each cell, of a map beside the recording."""
+        file = self.frames.radio_map
+        if file is None:
+            raise NotThereError(
+                "there is no radio map beside the recording; make one with: caviar plot map RUN"
+            )
+        try:
+            with np.load(file, allow_pickle=False) as found:
+                x, y, z = (found[name].astype(float) for name in ("x", "y", "z"))
+                gain = np.where(np.isnan(found["gain"]), -np.inf, found["gain"]).max(0).astype(float)
+        except (OSError, ValueError, KeyError) as error:
+            raise RecordingError(f"{file} is no radio map: {error}") from error
+        step = math.ceil(math.sqrt(gain.size / CELLS)) or 1
+        x, y, z, gain = x[::step], y[::step], z[::step, ::step], gain[::step, ::step]
+        shown = np.isfinite(gain) & np.isfinite(z)
+        cells = [
+            [value if there else None for value, there in zip(*row, strict=True)]
+            for row in zip(gain.tolist(), shown.tolist(), strict=True)
+        ]
+        heights = np.where(shown, z, 0.0).tolist()
+        return {"x": x.tolist(), "y": y.tolist(), "z": heights, "gain_db": cells, "every": step}
+
     def _lobe(self, place: int, query: Mapping[str, str]) -> dict[str, Any]:
         name, beam = query.get("device", ""), query.get("beam", "")
         scene = self._scene(place, self._items(self.frames.entry(place), "scene"))
@@ -301,6 +329,8 @@ class Answers:
         every = _number(query, "every", 1, 1)
         places = range(first, min(first + min(count, 1000) * every, self.frames.end), every)
         services: Mapping[str, Any] = self.frames.scenario.get("services") or {}
+        span = range(first, min(first + len(places) * every, self.frames.end))
+        shown = {(e.episode, e.frame): n for n in span for e in [self.frames.entry(n)]}
         answered = {
             name: {(episode, frame): (at, took) for episode, frame, at, took in table}
             for name in services
@@ -309,6 +339,11 @@ class Answers:
         return {
             "services": [_service(name, spec) for name, spec in services.items()],
             "frames": [_lanes(place, self.frames.entry(place), services, answered) for place in places],
+            "events": [
+                {"n": shown[event["episode"], event["frame"]], "text": event["text"]}
+                for event in self.frames.events()
+                if (event["episode"], event["frame"]) in shown
+            ],
         }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -38,6 +40,8 @@ class Frames(ABC):
     damage: Sequence[str]
     """What cannot be shown, a line each."""
     complete: bool
+    radio_map: Path | None = None
+    """Arrays of a map of coverage (``caviar plot map``); None: there is none."""
     first: int
     """Place of the oldest frame that is held."""
     end: int
@@ -58,6 +62,29 @@ class Frames(ABC):
     def answers(self) -> Mapping[str, Any]:
         """Grants that were answered, ``answers/SERVICE`` (`caviar_broker.statistics.Statistics.answers`)."""
         return {}
+
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """Notices of the run that name a culprit, or say that a service came back."""
+        return ()
+
+
+TOLD = frozenset({"miss", "lost", "away", "back", "restarted", "fault", "skipped"})
+"""Kinds of notices that the clock shows."""
+
+
+def events_of(run: Path) -> list[Mapping[str, Any]]:
+    """Read the notices of a run that the clock shows; a line that is being written is left out."""
+    found = []
+    try:
+        lines = RunDirectory(run).events.read_text("utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+    for line in lines:
+        with contextlib.suppress(ValueError):
+            event = json.loads(line)
+            if event.get("kind") in TOLD:
+                found.append(event)
+    return found
 
 
 class RecordedFrames(Frames):
@@ -83,6 +110,8 @@ class RecordedFrames(Frames):
         self.assets, self.topics = recording.assets if assets is None else assets, recording.topics
         self.damage, self.complete = recording.damage, recording.complete
         self.end = len(recording)
+        found = recording.directory / "radio-map.npz"
+        self.radio_map = found if found.is_file() else None
 
     def entry(self, place: int) -> FrameEntry:
         """Record of a frame."""
@@ -103,6 +132,14 @@ class RecordedFrames(Frames):
                 return {name: found[name].tolist() for name in found if name.startswith("answers/")}
         except (OSError, ValueError):
             return {}
+
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """Of ``events.jsonl``."""
+        return self._events
+
+    @cached_property
+    def _events(self) -> Sequence[Mapping[str, Any]]:
+        return events_of(self._recording.directory)
 
 
 class FirstScene(Frames):

@@ -13,7 +13,7 @@ from caviar_protocol.errors import ProtocolError, RecordingError
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.observer import Observation, ObservedProduct
 from caviar_protocol.recording import FrameEntry
-from caviar_view.frames import Frames
+from caviar_view.frames import Frames, events_of
 
 MOST_FRAMES = 4096
 """Frames that are held, to look back at."""
@@ -27,6 +27,7 @@ class LiveFrames(Frames):
     """Frames of a run, added as they are seen; those that were finished in between are not there.
 
     Args:
+        directory: Of the run.
         scenario: As it was resolved.
         run: Id of the run.
         seed: Of the run.
@@ -35,7 +36,15 @@ class LiveFrames(Frames):
 
     kind, complete, damage = "run", True, ()
 
-    def __init__(self, scenario: Mapping[str, Any], run: str, seed: int, assets: Mapping[str, Path]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        scenario: Mapping[str, Any],
+        run: str,
+        seed: int,
+        assets: Mapping[str, Path],
+    ) -> None:
+        self._directory = directory
         self.scenario, self.run, self.seed, self.assets = scenario, run, seed, assets
         self.first = self.end = 0
         self.topics: Mapping[str, Sequence[str]] = {}
@@ -115,6 +124,10 @@ class LiveFrames(Frames):
             return product.payload
         except ProtocolError as error:
             raise RecordingError(f"{item.topic} of {item.source!r} in frame {place}: {error}") from error
+
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """The newest notices."""
+        return events_of(self._directory)[-200:]
 
     def known_answers(self) -> dict[str, int]:
         """Number of answers of each service up to the newest that `add_answers` has got."""

@@ -52,6 +52,8 @@ def saved_page(answers: Answers, limit: int, progress: Progress = lambda done, o
     about = answers.about()
     kept = {f"meshes/{mesh['id']}": _packed(answers.get(f"meshes/{mesh['id']}")) for mesh in about["meshes"]}
     kept |= {f"meshes/{name}": _packed(answers.get(f"meshes/{name}")) for name in about["assets"].values()}
+    if about["radio_map"]:
+        kept["radio-map"] = _packed(answers.get("radio-map"))
     for user in range(len(answers.users())):
         kept[f"curves/{user}"] = _packed(answers.get("curves", {"user": str(user)}))
     room = limit - len(page) - sum(map(len, kept.values())) - _LOBES * _LOBE_BYTES

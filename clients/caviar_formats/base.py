@@ -149,7 +149,7 @@ class Format:
 FORMATS: Mapping[str, str] = {
     "deepmimo": "caviar_formats.deepmimo:DeepMimo",
     "deepsense": "caviar_formats.deepsense:DeepSense",
-    "foxglove": "caviar_formats.viewers:Foxglove",
+    "foxglove": "caviar_formats.foxglove:Foxglove",
     "huggingface": "caviar_formats.parquet:HuggingFace",
     "itu": "caviar_formats.itu:Itu",
     "minari": "caviar_formats.minari:Minari",
@@ -158,8 +158,8 @@ FORMATS: Mapping[str, str] = {
     "p2m": "caviar_formats.p2m:P2m",
     "parquet": "caviar_formats.parquet:Parquet",
     "pcd": "caviar_formats.traces:Pcd",
-    "rerun": "caviar_formats.viewers:Rerun",
-    "ros2": "caviar_formats.viewers:Ros2",
+    "rerun": "caviar_formats.rerun:Rerun",
+    "ros2": "caviar_formats.ros2:Ros2",
     "sionna": "caviar_formats.npz:Sionna",
     "viwi": "caviar_formats.viwi:ViWi",
 }

@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 
 from caviar_broker.control.socket import ask
-from caviar_broker.http.process import gateway_credentials, reachable
-from caviar_broker.security.access import PAGE
-from caviar_formats.viewers import FoxgloveMessages, moment
+from caviar_broker.http.process import reachable
+from caviar_formats.foxglove import FoxgloveMessages
+from caviar_formats.viewers import moment
 from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import SetupError
 from caviar_protocol.fields import Asset
@@ -66,24 +66,29 @@ class _Guests:
 def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> None:
     """Serve a run to Foxglove on this machine until it ends: the newest frames, as an observer sees them.
 
-    The server of Foxglove's SDK asks nobody for a token: it is reached from this machine alone.
+    The server of Foxglove's SDK asks nobody for a token: it is reached from this machine alone, and a run of
+    which the broker asks for keys is not served.
 
     Args:
         run: Directory of the run.
         port: To serve at; 0: any.
-        announce: Called with the address that Foxglove opens.
+        announce: Called with the address that Foxglove opens, once there is a frame.
 
     Raises:
         RunError: No broker runs there, or it refuses the observer.
-        SetupError: The SDK of Foxglove is not installed, or the port is taken.
+        SetupError: The SDK of Foxglove is not installed, the port is taken, or the broker asks for keys.
     """
     if find_spec("foxglove") is None:
         raise SetupError(f"--foxglove needs foxglove; run: {install_command('viewers')}")
     import foxglove
 
-    status, keys = ask(run, do="status")["status"], ask(run, do="gateway")
+    if ask(run, do="gateway")["keys"] is not None:
+        raise SetupError(
+            f"the broker in {run} asks for keys, and any program of this machine could read the run from a "
+            "server without them; leave out --foxglove, or export the recording with --to foxglove"
+        )
+    status = ask(run, do="status")["status"]
     world = World(_assets(run), json.loads(RunDirectory(run).record.read_text("utf-8"))["scenario"])
-    credentials = gateway_credentials(keys)
     context, guests = foxglove.Context(), _Guests()
     try:
         server = foxglove.start_server(
@@ -91,20 +96,21 @@ def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> Non
         )
     except (OSError, RuntimeError) as error:
         raise SetupError(f"--foxglove {port}: {error}; choose another port, or 0 for any") from error
-    messages = FoxgloveMessages(context)
+    messages, is_announced = FoxgloveMessages(context), False
     try:
-        announce(f"ws://127.0.0.1:{server.port}")
-        name = PAGE if credentials is not None else "Foxglove"
         endpoint = reachable(status["endpoint"])
-        with Observer(endpoint, name, credentials=credentials, period_s=PERIOD_S) as observer:
+        with Observer(endpoint, "Foxglove", period_s=PERIOD_S) as observer:
             for seen in observer:
-                if seen.frame < 0:
+                if seen.frame < 0 or not seen.products:  # a run that begins, or pauses
                     continue
                 messages.stamp(seen.message.t_ns)
                 if guests.has_come:
                     guests.has_come = False
                     messages.scenery(world)
                 messages.add(moment(ObservedFrame(seen)))
+                if not is_announced:  # with its topics: the SDK refuses who subscribes to one as it appears
+                    is_announced = True
+                    announce(f"ws://127.0.0.1:{server.port}")
     finally:
         server.stop()
 

@@ -1,13 +1,10 @@
-"""Formats that viewers open: ``foxglove`` and ``ros2``, MCAP for Foxglove and ROS 2, and ``rerun``.
+"""Content of a frame that viewers show, and the class of their formats: ``foxglove``, ``ros2`` and ``rerun``.
 
-All have a file or folder for each episode, of which `moments` collects what viewers show frame by frame.
-Times are those of the simulation.
+All have a file or folder for each episode, and the times of the simulation.
 """
 
 from __future__ import annotations
 
-import re
-import shutil
 import textwrap
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
@@ -20,12 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caviar_clients.cli.plot import beam_amplitude
-from caviar_clients.datasets.user_rows import Users
 from caviar_clients.plots.rays import RANGE_DB, rays
-from caviar_clients.plots.style import SKY, VERMILION
 from caviar_formats.base import Format, Part
 from caviar_protocol.arrays import Float64Array, Payload
-from caviar_protocol.errors import RunError
 from caviar_protocol.messages import Status
 from caviar_protocol.space.coordinates import Pose, compose, unit_vectors
 from caviar_protocol.space.scene import device_pose, object_pose
@@ -40,7 +34,7 @@ from caviar_protocol.topics import (
     Scene,
 )
 from caviar_protocol.topics.sensors import CameraImage, DepthImage, LidarScan
-from caviar_space.meshes import Mesh, joined, placed
+from caviar_space.meshes import Mesh
 from caviar_view.answers import SERIES
 from caviar_view.world import World
 
@@ -49,8 +43,6 @@ WORLD = "world"
 """Frame of reference whose axes are those of the world."""
 LOBE_M, TICK_M = 10.0, 3.0
 """Lengths of the strongest direction of a beam, and of the ticks of paths whose route is unknown [m]."""
-CUBE, LINE_STRIP, TRIANGLE_LIST, FLOAT32 = 1, 4, 11, 7
-"""Numbers of visualization_msgs/Marker and sensor_msgs/PointField."""
 ORIGIN = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 # Turns axes x right, y down, z forward into those of a device, x forward, y left, z up.
 _OPTICAL = Pose((0.0, 0.0, 0.0), (0.5, -0.5, 0.5, -0.5))
@@ -206,7 +198,7 @@ def rgb(color: str) -> list[float]:
     return [value / 255 for value in bytes.fromhex(color[1:])]
 
 
-class _Viewer(Format):
+class Viewer(Format):
     """A format with a file or folder for each episode."""
 
     extra = "viewers"
@@ -242,468 +234,15 @@ class _Viewer(Format):
         """
 
 
-_FRAMES = """Lengths are in metres.
+FRAMES = """Lengths are in metres.
 
 Frames of reference are `world` (x to the east, y to the north, z up), objects and devices by name (x forward,
 y left, z up), and `CAMERA_optical` (x right, y down, z forward)."""
+"""Paragraphs of a README."""
 
 
-def _series() -> str:
-    """Values of a user, for a README."""
+def series_text() -> str:
+    """Describe the values of a user, for a README."""
     series = (f"`{name}` [{unit}]" for name, (unit, _) in SERIES.items())
     text = f"{', '.join(series)}, and the chosen `tx_beam` and `rx_beam`."
     return textwrap.fill(text, 105, initial_indent="  ", subsequent_indent="  ")
-
-
-class Foxglove(_Viewer):
-    """MCAP with the schemas of Foxglove, which Foxglove and Lichtblick open, and Rerun in part."""
-
-    packages = ("foxglove",)
-
-    def write_episode(self, place: Path, world: World, moments: Iterator[Moment]) -> None:
-        import foxglove
-
-        context = foxglove.Context()
-        with foxglove.open_mcap(place.with_suffix(".mcap"), allow_overwrite=True, context=context):
-            file = FoxgloveMessages(context)
-            for number, now in enumerate(moments):
-                file.stamp(now.t_ns)
-                if not number:
-                    file.scenery(world)
-                file.add(now)
-
-    def readme(self, users: Users) -> str:
-        return f"""# {users.dataset.name} for Foxglove
-
-`episode-N.mcap`: an episode, with simulated times. Messages have Foxglove's schemas in Protocol Buffers;
-those of `/users` are JSON. {_FRAMES}
-
-- `/tf`: FrameTransforms of objects in the world, and of devices on their objects.
-- `/scenery`: SceneUpdate of the first frame, triangles by material.
-- `/objects`: SceneUpdate, a box for each object, with its class.
-- `/rays`: SceneUpdate, a line for each path on the first carrier that its pair uses, yellow for the
-  strongest; metadata has its gain [dB] there. A path whose route is not known has a tick of {TICK_M:g} m at
-  either end.
-- `/beams`: SceneUpdate when a beam changes: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m
-  at the most.
-- `/lidar/SENSOR`: PointCloud in the axes of the sensor, with ranges [m] and the pose of the sensor.
-- `/camera/SENSOR/image`, `depth`, `calibration`: RawImage of colours, RawImage of depths [m],
-  CameraCalibration.
-- `/users/RX/TX/CARRIER`: for plots, without what is not finite,
-{_series()}
-
-`rerun mcap convert` draws transforms, points and pictures of these files.
-"""
-
-
-class FoxgloveMessages:
-    """Messages of Foxglove to a file or a server: topics have channels from their first message on.
-
-    Args:
-        context: Of the SDK, which the file or the server is of.
-    """
-
-    def __init__(self, context: Any) -> None:
-        import foxglove
-        from foxglove import channels, messages
-
-        self._channel, self._channels, self.fg = foxglove.Channel, channels, messages
-        self._context, self._topics = context, dict[str, Any]()
-        self._beams: list[tuple[str, int]] | None = None
-
-    def stamp(self, t_ns: int) -> None:
-        """Set the time of what follows [ns]."""
-        self._t_ns, self._stamp = t_ns, self.fg.Timestamp(*divmod(t_ns, 10**9))
-
-    def scenery(self, world: World) -> None:
-        """Show the scenery, and with the next frame all beams again: a viewer that comes has seen nothing."""
-        self._beams, entities = None, []
-        for group in world.groups:
-            about = {"triangles": len(group.mesh.faces), "of": group.of}
-            surface = self._surface(group.mesh, rgb(group.color))
-            entities.append(self._entity(f"{group.kind} of {group.material}", about, triangles=[surface]))
-        self._update("/scenery", entities)
-
-    def add(self, now: Moment) -> None:
-        """Show a frame."""
-        fg = self.fg
-        transforms = [(WORLD, name, pose) for name, _, pose, _ in now.objects] + now.mounts
-        self._log("/tf", fg.FrameTransforms(transforms=[self._transform(*each) for each in transforms]))
-        boxes = []
-        for name, kind, pose, size in now.objects:
-            cube = fg.CubePrimitive(
-                pose=self._pose(pose), size=self._vector(size), color=self._color(rgb(SKY))
-            )
-            boxes.append(self._entity(name, {"class": kind}, cubes=[cube]))
-        self._update("/objects", boxes)
-        lines = []
-        for number, (points, gain, color) in enumerate(now.rays):
-            line = fg.LinePrimitive(
-                type=fg.LinePrimitiveLineType.LineStrip,
-                pose=self._pose(ORIGIN),
-                thickness=0.15,
-                points=self._points(points),
-                color=self._color(color),
-            )
-            lines.append(self._entity(f"path {number}", {"gain_db": f"{gain:.2f}"}, lines=[line]))
-        self._update("/rays", lines)
-        beams = [(device.name, beam) for device, _, beam in now.beams]
-        if beams != self._beams:
-            self._beams, lobes = beams, []
-            for device, _, beam in now.beams:
-                surface = self._surface(lobe(device.array, beam), rgb(VERMILION), 0.4)
-                name = f"beam {beam} of {device.name}"
-                lobes.append(
-                    self._entity(name, {"beam": beam}, device.name, frame_locked=True, triangles=[surface])
-                )
-            self._update("/beams", lobes)
-        for scan in now.scans:
-            rows = np.concatenate([scan.points, scan.range[:, None]], axis=1).astype("<f4")
-            kind = fg.PackedElementFieldNumericType.Float32
-            fields = [
-                fg.PackedElementField(name=name, offset=4 * at, type=kind)
-                for at, name in enumerate(("x", "y", "z", "range"))
-            ]
-            cloud = fg.PointCloud(
-                timestamp=self._stamp,
-                frame_id=WORLD,
-                pose=self._pose(Pose(scan.position, scan.orientation)),
-                point_stride=16,
-                fields=fields,
-                data=rows.tobytes(),
-            )
-            self._log(f"/lidar/{scan.sensor}", cloud)
-        lenses = dict[str, Any]()
-        for image in now.images:
-            topic, encoding, pixels = picture(image)
-            height, width = pixels.shape[:2]
-            shared: dict[str, Any] = {
-                "timestamp": self._stamp,
-                "frame_id": optical(image),
-                "width": width,
-                "height": height,
-            }
-            step = pixels.strides[0]
-            raw = fg.RawImage(**shared, encoding=encoding, step=step, data=pixels.tobytes())
-            self._log(f"/camera/{image.sensor}/{topic}", raw)
-            k, p = projections(image)
-            turned = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-            lenses[image.sensor] = fg.CameraCalibration(**shared, K=k, R=turned, P=p)
-        for sensor, calibration in lenses.items():
-            self._log(f"/camera/{sensor}/calibration", calibration)
-        for user, values in now.users.items():
-            self._log(f"/users/{user}", values)
-
-    def _log(self, topic: str, message: Any) -> None:
-        if topic not in self._topics and isinstance(message, dict):
-            numbers = {name: {"type": "number"} for name in (*SERIES, "tx_beam", "rx_beam")}
-            schema = {"type": "object", "title": "caviar.User", "properties": numbers}
-            self._topics[topic] = self._channel(topic, schema=schema, context=self._context)
-        elif topic not in self._topics:
-            kind = getattr(self._channels, f"{type(message).__name__}Channel")
-            self._topics[topic] = kind(topic, context=self._context)
-        self._topics[topic].log(message, log_time=self._t_ns)
-
-    def _update(self, topic: str, entities: list[Any]) -> None:
-        # Each message has all of its topic, so that a jump in time shows what there is then.
-        fg = self.fg
-        gone = [fg.SceneEntityDeletion(timestamp=self._stamp, type=fg.SceneEntityDeletionType.All)]
-        self._log(topic, fg.SceneUpdate(deletions=gone, entities=entities))
-
-    def _entity(self, name: str, about: dict[str, Any], frame: str = WORLD, **parts: Any) -> Any:
-        pairs = [self.fg.KeyValuePair(key=key, value=str(value)) for key, value in about.items()]
-        return self.fg.SceneEntity(timestamp=self._stamp, frame_id=frame, id=name, metadata=pairs, **parts)
-
-    def _surface(self, mesh: Mesh, color: list[float], alpha: float = 1.0) -> Any:
-        return self.fg.TriangleListPrimitive(
-            pose=self._pose(ORIGIN),
-            points=self._points(mesh.vertices),
-            color=self._color(color, alpha),
-            indices=mesh.faces.ravel().tolist(),
-        )
-
-    def _transform(self, parent: str, name: str, pose: Pose) -> Any:
-        return self.fg.FrameTransform(
-            timestamp=self._stamp,
-            parent_frame_id=parent,
-            child_frame_id=name,
-            translation=self._vector(pose.position),
-            rotation=self._turned(pose),
-        )
-
-    def _pose(self, pose: Pose) -> Any:
-        return self.fg.Pose(position=self._vector(pose.position), orientation=self._turned(pose))
-
-    def _turned(self, pose: Pose) -> Any:
-        w, x, y, z = pose.orientation
-        return self.fg.Quaternion(x=x, y=y, z=z, w=w)
-
-    def _vector(self, values: Sequence[float]) -> Any:
-        x, y, z = values
-        return self.fg.Vector3(x=x, y=y, z=z)
-
-    def _points(self, points: Float64Array) -> list[Any]:
-        return [self.fg.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
-
-    def _color(self, color: list[float], alpha: float = 1.0) -> Any:
-        r, g, b = color
-        return self.fg.Color(r=r, g=g, b=b, a=alpha)
-
-
-class Ros2(_Viewer):
-    """Bags of ROS 2, in MCAP, with standard messages."""
-
-    packages = ("rosbags",)
-
-    def write_episode(self, place: Path, world: World, moments: Iterator[Moment]) -> None:
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-
-        shutil.rmtree(place, ignore_errors=True)
-        # Version 8 of the metadata, which ROS 2 Iron and everything newer reads.
-        writer = Writer(place, version=8, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        with writer:
-            bag = _Bag(writer)
-            for number, now in enumerate(moments):
-                bag.stamp(now.t_ns)
-                if not number:
-                    bag.scenery(world)
-                bag.add(now)
-
-    def readme(self, users: Users) -> str:
-        return f"""# {users.dataset.name} as bags of ROS 2
-
-`episode-N`: a bag, `episode-N.mcap` and its `metadata.yaml`, with simulated times, as of `use_sim_time`.
-{_FRAMES}
-What is no letter, digit or slash in a name is an underscore in topics.
-
-- `/tf`: tf2_msgs/TFMessage of objects in the world, and of devices on their objects.
-- `/scenery`: visualization_msgs/MarkerArray of the first frame, triangles by material.
-- `/objects`: visualization_msgs/MarkerArray, a box for each object.
-- `/objects/NAME/pose`: geometry_msgs/PoseStamped of the centre of the box.
-- `/rays`: visualization_msgs/MarkerArray, lines of paths on the first carrier that their pair uses, yellow
-  for the strongest. A path whose route is not known has a tick of {TICK_M:g} m at either end.
-- `/lidar/SENSOR/points`: sensor_msgs/PointCloud2 in the world, with ranges [m].
-- `/camera/SENSOR/image`, `depth`, `camera_info`: sensor_msgs/Image `rgb8`, Image `32FC1` [m], CameraInfo.
-- `/users/RX/TX/CARRIER/NAME`: std_msgs/Float64, without what is not finite,
-{_series()}
-"""
-
-
-class _Bag:
-    """Messages of a bag: topics have connections from their first message on."""
-
-    def __init__(self, writer: Any) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._writer, self._topics = writer, dict[str, tuple[str, Any]]()
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
-        self._known = set[str]()
-
-    def stamp(self, t_ns: int) -> None:
-        self._t_ns, self._time = t_ns, self._new("builtin_interfaces/Time", *divmod(t_ns, 10**9))
-
-    def scenery(self, world: World) -> None:
-        markers = []
-        for number, group in enumerate(world.groups):
-            corners = self._points(group.mesh.vertices[group.mesh.faces].reshape(-1, 3))
-            name, color = f"{group.kind} of {group.material}", rgb(group.color)
-            markers.append(self._marker(name, number, TRIANGLE_LIST, color=color, points=corners))
-        self._markers("/scenery", markers)
-
-    def add(self, now: Moment) -> None:
-        new = self._new
-        transforms = []
-        for parent, name, pose in [(WORLD, name, pose) for name, _, pose, _ in now.objects] + now.mounts:
-            moved = new("geometry_msgs/Transform", self._vector(pose.position), self._turned(pose))
-            transforms.append(new("geometry_msgs/TransformStamped", self._header(parent), name, moved))
-        self._log("/tf", new("tf2_msgs/TFMessage", transforms))
-        boxes = []
-        for number, (name, _, pose, size) in enumerate(now.objects):
-            boxes.append(self._marker(name, number, CUBE, pose=pose, scale=size, color=rgb(SKY)))
-            stamped = new("geometry_msgs/PoseStamped", self._header(WORLD), self._pose(pose))
-            self._log(f"/objects/{name}/pose", stamped)
-        self._markers("/objects", boxes)
-        lines = []
-        for number, (points, _, color) in enumerate(now.rays):
-            lines.append(
-                self._marker(
-                    "paths",
-                    number,
-                    LINE_STRIP,
-                    scale=(0.15, 0.0, 0.0),
-                    color=color,
-                    points=self._points(points),
-                )
-            )
-        self._markers("/rays", lines)
-        for scan in now.scans:
-            rows = np.concatenate([scan.in_world(), scan.range[:, None]], axis=1).astype("<f4")
-            names = enumerate(("x", "y", "z", "range"))
-            fields = [new("sensor_msgs/PointField", name, 4 * at, FLOAT32, 1) for at, name in names]
-            shape = 1, len(rows), fields, False, 16, 16 * len(rows), rows.view(np.uint8).ravel(), True
-            cloud = new("sensor_msgs/PointCloud2", self._header(WORLD), *shape)
-            self._log(f"/lidar/{scan.sensor}/points", cloud)
-        lenses = dict[str, Any]()
-        for image in now.images:
-            topic, encoding, pixels = picture(image)
-            (height, width), header = pixels.shape[:2], self._header(optical(image))
-            content = encoding, 0, pixels.strides[0], pixels.view(np.uint8).ravel()
-            self._log(
-                f"/camera/{image.sensor}/{topic}", new("sensor_msgs/Image", header, height, width, *content)
-            )
-            k, p = (np.array(matrix) for matrix in projections(image))
-            region = new("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
-            shared = header, height, width, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), p, 0, 0, region
-            lenses[image.sensor] = new("sensor_msgs/CameraInfo", *shared)
-        for sensor, lens in lenses.items():
-            self._log(f"/camera/{sensor}/camera_info", lens)
-        for user, values in now.users.items():
-            for name, value in values.items():
-                self._log(f"/users/{user}/{name}", new("std_msgs/Float64", value))
-
-    def _new(self, kind: str, *values: Any) -> Any:
-        return self._store.types[kind.replace("/", "/msg/")](*values)
-
-    def _log(self, name: str, message: Any) -> None:
-        kind = message.__msgtype__
-        if name not in self._topics:
-            topic = re.sub(r"/(?=\d)", "/_", re.sub(r"[^A-Za-z0-9/]", "_", name))
-            if topic in self._known:
-                raise RunError(
-                    f"two names are the topic {topic!r} of ROS, one of them is {name!r}; rename it"
-                )
-            self._known.add(topic)
-            self._topics[name] = self._writer.add_connection(topic, kind, typestore=self._store)
-        self._writer.write(self._topics[name], self._t_ns, self._store.serialize_cdr(message, kind))
-
-    def _markers(self, topic: str, markers: list[Any]) -> None:
-        self._log(topic, self._new("visualization_msgs/MarkerArray", [self._marker(action=3), *markers]))
-
-    def _marker(
-        self, name: str = "", number: int = 0, kind: int = 0, action: int = 0, pose: Pose = ORIGIN,
-        scale: Sequence[float] = (1.0, 1.0, 1.0), color: Sequence[float] = (1.0, 1.0, 1.0),
-        points: Sequence[Any] = (), colors: Sequence[Any] = (),
-    ) -> Any:  # fmt: skip
-        new, header, none = self._new, self._header(WORLD), np.zeros(0, np.uint8)
-        return new(
-            "visualization_msgs/Marker", header, name, number, kind, action, self._pose(pose),
-            self._vector(scale), self._color(color), new("builtin_interfaces/Duration", 0, 0), False, points,
-            colors, "", new("sensor_msgs/CompressedImage", header, "", none), [], "", "",
-            new("visualization_msgs/MeshFile", "", none), False,
-        )  # fmt: skip
-
-    def _header(self, frame: str) -> Any:
-        return self._new("std_msgs/Header", self._time, frame)
-
-    def _pose(self, pose: Pose) -> Any:
-        place = self._new("geometry_msgs/Point", *pose.position)
-        return self._new("geometry_msgs/Pose", place, self._turned(pose))
-
-    def _turned(self, pose: Pose) -> Any:
-        w, x, y, z = pose.orientation
-        return self._new("geometry_msgs/Quaternion", x, y, z, w)
-
-    def _vector(self, values: Sequence[float]) -> Any:
-        return self._new("geometry_msgs/Vector3", *values)
-
-    def _points(self, points: Float64Array) -> list[Any]:
-        return [self._new("geometry_msgs/Point", *point) for point in points.tolist()]
-
-    def _color(self, color: Sequence[float]) -> Any:
-        return self._new("std_msgs/ColorRGBA", *color, 1.0)
-
-
-class Rerun(_Viewer):
-    """Recordings of Rerun."""
-
-    packages = ("rerun",)
-    extra = "rerun"
-
-    def write_episode(self, place: Path, world: World, moments: Iterator[Moment]) -> None:
-        import rerun as rr
-
-        name = f"{place.parent.name.removesuffix('.part')} {place.name}"
-        # By size alone: by default what is logged in 0.2 s is a chunk, each of two kilobytes for a number.
-        batches = rr.ChunkBatcherConfig(flush_tick=3600.0)
-        stream = rr.RecordingStream(
-            "caviar", recording_id=name, send_properties=False, batcher_config=batches
-        )
-        stream.save(place.with_suffix(".rrd"))
-        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for group in world.groups:
-            stream.log(
-                ["world", "scenery", f"{group.kind} of {group.material}"],
-                _rerun_mesh(group.mesh, rgb(group.color)),
-                static=True,
-            )
-        for now in moments:
-            stream.set_time("time", duration=np.timedelta64(now.t_ns, "ns"))
-            boxes = rr.Boxes3D(
-                centers=[pose.position for _, _, pose, _ in now.objects],
-                quaternions=[_rerun_turned(pose) for _, _, pose, _ in now.objects],
-                sizes=[size for *_, size in now.objects],
-                labels=[name for name, *_ in now.objects],
-                colors=[rgb(SKY)] * len(now.objects),
-            )
-            stream.log("world/objects", boxes)
-            strips, colors = [points for points, _, _ in now.rays], [color for *_, color in now.rays]
-            stream.log("world/rays", rr.LineStrips3D(strips, colors=colors, radii=0.08))
-            lobes = [
-                Mesh(placed(lobe(device.array, beam), np.ones(3), pose), lobe(device.array, beam).faces)
-                for device, pose, beam in now.beams
-            ]
-            stream.log("world/beams", _rerun_mesh(joined(lobes), [*rgb(VERMILION), 0.4]))
-            for scan in now.scans:
-                pose = Pose(scan.position, scan.orientation)
-                points = np.array(scan.points)  # a copy: Rerun ends the process where memory is not aligned
-                stream.log(["world", "lidar", scan.sensor], _rerun_pose(pose), rr.Points3D(points))
-            for image in now.images:
-                topic, _, pixels = picture(image)
-                optics, (height, width) = image.intrinsics, pixels.shape[:2]
-                # Pixel centres are at +½ there, too.
-                pinhole = rr.Pinhole(
-                    focal_length=(optics.fx, optics.fy),
-                    principal_point=(optics.cx, optics.cy),
-                    resolution=(width, height),
-                )
-                camera = ["world", "camera", image.sensor]
-                stream.log(camera, _rerun_pose(camera_pose(image)), pinhole)
-                shown = rr.DepthImage(pixels, meter=1.0) if topic == "depth" else rr.Image(pixels)
-                stream.log([*camera, topic], shown)
-            for user, values in now.users.items():
-                for name, value in values.items():
-                    stream.log(["users", *user.split("/"), name], rr.Scalars(value))
-        stream.disconnect()
-
-    def readme(self, users: Users) -> str:
-        return f"""# {users.dataset.name} for Rerun
-
-`episode-N.rrd`: an episode, with simulated times on the timeline `time`. {_FRAMES}
-
-- `world/scenery`: meshes by material.
-- `world/objects`: boxes, with names.
-- `world/rays`: paths on the first carrier that their pair uses, yellow for the strongest. One whose route is
-  not known has a tick of {TICK_M:g} m at either end.
-- `world/beams`: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m at the most.
-- `world/lidar/SENSOR`: points. `world/camera/CAMERA`: `image`, and `depth` [m].
-- `users/RX/TX/CARRIER/NAME`: for plots, without what is not finite,
-{_series()}
-"""
-
-
-def _rerun_turned(pose: Pose) -> list[float]:
-    w, *xyz = pose.orientation
-    return [*xyz, w]
-
-
-def _rerun_pose(pose: Pose) -> Any:
-    import rerun as rr
-
-    return rr.Transform3D(translation=pose.position, quaternion=_rerun_turned(pose))
-
-
-def _rerun_mesh(mesh: Mesh, color: list[float]) -> Any:
-    import rerun as rr
-
-    return rr.Mesh3D(vertex_positions=mesh.vertices, triangle_indices=mesh.faces, albedo_factor=color)

@@ -188,7 +188,7 @@ def test_it_is_steered_by_mouse_keyboard_and_link(opened: Callable[..., Page]) -
     page.until("s.n === 3")
     page.raw.mouse.move(640, 300)
     page.raw.mouse.wheel(0, 240)
-    page.holds("location.hash.includes('cam')")
+    page.holds("location.hash.includes('cam') && location.hash.includes('n=3')")
     link, state = page.raw.evaluate("location.href"), page.state
     again = opened(url=link)
     assert (again.state["n"], again.state["selected"]) == (3, nearest)
@@ -256,6 +256,11 @@ def test_a_saved_page_needs_no_server(browser: Any, recorded: Path, tmp_path: Pa
     finished = caviar("view", recorded, "--save", file, "--limit", "4")
     assert finished.status == 0, finished.output
     assert file.stat().st_size <= 4e6
+    for wrong in (tmp_path, tmp_path / "nowhere" / "page.html"):
+        refused = caviar("view", recorded, "--save", wrong)
+        assert refused.status == 1
+        assert str(wrong) in refused.output
+        assert "Traceback" not in refused.output
     page = Page(browser, file.as_uri())
     page.until("s.shown.paths > 0")
     page.press("End")

@@ -32,9 +32,10 @@ from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
 from caviar_formats.cli import export_command, import_command
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
+from caviar_formats.ros2 import Ros2
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
-from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, Ros2, lobe
+from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, lobe
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import CaviarError, RecordingError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
@@ -1126,6 +1127,19 @@ def test_an_export_refuses_a_folder_that_another_writes(data: Dataset, tmp_path:
     assert len(refused) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["npz"]
     assert sorted(path.name for path in out.iterdir()) == ["README.md", "users-00000.npz"]
+
+
+def test_an_import_refuses_a_folder_that_another_writes(tmp_path: Path) -> None:
+    file, out, refused = p2m(tmp_path, P2M.format(phase="")), tmp_path / "data", list[str]()
+
+    def again(_: int) -> None:
+        with pytest.raises(RunError, match="another process writes the dataset") as error:
+            import_dataset(insite(file), out)
+        refused.append(str(error.value))
+
+    import_dataset(insite(file), out, again)
+    assert (len(refused), list(verify(out))) == (1, [])
+    assert not out.with_name("data.part").exists()
 
 
 def test_an_export_of_a_run_names_the_run(folder: Path) -> None:

@@ -16,9 +16,9 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from caviar_broker.control.socket import Ask, ask_in_thread, call_at_end, connect
 from caviar_broker.http.auth import Tokens, http_address
@@ -181,14 +181,8 @@ async def _keys_of_broker(ask: Ask, keys: Path | None) -> tuple[Path | None, Cre
     directory = Path(answer["keys"])
     if keys is not None and keys.resolve() != directory:
         raise RunError(f"the broker has its keys and tokens in {directory}, not in {keys}; leave out --keys")
-    return directory, gateway_credentials(answer)
-
-
-def gateway_credentials(answer: Mapping[str, Any]) -> Credentials | None:
-    """Make the credentials of a broker's answer to ``gateway``; None where it has no keys."""
-    if answer["keys"] is None:
-        return None
-    return Credentials(Pair(public=answer["public"], secret=answer["secret"]), answer["broker"])
+    pair = Pair(public=answer["public"], secret=answer["secret"])
+    return directory, Credentials(pair, answer["broker"])
 
 
 def reachable(endpoint: str) -> str:

@@ -127,7 +127,7 @@ class LiveView:
             raise RunError(f"cannot read {self._record}: {error.strerror}") from None
         scenario = record["scenario"]
         seed = (scenario.get("run") or {}).get("seed", 0)
-        self._frames = LiveFrames(scenario, status["run"], seed, assets)
+        self._frames = LiveFrames(self._record.parent, scenario, status["run"], seed, assets)
         self._answers = Answers(self._frames, controls=True)
         threading.Thread(target=self._observe, args=(self._frames,), name="observer", daemon=True).start()
         for _ in range(100):  # the first frame, where there is one: a page can show it at once
@@ -151,7 +151,11 @@ class LiveView:
         while not self._failure:
             now = time.monotonic()
             if frames.end != told or now - said_at > QUIET_S:
-                why = (await self._ask(do="why"))["why"]
+                try:
+                    why = (await self._ask(do="why"))["why"]
+                except RunError:  # a broker that is busy, or that has ended, as the observer finds out
+                    await asyncio.sleep(QUIET_S)
+                    continue
                 added = answers.blocks(told)
                 told, said_at = frames.end, now
                 event = {key: why.get(key) for key in ("state", "paused", "waits")}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from rich.console import Console
 
-from caviar_clients.cli.shared import print_line, progress_bar
+from caviar_clients.cli.shared import print_line, progress_bar, require_writable
 from caviar_clients.files import writing
 from caviar_protocol.errors import CaviarError, RecordingError, SetupError
 from caviar_protocol.files import read_regular
@@ -57,13 +57,16 @@ def view(
     if save is not None:
         from caviar_view.save import saved_page
 
+        require_writable(save)
+
         answers = Answers(_frames(source, episode))
         with progress_bar(Console(stderr=True), transient=True) as bar:
             task = bar.add_task("frames", total=None)
             content, every = saved_page(
                 answers, int(limit_mb * 1e6), lambda done, of: bar.update(task, completed=done, total=of)
             )
-        save.write_bytes(content)
+        with writing(save):
+            save.write_bytes(content)
         thin = "" if every == 1 else f", every {every} frames one"
         print_line(console, f"{save}: {len(content) / 1e6:.1f} MB{thin}; it opens without a server")
         return

@@ -11,6 +11,7 @@ export const LAYERS = {
   rays: "Rays",
   beams: "Beams",
   lidar: "LIDAR",
+  map: "Radio map",
   frusta: "Frusta",
   pictures: "Pictures",
   grid: "Grid",

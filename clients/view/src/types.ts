@@ -49,6 +49,8 @@ export interface About {
   /** Only every so-many-th place is there. */
   every: number;
   beside: boolean;
+  /** Whether there is `radio-map`. */
+  radio_map?: boolean;
   /** sRGB from 0 to 1. */
   materials: { name: string; color: Vector }[];
   meshes: MeshInfo[];

@@ -61,7 +61,7 @@ export class LayersPanel {
       lidar: ["lidar"],
       pictures: ["camera", "depth", "segmentation"],
     };
-    const there = (layer: string) => needed[layer as Layer]?.some((topic) => about.topics[topic]?.length) ?? true;
+    const there = (layer: string) => (layer !== "map" || !!about.radio_map) && (needed[layer as Layer]?.some((topic) => about.topics[topic]?.length) ?? true);
     const boxes = Object.entries(LAYERS).filter(([layer]) => there(layer)).map(([layer, text]) => {
       const box = el("input", { type: "checkbox", change: () => store.toggleLayer(layer as Layer) });
       this.shown.set(layer, box);

@@ -10,6 +10,7 @@ import { Cameras } from "./cameras";
 import { Devices } from "./devices";
 import type { Label } from "./labels";
 import { Points } from "./lidar";
+import { RadioMap } from "./radio_map";
 import { Objects } from "./objects";
 import { type Path, pathsOf, Rays } from "./rays";
 import type { Theme } from "./theme";
@@ -30,6 +31,7 @@ export class RunView {
   readonly beams: Beams;
   readonly points: Points;
   readonly cameras: Cameras;
+  readonly radioMap: RadioMap;
   frame: Frame | null = null;
   private readonly hemisphere = new HemisphereLight();
   readonly sun = new DirectionalLight();
@@ -48,14 +50,16 @@ export class RunView {
     this.beams = new Beams(origin);
     this.points = new Points(origin);
     this.cameras = new Cameras(about, origin);
-    const layers = [this.world, this.objects, this.devices, this.rays, this.beams, this.points, this.cameras];
+    this.radioMap = new RadioMap(origin);
+    const layers = [this.world, this.objects, this.devices, this.rays, this.beams, this.points, this.cameras, this.radioMap];
     this.scene.add(...layers.map(({ group }) => group), this.hemisphere, this.sun, this.sun.target);
     this.placeSun(origin);
   }
 
   /** Fetch what stands still. */
   async load(report: (text: string) => void): Promise<void> {
-    await Promise.all([this.world.load(this.source), this.objects.load(this.source, report)]);
+    const map = this.about.radio_map ? this.radioMap.load(this.source).catch((error: Error) => report(error.message)) : null;
+    await Promise.all([this.world.load(this.source), this.objects.load(this.source, report), map]);
   }
 
   /** Show a frame. */
@@ -81,6 +85,7 @@ export class RunView {
     this.rays.group.visible = layers.has("rays");
     this.beams.group.visible = layers.has("beams");
     this.points.group.visible = layers.has("lidar");
+    this.radioMap.group.visible = layers.has("map");
     // On board of a camera its picture would stand before the world.
     this.cameras.group.visible = layers.has("frusta") && state.mode !== "board";
   }
