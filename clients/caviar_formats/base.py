@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import pairwise
@@ -69,16 +72,20 @@ class Format:
     """Extra that brings them."""
     needs: ClassVar[Sequence[str]] = ()
     """Recorded arrays without which there is no export: ``channel.a``."""
-    needs_users: ClassVar[bool] = True
-    """Whether there is no export of scenes without users."""
+    of_all_users: ClassVar[bool] = False
+    """Whether a file is of all users, so that none are chosen, or of scenes without any."""
     whole_episodes: bool = False
     """Whether no part ends within an episode, whose scenes share a file."""
     temporary: ClassVar[Sequence[str]] = ()
     """Folders of the export that are removed once `finish` has made files of them."""
     frequency_hz: float | None = None
     """Of the carrier, where the files that are read do not have it [Hz]."""
+    takes_origin: ClassVar[bool] = False
+    """Whether `origin` is of use."""
     origin: tuple[float, float] | None = None
     """Latitude and longitude of the origin of the world [°], where the dataset does not have them."""
+    name: str = ""
+    """NAME of the commands, of `find_format`."""
     loses: ClassVar[str] = ""
     """Parts of a dataset that the format cannot hold, for the README of the export."""
 
@@ -109,7 +116,7 @@ class Format:
         Raises:
             RecordingError, RunError: As of `begin`.
         """
-        raise RunError(f"datasets are imported from {type(self).__name__}, not exported to it")
+        raise NotImplementedError
 
     def finish(self, users: Users, folder: Path) -> None:
         """Write what only the whole says, once all parts are there.
@@ -136,7 +143,7 @@ class Format:
         Raises:
             RunError: They are damaged, or none of the format; names file and place. So does their iterator.
         """
-        raise RunError(f"datasets are exported to {type(self).__name__}, not imported from it")
+        raise RunError(f"datasets are exported to {self.name or type(self).__name__}, not imported from it")
 
 
 FORMATS: Mapping[str, str] = {
@@ -175,10 +182,15 @@ def find_format(name: str, flavour: str = "", option: str = "--to") -> Format:
     place = FORMATS.get(name)
     cls = resolve_name(place) if place else plugin_class(FORMAT_PLUGINS, name, Format)
     if cls is None:
-        raise RunError(f"{option} {name!r}: {suggestion(name, [*FORMATS, *plugins(FORMAT_PLUGINS)])}")
+        way = "write" if option == "--to" else "read"
+        known = [
+            key for key, at in FORMATS.items() if getattr(resolve_name(at), way) is not getattr(Format, way)
+        ]
+        raise RunError(f"{option} {name!r}: {suggestion(name, [*known, *plugins(FORMAT_PLUGINS)])}")
     if lacking := [module for module in cls.packages if find_spec(module) is None]:
         raise SetupError(f"{option} {name} needs {lacking[0]}; run: {install_command(cls.extra)}")
     found: Format = cls(flavour)
+    found.name = name
     return found
 
 
@@ -209,9 +221,12 @@ def export_users(
             or a file cannot be written.
         RecordingError, RunError: As of `Format.begin`.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise RunError(f"{out} is there and not empty; choose another folder with --out")
-    if not len(users) and to.needs_users:
+    _require_free(out)
+    if type(to).write is Format.write:
+        raise RunError(f"datasets are imported from {to.name or type(to).__name__}, not exported to it")
+    if to.of_all_users and len(users) != len(users.dataset.users()):
+        raise RunError("this format is of all users: leave --carrier, --tx and --object-class out")
+    if not len(users) and not to.of_all_users:
         raise RunError(f"{users.dataset.location} has no such users to export; record scene and channel")
     if lacking := [name for name in to.needs if name not in users.recorded()]:
         users.check_names(lacking)
@@ -223,8 +238,7 @@ def export_users(
     to.begin(users)
     parts = _parts(users, to.whole_episodes)
     folder = out.with_name(f"{out.name}.part")
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder), _held(folder, out):
         state = _continued(folder, _identity(users, to))
         scenes, of = 0, len(users.dataset.table("scenes"))
         for part in parts:
@@ -243,6 +257,29 @@ def export_users(
         (folder / "README.md").write_text(_readme(users, to), encoding="utf-8")
         folder.replace(out)
         (out / STATE).unlink()
+
+
+def _require_free(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out} is there and not empty; choose another folder with --out")
+
+
+@contextmanager
+def _held(folder: Path, out: Path) -> Iterator[None]:
+    """Make a folder and lock it, which a rename keeps, for as long as the block lasts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(
+                f"another export writes {out} now: wait for it, or choose another --out"
+            ) from error
+        _require_free(out)  # of an export that has ended in between
+        yield
+    finally:
+        os.close(lock)
 
 
 def _parts(users: Users, whole_episodes: bool) -> Iterator[Part]:

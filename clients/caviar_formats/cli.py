@@ -38,11 +38,16 @@ def export_command(
     """Export a dataset or a run to the format of another program; a command that was ended goes on."""
     from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
+    from caviar_clients.datasets.remote import is_address
     from caviar_formats.base import export_users, find_format
     from caviar_formats.runs import open_source
 
     console, form = Console(), find_format(to, flavour)
+    if origin is not None and not form.takes_origin:
+        raise RunError(f"--origin: {to} has no places on the Earth; leave it out")
     form.origin = None if origin is None else _origin(origin)
+    if not is_address(source) and Path(source).resolve() in (out.resolve(), *out.resolve().parents):
+        raise RunError(f"--out {out} is in {source}, which is read; choose a folder outside")
     columns = (MofNCompleteColumn(), TimeRemainingColumn())
     with open_source(source) as dataset, progress_bar(console, *columns, transient=True) as bar:
         users = dataset.users(carrier=carrier, tx=tx, object_class=object_class)
@@ -82,6 +87,8 @@ def import_command(
         task = bar.add_task(f"{form}: episodes", total=None)
         reader = find_format(form, flavour, "--from")
         reader.frequency_hz = frequency_hz
+        if not source.exists():
+            raise RunError(f"{source}: there is no such file or folder")
         found = reader.read(source)
         import_dataset(found, out, lambda done: bar.update(task, completed=done))
     for text in filter(None, (found.lacks, found.assumed)):

@@ -302,6 +302,9 @@ The rotation of an array is (roll, pitch, yaw) in degrees of its quaternion.
     def read(self, path: Path) -> Source:
         if self.frequency_hz is not None:
             raise RunError("--frequency-hz: the files have it; leave it out")
+        below = sorted(file.parent for file in path.glob("*/params.json"))
+        if below and not (path / "params.json").exists():
+            raise RunError(f"{path} is no scenario, it holds {len(below)}: give one of them, as {below[0]}")
         params = _json(path / "params.json")
         try:
             frequency = float(params["rt_params"]["frequency"])

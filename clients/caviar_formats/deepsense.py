@@ -40,6 +40,7 @@ class DeepSense(Format):
     packages = ("PIL",)
     needs = ("channel.h",)
     temporary = (_ROWS,)
+    takes_origin = True
     loses = (
         "Users without a path. Of channels all but the received power; heights, velocities, orientations; "
         "radar, which is not recorded; sensors that move with objects; depth, segmentation; objects."
@@ -182,9 +183,10 @@ to this folder, files are text unless it is said.
   float32 x, y, z [m] in the axes of the sensor: forward, left, up) of the sensors that stand beside the road;
   samples of one scene share them. A column is left out where none was recorded.
 - `unit1_pwr_60ghz`: 64 lines (`.txt`), received power of each beam [mW] at {ghz:g} GHz: of the recorded
-  narrowband H and transmit power, without noise and losses of a codebook, at the first element of the
-  receiver's array. Beams are steering vectors of the recorded array, in azimuth from its boresight, at its
-  elevation 0: beam 1 at −45°, the clockwise end, to beam 64 at +45°. Of an array of few columns they overlap.
+  narrowband H and transmit power, without noise and losses of a codebook, at the first element (top row, −y)
+  of the receiver's array. Beams are steering vectors of the recorded array, in azimuth from its boresight, at
+  its elevation 0: beam 1 at −45°, the clockwise end, to beam 64 at +45°. Of an array of few columns they
+  overlap.
 - `unit1_loc`, `unit2_loc`: latitude and longitude [°] on WGS84, two lines (`.txt`), without errors of a
   receiver. The world's origin is at {origin.latitude_deg:.9f}, {origin.longitude_deg:.9f}; x is to the east,
   y to the north.

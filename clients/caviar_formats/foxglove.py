@@ -58,8 +58,9 @@ those of `/users` are JSON. {FRAMES}
 - `/tf`: FrameTransforms of objects in the world, and of devices on their objects.
 - `/scenery`: SceneUpdate of the first frame, triangles by material.
 - `/objects`: SceneUpdate, a box for each object, with its class.
-- `/rays`: SceneUpdate, a line for each path, yellow for the strongest; metadata has its gain [dB]. A path
-  whose route is not known has a tick of {TICK_M:g} m at either end.
+- `/rays`: SceneUpdate, a line for each path on the first carrier that its pair uses, yellow for the
+  strongest; metadata has its gain [dB] there. A path whose route is not known has a tick of {TICK_M:g} m at
+  either end.
 - `/beams`: SceneUpdate when a beam changes: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m
   at the most.
 - `/lidar/SENSOR`: PointCloud in the axes of the sensor, with ranges [m] and the pose of the sensor.

@@ -111,14 +111,17 @@ def import_dataset(
     with writing(directory.path):
         if directory.path.exists() and not directory.catalogue.exists():
             raise RunError(f"{directory.path} is in the way, and no import that was cut off; remove it")
-        shutil.rmtree(directory.path, ignore_errors=True)
-        try:
-            with writing_dataset(directory):
+        with writing_dataset(directory):  # another import that writes there is refused
+            shutil.rmtree(directory.episodes)
+            directory.episodes.mkdir()
+            for file in directory.path.glob(f"{directory.catalogue.name}*"):
+                file.unlink()
+            try:
                 _write(source, directory, on_episode)
-            directory.path.replace(out)
-        except BaseException:
-            shutil.rmtree(directory.path, ignore_errors=True)
-            raise
+            except BaseException:
+                shutil.rmtree(directory.path, ignore_errors=True)
+                raise
+        directory.path.replace(out)
     return out
 
 

@@ -235,7 +235,7 @@ class Itu(Format):
 
     def readme(self, users: Users) -> str:
         (scenes, receivers), slots = self._shape, self._slots
-        rays = self._rays_file(Path(), "N").as_posix()
+        rays, split = self._rays_file(Path(), "N").as_posix(), ""
         about = {
             f"CoordVehiclesRxPerScene_{self._set}.csv": "a row for each receiver of a scene: Val is V where "
             "a ray reaches it and, with a LIDAR, its vehicle lies in the area of the grid; x, y of it, z the "
@@ -252,15 +252,19 @@ class Itu(Format):
             about["episodedata.db"] = "the same as tables of SQLite; vectors are float64 in binary"
         if self._grid:
             about[f"lidar_data_{self._set}/obstacles_e_N.npz"] = (
-                "`obstacles_matrix_array`, int8 [receivers, x, y, z]: 1 obstacle, −1 TX, −2 RX, 0 free; "
+                f"`obstacles_matrix_array`, int8 [{f'{scenes} scenes, ' * (scenes > 1)}{receivers} "
+                "receivers, x, y, z]: 1 obstacle, −1 TX, −2 RX, 0 free; "
                 f"cells of {self._grid['minimum_m']} to {self._grid['maximum_m']} m"
             )
         for number, camera in enumerate(self._cameras, 1):
-            about[f"image_data_{self._set}/camera{number}/N.png"] = f"pictures of {camera}"
+            about[f"image_data_{self._set}/camera{number}/N.png"] = f"pictures of {camera}" + (
+                f" in scene 0; of scene S in `N_S.png`, S to {scenes - 1}" * (scenes > 1)
+            )
         if self.flavour == "baseline":
             about = {f"raw_data/{name}": text for name, text in about.items()}
             about |= {f"baseline_data/{name.format('SPLIT')}": f"`{key}`" for name, key in TRAINING.values()}
             about["baseline_data/beam_output/best_pairs_SPLIT.npz"] = "index of the best pair, in both orders"
+            split = f" SPLIT is `train` up to episode {self._last_training}, then `validation`."
         return f"""# {users.dataset.name} in the layout of the ITU challenge ML5G-PHY
 
 {markdown_table(("file", "what is in it"), about.items())}
@@ -268,9 +272,10 @@ class Itu(Format):
 N is the number of the episode. Rows of all files are sorted by episode, scene and receiver. x is to the
 east, y to the north, z upwards; azimuth is from x to y, zenith from z. RxAngle is the yaw of the RX array's
 boresight: its elements follow each other along RxAngle + 90°. The phase is that of the gain between the
-first elements of both arrays, exp(+j·phase), with the carrier's. Readers open files of rays by this name,
-which says nothing of the scene; they take the TX array to lie along x, at a yaw of {TX_YAW_DEG:g}°: here it
-is {self._tx_yaw_deg:g}°. SPLIT is `train` up to episode {self._last_training}, then `validation`.
+first elements (top row, −y) of both arrays, exp(+j·phase), with the carrier's. Readers open files of rays by
+this name, which says nothing of the scene; they take the TX array to lie along x, at a yaw of
+{TX_YAW_DEG:g}°: here it is {self._tx_yaw_deg:g}°. VehicleName is without the prefix that the world gives its
+objects, as `bus` for `vehicle.bus`.{split}
 
 {_ABOUT_PHASES[self.flavour]}
 """

@@ -38,6 +38,7 @@ class Minari(Format):
     flavours: ClassVar[Mapping[str, str]] = {kind: f"with the reward {kind!r}" for kind in KINDS}
     packages = ("h5py",)
     needs = ("link.tx_beam",)
+    of_all_users = True
     whole_episodes = True
     temporary = (_PARTS,)
     loses = (
@@ -47,8 +48,6 @@ class Minari(Format):
 
     def begin(self, users: Users) -> None:
         dataset = users.dataset
-        if len(users) != len(dataset.users()):
-            raise RunError("a decision is for all users: leave --carrier, --tx and --object-class out")
         scenario = msgspec.convert(dataset.settings["scenario"], Scenario)
         if not any(spec.role == "agent" for spec in scenario.services.values()):
             raise RunError(f"{dataset.location} has no agent, whose decisions are exported; was it imported?")

@@ -26,6 +26,8 @@ LETTERS = {
 LENGTH = 2e-3
 """Of a path's delay from the length of its points, relative: files have five digits of either."""
 LENGTH_M = 0.05
+GAIN_DB = 0.5
+"""Of a straight path from free space between isotropic antennas, above which an import says so."""
 
 
 class P2m(Format):
@@ -36,7 +38,7 @@ class P2m(Format):
         if not files:
             raise RunError(f"{path} has no file *.paths.*.p2m")
         if (frequency_hz := self.frequency_hz) is None:
-            raise RunError(f"{path}: the files do not have the carrier's frequency; give --frequency-hz 60e9")
+            raise RunError(f"{path}: the files do not have the carrier's frequency; give --frequency-hz HZ")
         devices: dict[str, AntennaDevice] = {}
         paths = [one for file in files for one in _File(file, frequency_hz).pairs(devices)]
         return Source(
@@ -45,8 +47,24 @@ class P2m(Format):
             carriers=(Carrier(name="carrier", frequency_hz=frequency_hz),),
             lacks="The files have no receivers without paths, arrays, orientations, objects, Doppler shifts.",
             assumed="Powers are of transmitters that send 0 dBm on 100 MHz, antennas are single elements. "
-            "Phases that version 3.2 does not write are those of the delays, −2πfτ.",
+            "Phases that version 3.2 does not write are those of the delays, −2πfτ."
+            + _beside_free_space(paths, frequency_hz),
         )
+
+
+def _beside_free_space(paths: list[Paths], frequency_hz: float) -> str:
+    """Name the straight path that is farthest from free space, |a| = 1 / (4πfτ); empty: none is far."""
+    worst, text = GAIN_DB, ""
+    for pair in paths:
+        straight = ~np.asarray(pair.interactions).any(axis=1) & (pair.tau > 0)
+        for over in 20 * np.log10(np.abs(pair.a[0]) * 4 * np.pi * frequency_hz * pair.tau)[straight]:
+            if abs(over) > worst:
+                worst = abs(over)
+                text = (
+                    f" The straight path from {pair.tx} to {pair.rx} is {over:+.2f} dB from free space at "
+                    f"{frequency_hz / 1e9:g} GHz: antennas have gains, or --frequency-hz is another one's."
+                )
+    return text
 
 
 class _File:

@@ -96,8 +96,8 @@ class Rerun(Viewer):
 
 - `world/scenery`: meshes by material.
 - `world/objects`: boxes, with names.
-- `world/rays`: paths, yellow for the strongest. One whose route is not known has a tick of {TICK_M:g} m at
-  either end.
+- `world/rays`: paths on the first carrier that their pair uses, yellow for the strongest. One whose route is
+  not known has a tick of {TICK_M:g} m at either end.
 - `world/beams`: amplitudes of the chosen beams without side lobes, {LOBE_M:g} m at the most.
 - `world/lidar/SENSOR`: points. `world/camera/CAMERA`: `image`, and `depth` [m].
 - `users/RX/TX/CARRIER/NAME`: for plots, without what is not finite,

@@ -65,8 +65,8 @@ What is no letter, digit or slash in a name is an underscore in topics.
 - `/scenery`: visualization_msgs/MarkerArray of the first frame, triangles by material.
 - `/objects`: visualization_msgs/MarkerArray, a box for each object.
 - `/objects/NAME/pose`: geometry_msgs/PoseStamped of the centre of the box.
-- `/rays`: visualization_msgs/MarkerArray, lines of paths, yellow for the strongest. A path whose route is not
-  known has a tick of {TICK_M:g} m at either end.
+- `/rays`: visualization_msgs/MarkerArray, lines of paths on the first carrier that their pair uses, yellow
+  for the strongest. A path whose route is not known has a tick of {TICK_M:g} m at either end.
 - `/lidar/SENSOR/points`: sensor_msgs/PointCloud2 in the world, with ranges [m].
 - `/camera/SENSOR/image`, `depth`, `camera_info`: sensor_msgs/Image `rgb8`, Image `32FC1` [m], CameraInfo.
 - `/users/RX/TX/CARRIER/NAME`: std_msgs/Float64, without what is not finite,

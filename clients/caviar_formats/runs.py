@@ -9,10 +9,11 @@ from pathlib import Path
 
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory
-from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.reader import Dataset, check_level
 from caviar_clients.datasets.remote import is_address
 from caviar_clients.datasets.rows import rows_of, whole_recording
 from caviar_clients.datasets.settings import FORMAT
+from caviar_protocol.errors import RecordingError, RunError
 from caviar_protocol.files import PrivateFolder
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
@@ -30,6 +31,12 @@ def open_source(source: str) -> Iterator[Dataset]:
     """
     run = Path(source)
     if is_address(source) or not RunDirectory(run).segments():
+        if not is_address(source) and not DatasetDirectory(run).catalogue.exists() and run.is_dir():
+            check_level(source)
+            if below := sorted(folder for folder in run.iterdir() if RunDirectory(folder).segments()):
+                raise RecordingError(
+                    f"{run} is no run, it holds {len(below)}: give one of them, as {below[0]}"
+                )
         yield Dataset(source)
         return
     recording = whole_recording(lambda: Recording(run))
@@ -57,4 +64,7 @@ def open_source(source: str) -> Iterator[Dataset]:
         }
         catalogue.plan(settings, len(numbers))
         catalogue.close()
-        yield Dataset(directory.path)
+        try:
+            yield Dataset(directory.path)
+        except (RecordingError, RunError) as error:
+            raise type(error)(str(error).replace(str(directory.path), source)) from error

@@ -104,7 +104,7 @@ class Pcd(Format):
     """Files ``EPISODE/SCENE-SENSOR.pcd`` of the Point Cloud Library, binary, of each scan of each LIDAR."""
 
     needs = ("lidar.points",)
-    needs_users = False
+    of_all_users = True
     loses = "All but points of LIDARs, and of these rays, objects and grids."
 
     def write(self, part: Part, folder: Path) -> None:

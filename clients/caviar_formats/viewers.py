@@ -60,7 +60,8 @@ class Moment:
     mounts: list[tuple[str, str, Pose]]
     """Parent, name and pose in the parent's axes of devices and, with x right and y down, of pictures."""
     rays: list[tuple[Float64Array, float, list[float]]]
-    """Points [m], Shape ``[N, 3]``, gain [dB], and colour by it, of the strongest paths of each pair."""
+    """Points [m], Shape ``[N, 3]``, gain [dB] on the first carrier that the pair uses, and colour by it, of
+    the strongest paths of each pair."""
     beams: list[tuple[AntennaDevice, Pose, int]]
     """Arrays of several elements, their poses in the world, and beams that were chosen for them."""
     users: dict[str, dict[str, float]]
@@ -201,9 +202,10 @@ class Viewer(Format):
     """A format with a file or folder for each episode."""
 
     extra = "viewers"
-    needs_users = False
+    of_all_users = True
     whole_episodes = True
     loses = (
+        "Paths on other carriers than the first that a pair uses, and those of a second channel service. "
         "Matrices, impulse responses, and all but the 25 strongest paths of a pair; meshes of objects, which "
         "are boxes; labels of pictures, normals; scenery of more than 150,000 triangles is thinned; products "
         "that were held are there once."

@@ -165,9 +165,10 @@ class ViWi(Format):
         return f"""# {users.dataset.name} in the form of ViWi
 
 - `raw_data.mat` (MATLAB 7.3, that is HDF5): struct `raw_data` with `channel`, float64 pairs (real, imag), in
-  MATLAB elements × subcarriers × users × transmitters, in h5py the other way round: H at the first element of
-  the receiver, of `{self._channel}`, 0 without a path; elements in rows from −z upwards, in a row from −y to
-  +y. `loc`: 3 × users, places of the receivers in the world [m], x to the east, y to the north, z upwards.
+  MATLAB elements × subcarriers × users × transmitters, in h5py the other way round: H at the first element
+  (top row, −y) of the receiver, of `{self._channel}`, 0 without a path; those of the transmitter in rows from
+  −z upwards, in a row from −y to +y. `loc`: 3 × users, places of the receivers in the world [m], x to the
+  east, y to the north, z upwards.
 - `rgb/cam_N_X_Y.png`: picture of transmitter N's camera, the nearest one that stands, with the user at X, Y
   [m] in it; users of a scene have the same picture. Readers find the user of a picture by its place.
 - `beams.csv`: sequences of {LENGTH} consecutive scenes of a receiver, transmitter by transmitter, without

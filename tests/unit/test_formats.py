@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
 from caviar_clients.datasets.catalogue import Catalogue
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
@@ -27,13 +30,14 @@ from caviar_clients.learning.recorded import RecordedBeamsEnv
 from caviar_clients.replay.plan import plan_replay, request_of, scenario_text
 from caviar_clients.replay.recorded import RecordedRun
 from caviar_formats.base import FORMATS, Format, export_users, find_format
+from caviar_formats.cli import export_command, import_command
 from caviar_formats.imports import ImportedScene, Paths, Source, import_dataset
 from caviar_formats.ros2 import Ros2
 from caviar_formats.runs import open_source
 from caviar_formats.testing import FormatConformance
 from caviar_formats.viewers import LOBE_M, ORIGIN, Moment, lobe
 from caviar_protocol.digest import file_digest
-from caviar_protocol.errors import RecordingError, RunError, ScenarioError, SetupError
+from caviar_protocol.errors import CaviarError, RecordingError, RunError, ScenarioError, SetupError
 from caviar_protocol.scenario import Carrier, load_scenario, parse_scenario
 from caviar_protocol.space.coordinates import rotation_matrix
 from caviar_protocol.topics import AntennaArray, AntennaDevice
@@ -742,8 +746,6 @@ def test_minari_needs_decisions(roadside: Path, tmp_path: Path) -> None:
         exported(data, "minari", tmp_path)
     with pytest.raises(ScenarioError, match="which sends none"):
         exported(Dataset(roadside), "minari", tmp_path, "delay")
-    with pytest.raises(RunError, match="leave --carrier"):
-        export_users(Dataset(roadside).users()[:2], find_format("minari"), tmp_path / "out")
 
 
 def test_flights_in_minari_are_velocities(tmp_path: Path) -> None:
@@ -847,6 +849,8 @@ def test_paths_of_wireless_insite_become_users_and_npz(
     phase: str, of_first: float | None, tmp_path: Path
 ) -> None:
     source = insite(p2m(tmp_path, P2M.format(phase=phase)))
+    # λ / 4πd of 50 m at 60 GHz is −101.98 dB.
+    assert "from t001_05 to r006-00001 is +20.99 dB from free space at 60 GHz" in source.assumed
     data = Dataset(import_dataset(source, tmp_path / "data"))
     assert list(verify(tmp_path / "data")) == []
     with np.load(exported(data, "npz", tmp_path) / "users-00000.npz") as users:
@@ -1096,8 +1100,93 @@ def test_names_that_are_one_topic_of_ros_are_refused(tmp_path: Path) -> None:
         Ros2().write_episode(tmp_path / "bag", World({}, {}), iter([now]))
 
 
-def test_scenes_without_users_are_exported_where_a_format_needs_none(clouds: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["foxglove", "minari", "pcd", "rerun", "ros2"])
+def test_formats_of_all_users_refuse_a_choice(name: str, clouds: Path, tmp_path: Path) -> None:
+    try:
+        form = find_format(name)
+    except SetupError as error:
+        pytest.skip(str(error))
+    with pytest.raises(RunError, match="leave --carrier"):
+        export_users(Dataset(clouds).users()[:2], form, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_export_refuses_a_folder_that_another_writes(data: Dataset, tmp_path: Path) -> None:
+    out, refused = tmp_path / "npz", list[str]()
+
+    def again(*_: int) -> None:
+        for name in ("npz", "parquet"):
+            with pytest.raises(RunError, match=r"another export writes .*npz now") as error:
+                exported_to(out, name)
+            refused.append(str(error.value))
+
+    def exported_to(out: Path, name: str, on_part: Any = lambda *_: None) -> None:
+        export_users(data.users(), find_format(name), out, on_part)
+
+    exported_to(out, "npz", again)
+    assert len(refused) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["npz"]
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", "users-00000.npz"]
+
+
+def test_an_import_refuses_a_folder_that_another_writes(tmp_path: Path) -> None:
+    file, out, refused = p2m(tmp_path, P2M.format(phase="")), tmp_path / "data", list[str]()
+
+    def again(_: int) -> None:
+        with pytest.raises(RunError, match="another process writes the dataset") as error:
+            import_dataset(insite(file), out)
+        refused.append(str(error.value))
+
+    import_dataset(insite(file), out, again)
+    assert (len(refused), list(verify(out))) == (1, [])
+    assert not out.with_name("data.part").exists()
+
+
+def test_an_export_of_a_run_names_the_run(folder: Path) -> None:
+    run = str(next((folder / "episodes").iterdir()))
+    text = f"^{re.escape(run)} has no users of carrier 'low'"
+    with pytest.raises(RecordingError, match=text), open_source(run) as data:
+        data.users(carrier="low")
+    runs = folder.parent / "runs"
+    runs.mkdir()
+    for name in ("a", "b"):
+        (runs / name).symlink_to(run)
+    text = r"is no run, it holds 2: give one of them, as .*runs/a"
+    with pytest.raises(RecordingError, match=text), open_source(str(runs)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["export", "DATA", "--to", "npz", "--origin", "1,2"], "--origin: npz has no places on the Earth"),
+        (["export", "DATA", "--to", "npz", "--out", "DATA/npz"], "is in DATA, which is read"),
+        (["export", "DATA", "--to", "matlab"], "known: deepmimo, deepsense,"),
+        (["export", "DATA", "--to", "p2m"], "imported from p2m, not exported"),
+        (["export", "DATA", "--to", "npz", "--object-class", "tram"], "known: car"),
+        (["import", "nosuch", "--from", "p2m"], "nosuch: there is no such file or folder"),
+        (["import", "DATA", "--from", "npz"], "exported to npz, not imported"),
+        (["import", "DATA", "--from", "matlab"], "known: deepmimo, itu, p2m"),
+    ],
+)
+def test_refusals_of_the_commands(arguments: list[str], text: str, folder: Path, tmp_path: Path) -> None:
+    words = [word.replace("DATA", str(folder)) for word in arguments]
+    if "--out" not in words:
+        words += ["--out", str(tmp_path / "out")]
+    function, name = (export_command, "export") if words[0] == "export" else (import_command, "import")
+    app = typer.Typer()
+    app.command(name)(function)
+    error = CliRunner().invoke(app, words[1:]).exception
+    assert isinstance(error, CaviarError)
+    assert text.replace("DATA", str(folder)) in str(error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scenes_without_users_are_exported_where_a_format_needs_none(
+    clouds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     users = Dataset(clouds).users()[:0]
+    monkeypatch.setattr(users.dataset, "users", lambda: users)
     export_users(users, find_format("pcd"), tmp_path / "pcd")
     assert len(list((tmp_path / "pcd").rglob("*.pcd"))) == EPISODES * SCENES
     with pytest.raises(RunError, match="no such users"):

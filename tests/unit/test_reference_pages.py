@@ -34,7 +34,9 @@ def test_every_command_has_a_page_with_its_options(reference: ModuleType) -> Non
     root: Any = typer.main.get_command(app)
     context = root.context_class(root)
     commands = {name: root.get_command(context, name) for name in root.list_commands(context)}
-    assert {"run", "dataset", "measure", "paper", "conform"} <= set(commands)
+    assert {"run", "dataset", "export", "import", "scene", "view", "measure", "paper", "conform"} <= set(
+        commands
+    )
     assert set(pages) == {"index.md", *(f"{name}.md" for name in commands)}
     for name, command in commands.items():
         for parameter in command.params:

@@ -196,10 +196,12 @@ def only_array(users: Users, end: str) -> AntennaArray:
             recorded.
     """
     place, arrays = users.dataset.location, {a.array for a in placed_antennas(users.one_of_each_kind(), end)}
-    if len(arrays) != 1:
+    if not arrays:
+        raise RecordingError(f"{place} has no such users with a path")
+    if len(arrays) > 1:
         raise RecordingError(
             f"{place}: {len(arrays)} different arrays at {end}; take users of one, as "
-            f"users[users[{end!r}] == NAME], or with --tx or --object-class"
+            f"users[users[{end!r}] == NAME], or with {'--tx' if end == 'tx' else '--object-class'}"
         )
     (array,) = arrays
     if not array.is_uniform:

@@ -224,9 +224,9 @@ class Dataset:
             if name is not None:
                 known = np.unique(table[column])
                 if name not in known:
+                    names = [each or f"'' (no {column})" for each in known.tolist()]
                     raise RecordingError(
-                        f"{self.location} has no users of {column} {name!r}; "
-                        f"{suggestion(name, known.tolist())}"
+                        f"{self.location} has no users of {column} {name!r}; {suggestion(name, names)}"
                     )
                 mask &= table[column] == name
         return Users(self, table.where(mask))
