@@ -516,7 +516,14 @@ def _pairs(
         name = f"rx{sets[2]}-{at:06d}"
         if not np.isfinite(rx_pos[at]).all():
             continue
-        devices[name] = _device(name, "rx", rx_pos[at], turn_rx[at], arrays["rx"])
+        device = _device(name, "rx", rx_pos[at], turn_rx[at], arrays["rx"])
+        if devices.setdefault(name, device) != device:  # another transmitter's files have the same receivers
+            place = devices[name].position
+            raise damaged(
+                folder / f"rx_pos{end}",
+                f"row {at}",
+                f"is {device.position}, and {place} for another transmitter",
+            )
         there = np.flatnonzero(np.isfinite(columns["power"][at]))
         row = {key: values[at, there].astype(np.float64) for key, values in columns.items()}
         bad = next((key for key, values in row.items() if not np.isfinite(values).all()), None)

@@ -245,7 +245,7 @@ def _origin(scene: ImportedScene, root: _Block) -> None:
 
 
 def _add_geometry(scene: ImportedScene, file: Path) -> None:
-    kind = KINDS[file.suffix]
+    kind = KINDS[file.suffix.lower()]
     root = _outermost(file, kind)
     _origin(scene, root)
     materials: dict[int, str] = {}
@@ -331,7 +331,11 @@ def _add_points(scene: ImportedScene, file: Path) -> None:
                 f"{file.name}:{block.line}: begin_<{block.tag}> is left out: points alone are read"
             )
             continue
+        if ["inactive"] in (words for _, words in block.lines):
+            scene.notes.append(f"{file.name}:{block.line}: {block.title!r} is inactive: left out")
+            continue
         _origin(scene, block)
+        _note_transmitter(scene, file, block)
         places = [location.vertices(1) for location in block.named("location")]
         if len(places) != 1:
             raise block.error("points have one begin_<location>; export the file again")
@@ -347,6 +351,19 @@ def _add_points(scene: ImportedScene, file: Path) -> None:
     if not root.blocks:
         raise root.error("holds no points; export it from Wireless InSite, or remove it")
     scene.sources.append(source_of(file))
+
+
+def _note_transmitter(scene: ImportedScene, file: Path, block: _Block) -> None:
+    """Say what a transmitter's power and pattern are, where the scenarios have others."""
+    for sender in block.named("transmitter"):
+        power = sender.number("power", 0.0)
+        turns = [p.number(f"rotation_{axis}", 0.0) for p in sender.named("pattern") for axis in "xyz"]
+        turn = max(turns, default=0.0, key=abs)
+        for what, value, key in (("power", power, "power_dbm"), ("rotation", turn, "yaw_deg")):
+            if value:
+                scene.notes.append(
+                    f"{file.name}:{sender.line}: the {what} {value:g} is not taken: set {key} in the scenario"
+                )
 
 
 def _add_study(scene: ImportedScene, file: Path) -> list[str]:
@@ -410,13 +427,18 @@ def read_project(
     studies = sorted(folder.glob("*.study.xml")) if path.is_dir() else [path] if path.suffix == ".xml" else []
     if len(studies) > 1:
         raise AssetError(f"{path} has studies {', '.join(s.name for s in studies)}; name one: {studies[0]}")
-    there = sorted(file for file in folder.iterdir() if file.suffix in KINDS)
+    there = sorted(file for file in folder.iterdir() if file.suffix.lower() in KINDS)
     if studies:
-        named = [(folder / name.replace("\\", "/")).resolve() for name in _add_study(scene, studies[0])]
+        # Windows, on which projects are made, takes names for equal whatever their case.
+        known = {file.name.lower(): file.name for file in folder.iterdir()}
+        listed = (Path(name.replace("\\", "/")) for name in _add_study(scene, studies[0]))
+        named = [
+            (folder / name.with_name(known.get(name.name.lower(), name.name))).resolve() for name in listed
+        ]
         for file in named:
             if not file.is_file():
                 scene.notes.append(f"{studies[0].name} names {file.name}, which is not there: left out")
-        files = [file for file in named if file.is_file() and file.suffix in KINDS]
+        files = [file for file in named if file.is_file() and file.suffix.lower() in KINDS]
         scene.notes += [
             f"{file.name} is there, and {studies[0].name} does not name it: left out"
             for file in there
@@ -425,13 +447,13 @@ def read_project(
         points = [folder / f"{studies[0].name.removesuffix('.study.xml')}.txrx"]
     else:
         files, points = there if path.is_dir() else [path], sorted(folder.glob("*.txrx"))
-    if not files or not all(file.suffix in KINDS for file in files):
+    if not files or not all(file.suffix.lower() in KINDS for file in files):
         raise AssetError(f"{path} has no geometry of Wireless InSite: {', '.join(KINDS)}, or a .study.xml")
-    points = [file for file in points if file.is_file()] if path.suffix not in KINDS else []
+    points = [file for file in points if file.is_file()] if path.suffix.lower() not in KINDS else []
     sizes = [file.stat().st_size if file.is_file() else 0 for file in (*files, *points)]
     for number, file in enumerate((*files, *points)):
         progress(file.name, sum(sizes[:number]) / max(sum(sizes), 1))
-        (_add_geometry if file.suffix in KINDS else _add_points)(scene, file)
+        (_add_geometry if file.suffix.lower() in KINDS else _add_points)(scene, file)
     ground = [piece.mesh.vertices[:, 2] for piece in scene.pieces.values() if piece.kind == "terrain"]
     if ground and max(float(np.abs(z).max()) for z in ground) > 0.01:
         scene.notes.append(

@@ -107,7 +107,7 @@ def test_what_cannot_be_attached_is_refused_by_name(text: str, words: list[str])
 @pytest.mark.usefixtures("acme")
 def test_an_attachment_is_an_option_of_its_name_unless_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
-    monkeypatch.setattr("caviar_clients.cli.run.run_scenario", lambda *values: given.extend(values[-2]))
+    monkeypatch.setattr("caviar_clients.cli.run.run_scenario", lambda *values: given.extend(values[-3]))
     runner = CliRunner()
     runner.invoke(app, ["run", "smoke", "--acme", "1", "--attach", "airsim=2", "--seed", "3", "--acme=4"])
     assert given == ["airsim=2", "acme=1", "acme=4"]

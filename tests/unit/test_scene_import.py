@@ -193,6 +193,25 @@ def test_what_a_scene_cannot_hold_is_said(tmp_path: Path) -> None:
         assert part in said
 
 
+def test_points_that_are_inactive_or_send_with_power_are_told(project: Path) -> None:
+    (project / "town.city").rename(project / "Town.CITY")  # Windows takes both names for one
+    points = project / "town.txrx"
+    sender = (
+        "begin_<transmitter>\nbegin_<pattern>\nrotation_z 90\nend_<pattern>\npower 33\nend_<transmitter>\n"
+    )
+    points.write_text(POINTS.replace("is_transmitter yes", f"{sender}is_transmitter yes"))
+    scene = read_project(project)
+    assert "city" in {piece.kind for piece in scene.pieces.values()}
+    said = "\n".join(scene.notes)
+    assert "power 33 is not taken" in said
+    assert "rotation 90 is not taken" in said
+    points.write_text(POINTS.replace("<points> Tx\n", "<points> Tx\ninactive\n"))
+    scene = read_project(project)
+    assert scene.transmitters_m == []
+    assert len(scene.receivers_m) == 10
+    assert "'Tx' is inactive" in "\n".join(scene.notes)
+
+
 def test_places_on_the_earth_and_back() -> None:
     pytest.importorskip("pyproj")
     origin = Georeference(latitude_deg=38.8907, longitude_deg=-77.0787)
@@ -313,6 +332,7 @@ MUTATIONS: dict[str, tuple[str, Callable[[str], str | bytes] | None, str]] = {
         r":\d+: byte 0xdf is not UTF-8",
     ),
     "points without role": ("town.txrx", replaced("yes", "no"), r":\d+: points neither"),
+    "offset that is none": ("sumo/a.net.xml", lambda t: t.replace("-650.50", "nan"), "netOffset 'nan"),
     "no points": ("town.txrx", lambda t: "", r":1: holds no points"),
     "study cut": ("town.study.xml", lambda t: t[:-12], r":\d+: .*export the study again"),
     "study mislabelled": ("town.study.xml", lambda t: "<html/>", r":1: <html> is no study"),

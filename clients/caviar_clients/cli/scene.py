@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import sys
@@ -301,9 +302,11 @@ def _traffic(config: Path) -> tuple[dict[str, bytes], dict[str, str]]:
     offset = "" if location is None else location.get("netOffset", "")
     try:
         x, y = (-float(word) + 0.0 for word in offset.split(","))
-    except ValueError as error:
+    except ValueError:
+        x = y = math.nan
+    if not math.isfinite(x + y):
         net = config.parent / names["net-file"][0].removeprefix("file:sumo/")
-        raise AssetError(f"{net}: <location> has the netOffset {offset!r}; write x,y in metres") from error
+        raise AssetError(f"{net}: <location> has the netOffset {offset!r}; write x,y in metres")
     kinds = {
         kind.get("id", ""): kind.get("id", "").lower()
         for element in roots["route-files"] + roots.get("additional-files", [])
