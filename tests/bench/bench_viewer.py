@@ -1,6 +1,6 @@
 """What the viewer costs and how soon it shows something, in headless Chromium.
 
-    python tests/bench/bench_viewer.py [--pages 3] [--pairs 5] [--frames 120] [--json FILE]
+    python tests/bench/bench_viewer.py [--pages 3] [--pairs 5] [--frames 300] [--json FILE]
 
 Alternating pairs of runs of `street-canyon`, without and with so many pages that follow it live: frames a
 second and processor time of a frame, of the processes of the run alone; digests are compared. Then, of
@@ -64,6 +64,8 @@ def opened(chromium: Any, url: str) -> tuple[Any, float]:
     begin = time.perf_counter()
     page.goto(url)
     while not page.evaluate("window.caviar !== undefined"):
+        if time.perf_counter() - begin > 60:
+            raise SystemExit(f"{url} shows nothing within 60 s: give the run more --frames")
         time.sleep(0.005)
     page.evaluate("window.caviar.ready")
     return page, time.perf_counter() - begin
@@ -118,7 +120,7 @@ def main() -> int:
     )
     parser.add_argument("--pages", type=int, default=3)
     parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--frames", type=int, default=120)
+    parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     figures: dict[str, Any] = {"pages": arguments.pages}
