@@ -35,8 +35,8 @@ from caviar_protocol.topics import (
     Scene,
     Segmentation,
 )
-from caviar_view.frames import Frames
-from caviar_view.world import World
+from caviar_view.frames import AnsweredGrants, Frames
+from caviar_view.world import World, whole
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
@@ -63,6 +63,9 @@ SERIES: dict[str, tuple[str, Callable[[Link], Any]]] = {
     "reward": ("1", lambda link: link.reward),
 }
 """Curves of a user: unit, and values of all users of a link."""
+
+
+_SHOWN = (Status.FRESH, Status.HELD)
 
 
 class NotThereError(CaviarError):
@@ -174,29 +177,36 @@ class Answers:
 
     def topics_of(self, place: int) -> list[str]:
         """Topics that a frame has a product of."""
-        shown = (Status.FRESH, Status.HELD)
-        return sorted({item.topic for item in self.frames.entry(place).inputs if item.status in shown})
+        return sorted({item.topic for item in self.frames.entry(place).inputs if item.status in _SHOWN})
 
     def users(self, most: int = CURVE_POINTS) -> list[tuple[str, str, str]]:
         """TX, RX and carrier of each user of the frames that curves are of."""
-        links = (self._link(place) for place in _spread(self.frames.first, self.frames.end, most))
-        return list(dict.fromkeys(user for link in links if link is not None for user in _users(link)))
+        return _all_users(self._spread_links(most))
+
+    def _spread_links(self, most: int) -> dict[int, Link | None]:
+        """Links by place of so many frames at most, evenly over all."""
+        places = _spread(self.frames.first, self.frames.end, most)
+        # Those of the last request are kept, and no others: a run that goes on has ever new ones.
+        self._links = {place: self._link(place) for place in places}
+        return self._links
 
     def beams_of(self, place: int) -> set[tuple[str, int]]:
         """Devices, and their beams that are chosen or best in a frame."""
         link, found = self._link(place), set[tuple[str, int]]()
-        for i, (tx, rx, _) in enumerate(_users(link) if link is not None else ()):
-            if link is not None:
-                found |= {(tx, int(link.tx_beam[i])), (rx, int(link.rx_beam[i]))}
-                found |= {(tx, int(beam)) for beam in link.top_tx_beam[i, :1]}
-                found |= {(rx, int(beam)) for beam in link.top_rx_beam[i, :1]}
+        if link is None:
+            return found
+        for i, (tx, rx, _) in enumerate(_users(link)):
+            found |= {(tx, int(link.tx_beam[i])), (rx, int(link.rx_beam[i]))}
+            found |= {(tx, int(beam)) for beam in link.top_tx_beam[i, :1]}
+            found |= {(rx, int(beam)) for beam in link.top_rx_beam[i, :1]}
         return {(device, beam) for device, beam in found if beam >= 0}
 
     def _place(self, text: str) -> int:
         frames = self.frames
-        if not text.isdigit() or not frames.first <= int(text) < frames.end:
+        place = whole(text)
+        if place is None or not frames.first <= place < frames.end:
             raise NotThereError(f"there is no frame {text}; there are {frames.first} to {frames.end - 1}")
-        return int(text)
+        return place
 
     def _frame(self, place: int) -> dict[str, Any]:
         entry = self.frames.entry(place)
@@ -237,8 +247,7 @@ class Answers:
         return Answer(join_parts([msgspec.msgpack.encode(said | {"kept": kept}), header, body]), BINARY)
 
     def _items(self, entry: FrameEntry, topic: str) -> list[GrantInput]:
-        shown = (Status.FRESH, Status.HELD)
-        return [item for item in entry.inputs if item.topic == topic and item.status in shown]
+        return [item for item in entry.inputs if item.topic == topic and item.status in _SHOWN]
 
     def _payload(self, place: int, item: GrantInput) -> Payload:
         with self._lock:
@@ -271,14 +280,15 @@ class Answers:
         return {"x": x.tolist(), "y": y.tolist(), "z": heights, "gain_db": cells, "every": step}
 
     def _lobe(self, place: int, query: Mapping[str, str]) -> dict[str, Any]:
-        name, beam = query.get("device", ""), query.get("beam", "")
+        name, beam = query.get("device", ""), whole(query.get("beam", ""))
         scene = self._scene(place, self._items(self.frames.entry(place), "scene"))
         device = next((d for d in scene.devices if d.name == name and isinstance(d, AntennaDevice)), None)
         if not isinstance(device, AntennaDevice):
             raise NotThereError(f"frame {place} has no antenna {name!r}")
         codebook = codebook_of(device.array)
-        if not beam.isdigit() or int(beam) >= codebook.beams:
-            raise NotThereError(f"{name!r} has the beams 0 to {codebook.beams - 1}, and no {beam!r}")
+        if beam is None or beam >= codebook.beams:
+            wanted = query.get("beam", "")
+            raise NotThereError(f"{name!r} has the beams 0 to {codebook.beams - 1}, and no {wanted!r}")
         # Around the longer side of the array, about which a line of elements looks the same from all sides;
         # finer than the narrowest beam: of N elements half a wavelength apart the first null is at 2/N rad.
         short, long = sorted((device.array.rows, device.array.columns))
@@ -287,10 +297,10 @@ class Answers:
         elevation = np.radians(np.linspace(-90, 90, min(721, 8 * max(9, long) + 1)))
         grid = np.stack(np.meshgrid(np.pi / 2 - elevation, azimuth, indexing="ij"), -1)
         directions = unit_vectors(grid)
-        gain = codebook.gain(int(beam), directions if axis == "z" else directions[..., [1, 2, 0]])
+        gain = codebook.gain(beam, directions if axis == "z" else directions[..., [1, 2, 0]])
         return {
             "device": name,
-            "beam": int(beam),
+            "beam": beam,
             "axis": axis,
             "azimuths": azimuth.round(6).tolist(),
             "elevations": elevation.round(6).tolist(),
@@ -299,9 +309,8 @@ class Answers:
 
     def _curves(self, query: Mapping[str, str]) -> dict[str, Any]:
         most = _number(query, "points", CURVE_POINTS, 2)
-        places = _spread(self.frames.first, self.frames.end, most)
-        links = {place: self._link(place) for place in places}
-        users = self.users(most)
+        links = self._spread_links(most)
+        users = _all_users(links)
         if not users:
             return {"user": None, "users": [], "n": [], "series": {}}
         number = _number(query, "user", 0, 0)
@@ -315,13 +324,13 @@ class Answers:
             if any(value is not None for value in values):
                 series[name] = {"unit": unit, "values": values}
         named = [dict(zip(("tx", "rx", "carrier"), each, strict=True)) for each in users]
-        return {"user": named[number], "users": named, "n": places, "series": series}
+        return {"user": named[number], "users": named, "n": list(links), "series": series}
 
     def _link(self, place: int) -> Link | None:
-        if place not in self._links:
-            items = self._items(self.frames.entry(place), "link")
-            self._links[place] = cast(Link, self._payload(place, items[0])) if items else None
-        return self._links[place]
+        if place in self._links:
+            return self._links[place]
+        items = self._items(self.frames.entry(place), "link")
+        return cast(Link, self._payload(place, items[0])) if items else None
 
     def _clock(self, query: Mapping[str, str]) -> dict[str, Any]:
         first = _number(query, "first", self.frames.first, self.frames.first)
@@ -329,22 +338,23 @@ class Answers:
         every = _number(query, "every", 1, 1)
         places = range(first, min(first + min(count, 1000) * every, self.frames.end), every)
         services: Mapping[str, Any] = self.frames.scenario.get("services") or {}
-        span = range(first, min(first + len(places) * every, self.frames.end))
+        answered, events = self.frames.answers(), self.frames.events()
+        # Events of the frames between those that are shown, too; without any, no record is looked at.
+        span = range(first, min(first + len(places) * every, self.frames.end)) if events else ()
         shown = {(e.episode, e.frame): n for n in span for e in [self.frames.entry(n)]}
-        answered = {
-            name: {(episode, frame): (at, missed, took) for episode, frame, at, missed, took in table}
-            for name in services
-            if (table := self.frames.answers().get(f"answers/{name}")) is not None
-        }
         return {
             "services": [_service(name, spec) for name, spec in services.items()],
             "frames": [_lanes(place, self.frames.entry(place), services, answered) for place in places],
             "events": [
                 {"n": shown[event["episode"], event["frame"]], "text": event["text"]}
-                for event in self.frames.events()
+                for event in events
                 if (event["episode"], event["frame"]) in shown
             ],
         }
+
+
+def _all_users(links: Mapping[int, Link | None]) -> list[tuple[str, str, str]]:
+    return list(dict.fromkeys(user for link in links.values() if link is not None for user in _users(link)))
 
 
 def _service(name: str, spec: Any) -> dict[str, Any]:
@@ -356,7 +366,7 @@ def _lanes(
     place: int,
     entry: FrameEntry,
     services: Mapping[str, Any],
-    answered: Mapping[str, Mapping[tuple[int, int], tuple[int, int, int]]],
+    answered: AnsweredGrants,
 ) -> dict[str, Any]:
     """Lanes of one frame: when each service was granted and answered, from the frame's first grant on."""
     key = (entry.episode, entry.frame)
@@ -489,9 +499,10 @@ def _spread(first: int, end: int, most: int) -> list[int]:
 
 def _number(query: Mapping[str, str], name: str, default: int, least: int) -> int:
     text = query.get(name, str(default))
-    if not (text.isascii() and text.isdigit()) or int(text) < least:
-        raise NotThereError(f"{name}={text!r} is no whole number of {least} or more")
-    return int(text)
+    value = whole(text)
+    if value is None or value < least:
+        raise NotThereError(f"{name}={text!r:.40} is no whole number of {least} or more")
+    return value
 
 
 def _json(value: Any) -> Answer:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,15 @@ from caviar_protocol.topics import Scene
 # The reader loads the arrays of every topic, which a run as it goes on does without.
 if TYPE_CHECKING:
     from caviar_protocol.recording import Recording
+
+
+AnsweredGrants = Mapping[str, Mapping[tuple[int, int], tuple[int, int, int]]]
+"""By service, then by episode and frame: when a grant was answered [ns], 1 for a miss, latency [ns]."""
+
+
+def answered_grants(rows: Iterable[Sequence[int]]) -> dict[tuple[int, int], tuple[int, int, int]]:
+    """Make an entry of `AnsweredGrants` of rows of `caviar_broker.statistics.Statistics.answers`."""
+    return {(episode, frame): (at, missed, took) for episode, frame, at, missed, took in rows}
 
 
 class Frames(ABC):
@@ -59,8 +69,8 @@ class Frames(ABC):
             RecordingError: Its bytes are damaged or missing.
         """
 
-    def answers(self) -> Mapping[str, Any]:
-        """Grants that were answered, ``answers/SERVICE`` (`caviar_broker.statistics.Statistics.answers`)."""
+    def answers(self) -> AnsweredGrants:
+        """Grants that were answered (`caviar_broker.statistics.Statistics.answers`)."""
         return {}
 
     def events(self) -> Sequence[Mapping[str, Any]]:
@@ -68,21 +78,29 @@ class Frames(ABC):
         return ()
 
 
-TOLD = frozenset({"miss", "lost", "away", "back", "restarted", "fault", "skipped"})
+CLOCK_NOTICES = frozenset({"miss", "lost", "away", "back", "restarted", "fault", "skipped"})
 """Kinds of notices that the clock shows."""
 
 
-def events_of(run: Path) -> list[Mapping[str, Any]]:
-    """Read the notices of a run that the clock shows; a line that is being written is left out."""
+def events_of(run: Path, most: int = -1) -> list[Mapping[str, Any]]:
+    """Read the notices of a run that the clock shows; a line that is not whole is left out.
+
+    Args:
+        run: Directory of the run.
+        most: Bytes to read at most, the last ones; −1: all.
+    """
     found = []
     try:
-        lines = RunDirectory(run).events.read_text("utf-8", errors="replace").splitlines()
+        with RunDirectory(run).events.open("rb") as file:
+            if most >= 0:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - most))
+            text = file.read().decode(errors="replace")
     except OSError:
         return []
-    for line in lines:
+    for line in text.splitlines():
         with contextlib.suppress(ValueError):
             event = json.loads(line)
-            if event.get("kind") in TOLD:
+            if event.get("kind") in CLOCK_NOTICES:
                 found.append(event)
     return found
 
@@ -121,15 +139,19 @@ class RecordedFrames(Frames):
         """Payload of one of a frame's inputs, of which the digest is checked."""
         return self._recording.recorded_product(place, item).payload
 
-    def answers(self) -> Mapping[str, Any]:
+    def answers(self) -> AnsweredGrants:
         """Of ``latency.npz``; none where the run did not end, or an earlier version wrote it."""
         return self._answers
 
     @cached_property
-    def _answers(self) -> Mapping[str, Any]:
+    def _answers(self) -> AnsweredGrants:
         try:
             with np.load(RunDirectory(self._recording.directory).latencies) as found:
-                return {name: found[name].tolist() for name in found if name.startswith("answers/")}
+                return {
+                    name.removeprefix("answers/"): answered_grants(found[name].tolist())
+                    for name in found
+                    if name.startswith("answers/")
+                }
         except (OSError, ValueError):
             return {}
 

@@ -13,12 +13,14 @@ from caviar_protocol.errors import ProtocolError, RecordingError
 from caviar_protocol.messages import GrantInput
 from caviar_protocol.observer import Observation, ObservedProduct
 from caviar_protocol.recording import FrameEntry
-from caviar_view.frames import Frames, events_of
+from caviar_view.frames import AnsweredGrants, Frames, answered_grants, events_of
 
 MOST_FRAMES = 4096
 """Frames that are held, to look back at."""
 MOST_BYTES = 1 << 28
 """Bytes of products that are held: of older frames those of sensors go first."""
+EVENT_BYTES = 1 << 16
+"""Of the notices of the run, the newest ones."""
 _MARGIN = 256
 _SENSORS = frozenset({"lidar", "camera", "depth", "segmentation"})
 
@@ -55,7 +57,9 @@ class LiveFrames(Frames):
         self._sensors: deque[tuple[int, str, str]] = deque()
         self._others: deque[tuple[int, str, str]] = deque()
         self._bytes = 0
-        self._answered: dict[str, list[list[int]]] = {}
+        self._answered: dict[str, dict[tuple[int, int], tuple[int, int, int]]] = {}
+        # Number of answers of each service that came up to now.
+        self._known: dict[str, int] = {}
         # Filled by the thread that observes, read by those that answer.
         self._lock = threading.Lock()
 
@@ -127,18 +131,20 @@ class LiveFrames(Frames):
 
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The newest notices."""
-        return events_of(self._directory)[-200:]
+        return events_of(self._directory, EVENT_BYTES)
 
     def known_answers(self) -> dict[str, int]:
         """Number of answers of each service up to the newest that `add_answers` has got."""
-        return {name: int(rows[-1][-1]) + 1 for name, rows in self._answered.items() if rows}
+        return self._known
 
     def add_answers(self, found: Mapping[str, Any]) -> None:
         """Take in what the broker's control channel says of ``answers``."""
         for name, part in found.items():
-            rows = [[*row, part["first"] + i] for i, row in enumerate(part["rows"])]
-            self._answered[name] = [*self._answered.get(name, []), *rows][-MOST_FRAMES:]
+            known = self._answered.get(name, {}) | answered_grants(part["rows"])
+            # A new one in place of the old: another thread may be reading that.
+            self._answered[name] = dict(list(known.items())[-MOST_FRAMES:])
+            self._known[name] = max(self._known.get(name, 0), part["first"] + len(part["rows"]))
 
-    def answers(self) -> Mapping[str, Any]:
+    def answers(self) -> AnsweredGrants:
         """Grants that were answered, of the newest frames."""
-        return {f"answers/{name}": [row[:-1] for row in rows] for name, rows in self._answered.items()}
+        return self._answered

@@ -129,9 +129,10 @@ class World:
         objects = list(self.objects.values())
         kind, _, number = name.rpartition("-")
         meshes = objects if kind == "object" else [group.mesh for group in self.groups] if not kind else []
-        if not number.isdigit() or int(number) >= len(meshes):
+        index = whole(number)
+        if index is None or index >= len(meshes):
             return None
-        mesh = meshes[int(number)]
+        mesh = meshes[index]
         sizes = np.array([len(mesh.vertices), len(mesh.faces)], "<u4")
         return b"".join(
             [sizes.tobytes(), mesh.vertices.astype("<f4").tobytes(), mesh.faces.astype("<u4").tobytes()]
@@ -155,6 +156,11 @@ class World:
                 mesh = box(*((float(low), float(high)) for low, high in ends))
                 found.append((f"obstacle {number}", "obstacle", _COLORS["concrete"], mesh))
         return found
+
+
+def whole(text: str) -> int | None:
+    """Read a whole number of an address, from 0 on and of 18 digits at most; None where it is none."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= 18 else None
 
 
 def _srgb(linear: Sequence[float] | None) -> str:

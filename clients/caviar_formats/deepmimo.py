@@ -32,6 +32,7 @@ PATHS = 25
 POINTS = 7
 """Interactions of a path at most: in float32 more digits are lost."""
 VERSION = "4.0.5"
+ANGLES = ("aoa_az", "aoa_el", "aod_az", "aod_el", "phase")
 PER_USER = ("aoa_az", "aoa_el", "aod_az", "aod_el", "delay", "power", "phase", "inter", "inter_pos", "rx_pos")
 OWN = ("doppler", "rx_orientation", "user")
 """Arrays that DeepMIMO does not load, in files of the same kind."""
@@ -467,6 +468,8 @@ def _matrix(file: Path, name: str, rows: int | None, columns: int, *, optional: 
         or (columns and found.shape[1:] != (columns,))
     ):
         raise damaged(file, name, f"has the shape {found.shape}; {rows} rows are expected")
+    if found.dtype.kind == "c":
+        raise damaged(file, name, f"is of {found.dtype}; write real numbers")
     return found
 
 
@@ -525,10 +528,18 @@ def _pairs(
                 f"is {device.position}, and {place} for another transmitter",
             )
         there = np.flatnonzero(np.isfinite(columns["power"][at]))
+        if not np.array_equal(there, np.flatnonzero(np.isfinite(columns["delay"][at]))):
+            raise damaged(
+                folder / f"power{end}", f"row {at}", "has other paths than delay: write NaN in both"
+            )
         row = {key: values[at, there].astype(np.float64) for key, values in columns.items()}
         bad = next((key for key, values in row.items() if not np.isfinite(values).all()), None)
         if bad is not None:
             raise damaged(folder / f"{bad}{end}", f"row {at}", "is not finite where there is power")
+        far = next((key for key in ANGLES if (np.abs(row[key]) > 360).any()), None)
+        if far is not None or (row["delay"] < 0).any():
+            wrong = "a delay below 0 s" if far is None else f"{far} beyond 360°"
+            raise damaged(folder / f"{far or 'delay'}{end}", f"row {at}", f"has {wrong}")
         aod, aoa = (np.radians(np.stack([row[f"{e}_el"], row[f"{e}_az"]], axis=1)) for e in ("aod", "aoa"))
         shift = first_element(arrays["tx"], turn_tx, aod) + first_element(arrays["rx"], turn_rx[at], aoa)
         phase = np.exp(1j * (np.radians(row["phase"]) - 2 * np.pi * shift))

@@ -346,6 +346,11 @@ def _add_points(scene: ImportedScene, file: Path) -> None:
         }
         if not roles:
             raise block.error("points neither send nor receive; write is_transmitter yes or is_receiver yes")
+        if len(roles) == 2:
+            scene.notes.append(
+                f"{file.name}:{block.line}: {block.title!r} sends and receives: a transmitter and a receiver "
+                "stand at one place; give their device the role both in the scenario"
+            )
         for role, known in (("transmitter", scene.transmitters_m), ("receiver", scene.receivers_m)):
             known += [(float(x), float(y), float(z)) for x, y, z in places[0]] if role in roles else []
     if not root.blocks:

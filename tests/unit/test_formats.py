@@ -571,6 +571,10 @@ def test_a_damaged_scenario_of_deepmimo_is_named(file: str, how: str, folder: Pa
         ("delay", lambda table: table[:3]),
         ("phase", lambda table: table * np.nan),
         ("rx_pos", lambda table: table[:, :2]),
+        ("power", lambda table: table.astype(np.complex64)),
+        ("power", lambda table: np.where(np.arange(table.shape[1]) == 0, np.nan, table)),
+        ("aoa_az", lambda table: np.where(np.isfinite(table), 1e30, table)),
+        ("delay", lambda table: -table),
     ],
 )
 def test_wrong_arrays_of_deepmimo_are_named(name: str, change: Any, folder: Path, tmp_path: Path) -> None:

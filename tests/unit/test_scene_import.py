@@ -205,6 +205,8 @@ def test_points_that_are_inactive_or_send_with_power_are_told(project: Path) -> 
     said = "\n".join(scene.notes)
     assert "power 33 is not taken" in said
     assert "rotation 90 is not taken" in said
+    points.write_text(POINTS.replace("is_receiver no", "is_receiver yes"))
+    assert "'Tx' sends and receives" in "\n".join(read_project(project).notes)
     points.write_text(POINTS.replace("<points> Tx\n", "<points> Tx\ninactive\n"))
     scene = read_project(project)
     assert scene.transmitters_m == []

@@ -15,7 +15,8 @@ import caviar
 from caviar_protocol.arrays import Payload
 from caviar_protocol.codec import decode_payload, split_frame
 from caviar_protocol.errors import RecordingError
-from caviar_protocol.messages import GrantInput, Status
+from caviar_protocol.messages import GrantInput, Observe, Status
+from caviar_protocol.observer import Observation, ObservedProduct
 from caviar_protocol.recording import FrameEntry, Recording
 from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.topics import (
@@ -29,6 +30,7 @@ from caviar_protocol.topics import (
     Scene,
 )
 from caviar_space.meshes import Mesh, ply
+from caviar_view import live
 from caviar_view.answers import Answers, NotThereError
 from caviar_view.frames import Frames, RecordedFrames
 from caviar_view.world import World
@@ -145,6 +147,8 @@ def test_curves_and_clock_are_those_of_the_run(run: Path, answers: Answers) -> N
         "frames/6",
         "frames/-1",
         "frames/x",
+        "frames/²",
+        f"frames/{'9' * 5000}",
         "frames/1/lidar",
         "frames/1/secret",
         "meshes/99",
@@ -252,3 +256,36 @@ def test_large_scenery_is_thinned_and_keeps_its_place(tmp_path: Path) -> None:
     assert len(group.mesh.faces) <= 5000 < group.of == 2 * (side - 1) ** 2
     assert np.allclose(group.mesh.vertices.min(0), vertices.min(0), atol=2.0)
     assert np.allclose(group.mesh.vertices.max(0), vertices.max(0), atol=2.0)
+
+
+def seen(frame: int, topic: str = "lidar", size: int = 0) -> Observation:
+    item = GrantInput(topic=topic, source="s", status=Status.FRESH, frame=frame)
+    product = ObservedProduct(item, memoryview(b""), memoryview(bytes(size)))
+    message = Observe(sequence=frame, state="running", frame=frame, t_ns=frame, inputs=(item,))
+    return Observation(message, {(topic, "s"): product})
+
+
+def test_a_run_that_goes_on_holds_its_newest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "MOST_BYTES", 1000)
+    monkeypatch.setattr(live, "MOST_FRAMES", 8)
+    monkeypatch.setattr(live, "_MARGIN", 2)
+    frames = live.LiveFrames(tmp_path, {}, "run", 1, {})
+    for frame in range(20):
+        frames.add(seen(frame, size=300))
+        frames.add(seen(frame, size=300))  # another state of the run, with the frame as before
+    assert (frames.first, frames.end) == (12, 20)
+    assert [frames.entry(place).frame for place in (12, 19)] == [12, 19]
+    with pytest.raises(RecordingError, match="frame 3 is not held"):
+        frames.entry(3)
+    item = frames.entry(15).inputs[0]
+    with pytest.raises(RecordingError, match="lidar of frame 15 is not held"):
+        frames.payload(15, item)
+    # Two pages ask at once, and get the same rows: none is counted twice, none is lost.
+    for first, rows in (
+        (0, [[0, 0, 5, 0, 2], [0, 1, 9, 1, 4]]),
+        (0, [[0, 0, 5, 0, 2]]),
+        (2, [[0, 2, 12, 0, 1]]),
+    ):
+        frames.add_answers({"link": {"first": first, "rows": rows}})
+    assert frames.known_answers() == {"link": 3}
+    assert frames.answers() == {"link": {(0, 0): (5, 0, 2), (0, 1): (9, 1, 4), (0, 2): (12, 0, 1)}}

@@ -33,6 +33,8 @@ from caviar_view.live import LiveFrames
 
 PERIOD_S = 0.04
 """[s] from one frame that is shown to the next at least: more than a screen needs."""
+AGAIN_S = 1.0
+"""[s] after which a broker that has disconnected the observer is asked again."""
 QUIET_S = 0.5
 """[s] between news of a run that makes no frames."""
 
@@ -95,7 +97,8 @@ class LiveView:
         self._starting = asyncio.Lock()
         self._answers: Answers | None = None
         self._frames: LiveFrames | None = None
-        self._failure = ""
+        # Why there is no observer now, and why the run is over; empty while there is none.
+        self._failure = self._ended = ""
 
     async def answers(self, path: str) -> Answers:
         """Answers; the observer begins with the first call.
@@ -106,8 +109,9 @@ class LiveView:
         async with self._starting:
             if self._answers is None:
                 await self._start()
-        if self._answers is None or self._frames is None or (self._failure and not self._frames.end):
-            raise RunError(self._failure)
+        failure = self._failure or self._ended
+        if self._answers is None or self._frames is None or (failure and not self._frames.end):
+            raise RunError(failure)
         if path == "clock":
             known = self._frames.known_answers()
             self._frames.add_answers((await self._ask(do="answers", known=known))["answers"])
@@ -131,24 +135,28 @@ class LiveView:
         self._answers = Answers(self._frames, controls=True)
         threading.Thread(target=self._observe, args=(self._frames,), name="observer", daemon=True).start()
         for _ in range(100):  # the first frame, where there is one: a page can show it at once
-            if self._frames.end or self._failure:
+            if self._frames.end or self._failure or self._ended:
                 break
             await asyncio.sleep(0.02)
 
     def _observe(self, frames: LiveFrames) -> None:
-        try:
-            with Observer(*self._observed, period_s=PERIOD_S) as observer:
-                for seen in observer:
-                    frames.add(seen)
-            self._failure = observer.ended or "the run is over"
-        except CaviarError as error:
-            self._failure = str(error)
+        while not self._ended:
+            try:
+                with Observer(*self._observed, period_s=PERIOD_S) as observer:
+                    self._failure = ""
+                    for seen in observer:
+                        frames.add(seen)
+                self._ended = observer.ended or "the run is over"
+            except CaviarError as error:
+                # A process that was stopped is disconnected, as slow: this one ends with the broker.
+                self._failure = str(error)
+                time.sleep(AGAIN_S)
 
     async def news(self) -> AsyncIterator[bytes]:
         """Server-sent events about new frames, and what the run does; without any, one in `QUIET_S`."""
         answers = await self.answers("news")
         frames, told, said_at = answers.frames, -1, 0.0
-        while not self._failure:
+        while not self._ended:
             now = time.monotonic()
             if frames.end != told or now - said_at > QUIET_S:
                 try:
@@ -162,7 +170,7 @@ class LiveView:
                 event |= {"first": frames.first, "frames": told, "added": added}
                 yield f"data: {json.dumps(event)}\n\n".encode()
             await asyncio.sleep(PERIOD_S)
-        yield f"data: {json.dumps({'ended': self._failure})}\n\n".encode()
+        yield f"data: {json.dumps({'ended': self._ended})}\n\n".encode()
 
 
 Views = Mapping[str, Callable[[str], Awaitable[Answers]]]
