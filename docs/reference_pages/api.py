@@ -27,6 +27,7 @@ PACKAGES = (
     "caviar_bridges",
     "caviar_clients",
     "caviar_formats",
+    "caviar_scenes",
     "caviar_labs",
 )
 """Import packages; those that are not installed are left out."""

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -26,11 +26,14 @@ Place = tuple[float, float, float]
 
 
 class Georeference(msgspec.Struct, frozen=True, kw_only=True):
-    """Origin of a scene on the ellipsoid of WGS84; x is east, y north, z up (ENU) [m]."""
+    """Origin of a scene on the ellipsoid of WGS84; x is east, y north, z up [m]."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float = 0.0
+    projection: Literal["enu", "tmerc"] = "enu"
+    """``enu``: axes of the plane that touches the ellipsoid at the origin; ``tmerc``: transverse Mercator of
+    scale 1 about the origin, in which maps are drawn, and z the height above the ellipsoid at each place."""
 
     def to_scene(self, latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> Place:
         """Convert a place on WGS84 to x, y, z in the scene [m].
@@ -57,7 +60,13 @@ class Georeference(msgspec.Struct, frozen=True, kw_only=True):
             raise SetupError(
                 f"places on the Earth need pyproj, of the extra `geo`; run: {install_command('geo')}"
             ) from error
-        origin = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.altitude_m!r}"
+        origin = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r}"
+        if self.projection == "tmerc":
+            return Transformer.from_pipeline(
+                "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=tmerc +k=1 "
+                f"+ellps=WGS84 {origin} +step +proj=affine +zoff={-self.altitude_m!r}"
+            )
+        origin += f" +h_0={self.altitude_m!r}"
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
             f"+step +proj=topocentric +ellps=WGS84 {origin}"

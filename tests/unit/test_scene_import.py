@@ -22,7 +22,7 @@ from caviar_space.imported_scenes import Georeference
 from caviar_space.meshes import box, ply
 from caviar_space.mitsuba_xml import read_scenery, world_mesh
 from caviar_space.scenery import scenery_assets
-from caviar_space.wireless_insite import read_project
+from caviar_space.sources import read_source
 
 REFERENCE = """begin_<reference>
 cartesian
@@ -155,7 +155,12 @@ def test_a_project_becomes_scenery_with_its_materials_and_scenarios(project: Pat
     }
     assert shapes["foliage-1"].radio is None  # a volume: never taken for a wall
     described = json.loads((out / "scene.json").read_text())
-    assert described["origin"] == {"latitude_deg": 38.8907, "longitude_deg": -77.0787, "altitude_m": 0.0}
+    assert described["origin"] == {
+        "latitude_deg": 38.8907,
+        "longitude_deg": -77.0787,
+        "altitude_m": 0.0,
+        "projection": "enu",
+    }
     assert len(described["sources"]) == 5
     assert "scenery/scene.json" in scenery_assets(str(out / "scene.xml"))  # its place travels with it
     assert all(re.fullmatch(r"[0-9a-f]{64}", source["sha256"]) for source in described["sources"])
@@ -184,7 +189,7 @@ def test_what_a_scene_cannot_hold_is_said(tmp_path: Path) -> None:
                     "fields_diffusively_scattered 0.2")  # fmt: skip
     metal = material(9, "Metal", "PEC", "roughness 0.01")
     (tmp_path / "a.city").write_text(geometry("city", wall + metal, block(8) + block(9, x=800.0)))
-    scene = read_project(tmp_path / "a.city")
+    scene = read_source(tmp_path / "a.city")
     assert scene.materials["insite-wall"].constants == (5.0, 0.9)
     assert scene.materials["insite-wall"].thickness_m == pytest.approx(0.3)
     assert list(scene.pieces) == ["city-1-8", "city-1-9"]
@@ -200,15 +205,15 @@ def test_points_that_are_inactive_or_send_with_power_are_told(project: Path) -> 
         "begin_<transmitter>\nbegin_<pattern>\nrotation_z 90\nend_<pattern>\npower 33\nend_<transmitter>\n"
     )
     points.write_text(POINTS.replace("is_transmitter yes", f"{sender}is_transmitter yes"))
-    scene = read_project(project)
+    scene = read_source(project)
     assert "city" in {piece.kind for piece in scene.pieces.values()}
     said = "\n".join(scene.notes)
     assert "power 33 is not taken" in said
     assert "rotation 90 is not taken" in said
     points.write_text(POINTS.replace("is_receiver no", "is_receiver yes"))
-    assert "'Tx' sends and receives" in "\n".join(read_project(project).notes)
+    assert "'Tx' sends and receives" in "\n".join(read_source(project).notes)
     points.write_text(POINTS.replace("<points> Tx\n", "<points> Tx\ninactive\n"))
-    scene = read_project(project)
+    scene = read_source(project)
     assert scene.transmitters_m == []
     assert len(scene.receivers_m) == 10
     assert "'Tx' is inactive" in "\n".join(scene.notes)
@@ -377,7 +382,7 @@ def test_a_damaged_project_is_refused_with_its_place_and_nothing_is_written(
 def test_rosslyn(shared_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("libsumo")
     pytest.importorskip("matplotlib")
-    scene = read_project(shared_data / "rosslyn")
+    scene = read_source(shared_data / "rosslyn")
     kinds = [piece.kind for piece in scene.pieces.values()]
     assert [kinds.count(kind) for kind in ("city", "terrain", "foliage")] == [29, 1, 3]
     assert scene.transmitters_m == [(746.0, 560.0, 4.0)]

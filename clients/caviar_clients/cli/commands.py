@@ -32,7 +32,6 @@ GROUPS = {
     "dataset": (
         DATASETS, "caviar_clients.cli.datasets:app", "Datasets: generate, look, verify, tables."
     ),
-    "scene": (RUN, "caviar_clients.cli.scene:app", "Scenes of other programs: import, picture."),
     "policy": (
         POLICIES, "caviar_clients.cli.learning:app", "Trained policies: train, evaluate, export, swap."
     ),
@@ -40,7 +39,7 @@ GROUPS = {
 }  # fmt: skip
 """Panel, place and help of groups that are imported when one of their commands is typed."""
 
-_OWN_PANELS = {"caviar_labs": LABORATORIES, "caviar_formats": DATASETS}
+_OWN_PANELS = {"caviar_labs": LABORATORIES, "caviar_formats": DATASETS, "caviar_scenes": RUN}
 
 FORMER = {
     "generate": "dataset generate", "look": "dataset look", "verify": "dataset verify",

@@ -38,7 +38,7 @@ def import_command(
     path: Annotated[
         Path,
         typer.Argument(
-            help="Wireless InSite project: its folder, .study.xml, or one .city, .ter, .object or .veg",
+            help="file or folder of another program; docs/howto/scenes has the formats",
             show_default=False,
         ),
     ],
@@ -54,12 +54,15 @@ def import_command(
 ) -> None:
     """Import a scene: meshes, materials, and scenarios with the project's transmitters and traffic."""
     from caviar_space.imported_scenes import write_scene
-    from caviar_space.wireless_insite import read_project
+    from caviar_space.sources import Request, read_source
 
     console = Console()
     with progress_bar(Console(stderr=True), transient=True) as bar:
         task = bar.add_task(path.name, total=1.0)
-        scene = read_project(path, lambda name, share: bar.update(task, description=name, completed=share))
+        scene = read_source(
+            path,
+            Request(progress=lambda name, share: bar.update(task, description=name, completed=share)),
+        )
     more = _scenarios(scene, path, sumo, lidar)
     write_scene(scene, out, more)
     for note in scene.notes:

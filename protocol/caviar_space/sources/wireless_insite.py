@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,6 +22,7 @@ from caviar_protocol.space.ply import cut_polygons
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, source_of
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial
+from caviar_space.sources import Request
 
 KINDS = {".city": "city", ".ter": "terrain", ".object": "object", ".veg": "foliage"}
 """Tag of the outermost block of a file of geometry, which is the kind of its pieces, by suffix."""
@@ -411,22 +412,16 @@ def _add_study(scene: ImportedScene, file: Path) -> list[str]:
     return files
 
 
-def read_project(
-    path: Path, progress: Callable[[str, float], None] = lambda name, share: None
-) -> ImportedScene:
+def read_project(path: Path, request: Request) -> ImportedScene:
     """Read a project of Wireless InSite.
 
     Args:
         path: Folder of the project, with at most one ``.study.xml``, a study, or one file of geometry.
-        progress: Called with the file that comes next, and the share of bytes that are read, 0…1.
+        request: Of which progress is called with the file that comes next.
 
     Raises:
         AssetError: A file is missing or wrong; names file, line and remedy.
     """
-    if not path.exists():
-        raise AssetError(
-            f"{path} is not there; name the folder of a project of Wireless InSite, or a file of it"
-        )
     folder = path if path.is_dir() else path.parent
     scene = ImportedScene(name=_slug(path.resolve().name.split(".")[0]) or "scene")
     studies = sorted(folder.glob("*.study.xml")) if path.is_dir() else [path] if path.suffix == ".xml" else []
@@ -457,12 +452,12 @@ def read_project(
     points = [file for file in points if file.is_file()] if path.suffix.lower() not in KINDS else []
     sizes = [file.stat().st_size if file.is_file() else 0 for file in (*files, *points)]
     for number, file in enumerate((*files, *points)):
-        progress(file.name, sum(sizes[:number]) / max(sum(sizes), 1))
+        request.progress(file.name, sum(sizes[:number]) / max(sum(sizes), 1))
         (_add_geometry if file.suffix.lower() in KINDS else _add_points)(scene, file)
     ground = [piece.mesh.vertices[:, 2] for piece in scene.pieces.values() if piece.kind == "terrain"]
     if ground and max(float(np.abs(z).max()) for z in ground) > 0.01:
         scene.notes.append(
             "the terrain is not level at 0: what stands on it in InSite has the heights of its file here"
         )
-    progress("", 1.0)
+    request.progress("", 1.0)
     return scene
