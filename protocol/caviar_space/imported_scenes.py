@@ -103,6 +103,8 @@ class ImportedScene:
     """Whether the source says that foliage takes nothing from waves."""
     sources: list[dict[str, str | int]] = field(default_factory=list)
     """File, bytes and SHA-256 of each file that was read."""
+    files: dict[str, bytes] = field(default_factory=dict)
+    """Content of other files of its folder, by path: the network of its roads, ``sumo/net.net.xml``."""
     notes: list[str] = field(default_factory=list)
     """Differences between the source and what the scene holds."""
 
@@ -168,7 +170,7 @@ def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | Non
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
             made = Path(temporary) / "scene"
-            for path, content in {**files, **(more or {})}.items():
+            for path, content in {**files, **scene.files, **(more or {})}.items():
                 (made / path).parent.mkdir(parents=True, exist_ok=True)
                 (made / path).write_bytes(content)
             shutil.move(made, out)

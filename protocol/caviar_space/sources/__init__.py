@@ -60,6 +60,8 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "wireless-insite": (
         (".study.xml", ".city", ".ter", ".object", ".veg"), f"{_SOURCES}.wireless_insite:read_project",
     ),
+    "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
+                      f"{_SOURCES}.openstreetmap:read_map"),
 }  # fmt: skip
 """Ends of the names of files, and the place of the reader, by the name of the format.
 
