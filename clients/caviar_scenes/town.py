@@ -21,10 +21,9 @@ from string import Template
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-import msgspec
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.errors import AssetError, RunError, SetupError
 from caviar_protocol.host import install_command
 from caviar_space.ground import are_ground
@@ -141,8 +140,10 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
     values = {"traffic": "", "bodies": "", "receivers": ""}
     # A scenario names its files relative to itself, with `/` on every system.
     here = path.parent.resolve()
+
     def named(file: Path) -> str:
         return f'"file:{Path(os.path.relpath(file.resolve(), here)).as_posix()}"'
+
     route: list[str] = []
     if streets is None:
         say(f"{scene} has no network of roads: base stations and a UAV alone")
@@ -154,16 +155,15 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
         scenery = ""
         values.update(_traffic_tables(streets, counts, named(description), named(streets.file),
                                       f'"file:{path.stem}.rou.xml"'))  # fmt: skip
+    what = "traffic, people, " if streets else ""
     waypoints, how = _flight(skyline, streets, route)
     values |= {
-        "title": f"Scene {scene.resolve().name} with {'traffic, people, ' if streets else ''}base stations and a UAV",
+        "title": f"Scene {scene.resolve().name} with {what}base stations and a UAV",
         "command": " ".join(["caviar", *sys.argv[1:]]),
         "name": path.stem,
         "sky_scenery": scenery,
         "uav_path": how,
-        "waypoints": "\n".join(
-            f"  [{t:.1f}, {x:.1f}, {y:.1f}, {z:.1f}]," for t, x, y, z in waypoints
-        ),
+        "waypoints": "\n".join(f"  [{t:.1f}, {x:.1f}, {y:.1f}, {z:.1f}]," for t, x, y, z in waypoints),
         "foliage": _FOLIAGE if any(foliage) else "",
         "stations": "".join(_device(number, station) for number, station in enumerate(stations, 1)),
     }
@@ -226,11 +226,13 @@ def _streets(file: Path) -> Streets:
                 if lane.get("allow") == "pedestrian":
                     on_foot += float(lane.get("length", 0))
                 else:
-                    lanes.append(points(lane) + (x, y))
+                    lanes.append(points(lane) + np.array((x, y)))
                     edges.setdefault(edge.get("id", ""), lanes[-1])
-        corners = [points(junction)[:1] for junction in root.iter("junction") if junction.get("type") != "internal"]
+        corners = [
+            points(junction)[:1] for junction in root.iter("junction") if junction.get("type") != "internal"
+        ]
         driven = sum(float(np.linalg.norm(np.diff(lane, axis=0), axis=1).sum()) for lane in lanes)
-        places = np.concatenate([np.zeros((0, 2)), *corners]) + (x, y)
+        places = np.concatenate([np.zeros((0, 2)), *corners]) + np.array((x, y))
     except (OSError, ValueError, AttributeError, ElementTree.ParseError) as error:
         raise AssetError(f"{file} is no network of SUMO: {error}; import the scene again") from error
     return Streets(file, (x, y), lanes, edges, places, (driven / 1e3, on_foot / 1e3))
@@ -266,7 +268,7 @@ def _stations(
         order = np.lexsort((roofs[:, 1], roofs[:, 0], -roofs[:, 2]))
         _, first = np.unique((roofs[order, :2] // 10).astype(int), axis=0, return_index=True)
         roofs = roofs[order][np.sort(first)]
-    eyes = list[tuple[Float64Array, str]]((roof + (0, 0, _ON_ROOF_M), "a roof") for roof in roofs)
+    eyes = list[tuple[Float64Array, str]]((roof + np.array((0, 0, _ON_ROOF_M)), "a roof") for roof in roofs)
     if streets is not None:
         masts = np.column_stack([streets.corners, np.full(len(streets.corners), _MAST_M)])
         eyes += [(mast, "a mast at a junction") for mast in masts if np.isneginf(skyline.at(mast[:2]))]
@@ -314,7 +316,7 @@ power_dbm = 30.0
 def _flight(
     skyline: Skyline, streets: Streets | None, route: Sequence[str]
 ) -> tuple[list[tuple[float, float, float, float]], str]:
-    """Waypoints of the UAV: t [s], x, y, z [m], 8 m/s, 10 m above all that is within 20 m; and what they are."""
+    """Waypoints of the UAV, t [s], x, y, z [m], at 8 m/s, 10 m above all within 20 m; and their kind."""
     ways = [streets.edges[name] for name in route if name in streets.edges] if streets else []
     if ways:
         line, how = np.concatenate(ways), "Along the streets of one of the trips."
@@ -347,7 +349,11 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[str], tuple[int, 
     trips = list[ElementTree.Element]()
     with tempfile.TemporaryDirectory(prefix="caviar-trips-") as folder:
         for rate, kind, more in (
-            (wanted[0], "car", ["--vehicle-class", "passenger", "--fringe-factor", "3", "--min-distance", "300"]),
+            (
+                wanted[0],
+                "car",
+                ["--vehicle-class", "passenger", "--fringe-factor", "3", "--min-distance", "300"],
+            ),
             (wanted[1], "walk", ["--pedestrians", "--max-distance", "700"]),
         ):
             if not rate:
@@ -367,13 +373,14 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[str], tuple[int, 
         ElementTree.indent(root)
         routes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
         Path(folder, "all.rou.xml").write_bytes(routes)
-        _run([str(home / "bin" / "sumo"), "-n", str(streets.file.resolve()), "-r", "all.rou.xml", "--step-length",
-              "0.5", "--begin", "0", "--end", f"{BEGIN_S:g}", "--seed", str(seed), "--no-step-log",
-              "--no-warnings", "--summary-output", "cars.xml", "--person-summary-output", "people.xml"], folder)  # fmt: skip
+        _run([str(home / "bin" / "sumo"), "-n", str(streets.file.resolve()), "-r", "all.rou.xml",
+              "--step-length", "0.5", "--begin", "0", "--end", f"{BEGIN_S:g}", "--seed", str(seed),
+              "--no-step-log", "--no-warnings", "--summary-output", "cars.xml",
+              "--person-summary-output", "people.xml"], folder)  # fmt: skip
         counts = []
-        for name in ("cars.xml", "people.xml"):
+        for name, key in (("cars.xml", "running"), ("people.xml", "walking")):
             steps = ElementTree.parse(Path(folder, name)).getroot().findall("step")  # noqa: S314 - SUMO wrote it
-            counts.append(int(steps[-1].get("running", 0)) if steps else 0)
+            counts.append(int(steps[-1].get(key, 0)) if steps else 0)
     routed = [route.get("edges", "").split() for route in root.iter("route")]
     return routes, max(routed, key=len, default=[]), (counts[0], counts[1])
 
@@ -382,7 +389,9 @@ def _run(command: Sequence[str], folder: str) -> None:
     ran = subprocess.run(command, cwd=folder, capture_output=True, check=False, text=True)  # noqa: S603 - SUMO's
     if ran.returncode:
         said = " ".join((ran.stderr or ran.stdout).strip().splitlines()[-2:])
-        raise RunError(f"{Path(command[0]).name} of SUMO fails: {said}; import the scene again with a larger box")
+        raise RunError(
+            f"{Path(command[0]).name} of SUMO fails: {said}; import the scene again with a larger box"
+        )
 
 
 def _traffic_tables(
@@ -429,8 +438,10 @@ array = { columns = 4 }
 
 _TYPES = """<routes>
     <vTypeDistribution id="traffic">
-        <vType id="car" vClass="passenger" length="4.5" width="1.8" height="1.5" sigma="0.5" probability="0.85"/>
-        <vType id="van" vClass="delivery" length="5.9" width="2.0" height="2.6" sigma="0.5" probability="0.15"/>
+        <vType id="car"
+            vClass="passenger" length="4.5" width="1.8" height="1.5" sigma="0.5" probability="0.85"/>
+        <vType id="van"
+            vClass="delivery" length="5.9" width="2.0" height="2.6" sigma="0.5" probability="0.15"/>
     </vTypeDistribution>
     <vType id="person" vClass="pedestrian" length="0.30" width="0.50" height="1.72"/>
 </routes>"""

@@ -93,8 +93,8 @@ def roofed(polygon: Polygon, low: float, high: float, roof: Roof) -> Body | None
         roof: Its form.
 
     Returns:
-        None: the roof is flat, or the footprint is not one that it fits: a quadrilateral, or for ``pyramidal``
-        a convex one.
+        None: the roof is flat, or the footprint is not one that it fits: a quadrilateral, or for
+        ``pyramidal`` a convex one.
     """
     plain = polygon.simplify(_STRAIGHT_M)
     corners = np.array(_rings(plain)[0].coords)[:-1, :2] if not plain.is_empty else np.zeros((0, 2))
@@ -109,13 +109,19 @@ def roofed(polygon: Polygon, low: float, high: float, roof: Roof) -> Body | None
     beside = sides[1] - sides[3] if len(corners) == 4 else sides[0]
     turned = (np.linalg.norm(beside) > np.linalg.norm(along)) != roof.across
     if roof.direction_deg is not None:
-        fall = np.array([math.sin(math.radians(roof.direction_deg)), math.cos(math.radians(roof.direction_deg))])
+        fall = np.array(
+            [math.sin(math.radians(roof.direction_deg)), math.cos(math.radians(roof.direction_deg))]
+        )
         turned = abs(beside @ fall) / np.linalg.norm(beside) < abs(along @ fall) / np.linalg.norm(along)
     if turned:
         corners = np.roll(corners, -1, axis=0)
     ends = (corners[[3, 1]] + corners[[0, 2]]) / 2 if len(corners) == 4 else np.zeros((2, 2))
     half_m = float(np.linalg.norm(corners[0] - corners[-1])) / 2
-    rise = roof.height_m if roof.height_m is not None else min(half_m * math.tan(math.radians(30)), (high - low) / 2)
+    rise = (
+        roof.height_m
+        if roof.height_m is not None
+        else min(half_m * math.tan(math.radians(30)), (high - low) / 2)
+    )
     eaves = max(high - rise, low + 0.1)
     if not eaves < high:
         return None
@@ -137,7 +143,10 @@ def roofed(polygon: Polygon, low: float, high: float, roof: Roof) -> Body | None
         slopes = np.array([[4, 5, 9], [4, 9, 8], [6, 7, 8], [6, 8, 9], [5, 6, 9], [7, 4, 8]], np.int32)
         slopes, gables = (slopes[:4], slopes[4:]) if roof.shape == "gabled" else (slopes, slopes[:0])
     vertices = np.concatenate(
-        [np.column_stack([at, np.full(len(at), z)]) for at, z in ((corners, low), (corners, eaves), (ridge, high))]
+        [
+            np.column_stack([at, np.full(len(at), z)])
+            for at, z in ((corners, low), (corners, eaves), (ridge, high))
+        ]
     )
     faces = np.concatenate([floor, *walls, gables, slopes]).astype(np.int32)
     return Body(Mesh(vertices, faces), np.arange(len(faces)) >= len(faces) - len(slopes))
@@ -154,7 +163,9 @@ def crown(x: float, y: float, low: float, high: float, diameter: float) -> Mesh:
     # π/6·d²·h of the ellipsoid = (3√3/2·r²)·h/3 of the double pyramid.
     radius = diameter * math.sqrt(math.pi / (3 * math.sqrt(3)))
     angles = np.arange(6) * math.pi / 3
-    ring = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles), np.full(6, (low + high) / 2)])
+    ring = np.column_stack(
+        [x + radius * np.cos(angles), y + radius * np.sin(angles), np.full(6, (low + high) / 2)]
+    )
     here = np.arange(6, dtype=np.int32)
     there = np.roll(here, -1)
     upper = np.stack([here, there, np.full(6, 6)], 1)

@@ -7,13 +7,12 @@ the network that SUMO's netconvert makes of the roads (`road_network`).
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -21,7 +20,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError, one_line
 from caviar_protocol.host import install_command
-from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, source_of
+from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, box_in_metres, source_of
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources.building_shapes import Roof, crown, prism, roofed, triangulated
@@ -35,7 +34,7 @@ STOREY_M = 3.0
 """Height of a storey [m]."""
 DEFAULT_HEIGHT_M = 9.0
 """Height of a building that neither tags nor neighbours say [m]."""
-NEIGHBOURS_M = 100.0
+NEIGHBOURS_M = 200.0
 """Distance within which the median of the tagged heights stands for one that is not tagged [m]."""
 LOW_BUILDINGS: Mapping[str, float] = dict.fromkeys(
     ("garage", "garages", "carport", "shed", "hut", "kiosk", "cabin", "service", "container", "toilets"), 3.0
@@ -59,12 +58,15 @@ MATERIALS: Mapping[str, str] = {
 """Material in ITU-R P.2040 by the value of ``building:material`` or ``roof:material``; ``ground``, and
 ``water``, of which the Recommendation has none: wet ground comes nearest."""
 TREE_M = (10.0, 5.0)
-"""Height of a tree and diameter of its crown that are not tagged [m]; the crown begins at 0.3 of the height."""
+"""Height of a tree and diameter of its crown that are not tagged [m]; the crown begins at 0.3 of it."""
 ROW_M = 8.0
 """Distance between the trees of a row [m]."""
 THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
 """Of walls and roofs, where it is not 0.2 [m]."""
 _KEYS = ("building", "building:part", "highway", "natural", "landuse", "waterway", "type")
+_COMPASS = (
+    "N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW"
+)  # fmt: skip
 # Nodes of a road that netconvert makes use of.
 _SIGNS = ("traffic_signals", "crossing", "stop", "give_way", "mini_roundabout")
 
@@ -226,7 +228,9 @@ def _read_geojson(path: Path) -> Map:
     try:
         collection = msgspec.json.decode(path.read_bytes(), type=_Collection)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise AssetError(f"{path} is no GeoJSON: {one_line(str(error))}; write a FeatureCollection") from error
+        raise AssetError(
+            f"{path} is no GeoJSON: {one_line(str(error))}; write a FeatureCollection"
+        ) from error
     found, numbers = Map(), dict[tuple[float, float], int]()
     for index, feature in enumerate(collection.features):
         where = f"{path}: feature {index}"
@@ -243,7 +247,9 @@ def _read_geojson(path: Path) -> Map:
             raise AssetError(f"{where}: its geometry is none: {one_line(str(error))}; mend it") from error
         places = shapely.get_coordinates(shape)
         if not (np.isfinite(places).all() and (np.abs(places) <= (180, 90)).all()):
-            raise AssetError(f"{where}: coordinates beyond 180 and 90; GeoJSON has longitude and latitude [°]")
+            raise AssetError(
+                f"{where}: coordinates beyond 180 and 90; GeoJSON has longitude and latitude [°]"
+            )
         for part in shapely.get_parts(shape):
             if part.geom_type == "Polygon" and _is_area(tags):
                 found.areas.append(Element(f"f{name}", tags, part))
@@ -302,8 +308,7 @@ class _Assembly:
             latitude_deg=round((south + north) / 2, 7), longitude_deg=round((west + east) / 2, 7)
         )
         self.origin = msgspec.structs.replace(self.origin, projection="tmerc")
-        corners = self._project(np.array([(west, south), (east, south), (east, north), (west, north)]))
-        self.box = request.box_m or (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+        self.box = request.box_m or box_in_metres((west, south, east, north), self.origin)
 
     def _extent(self) -> tuple[float, float, float, float]:
         import shapely
@@ -316,7 +321,8 @@ class _Assembly:
 
     def _project(self, places: Float64Array) -> Float64Array:
         """x and y [m] of longitudes and latitudes [°], Shape ``[N, 2]`` each."""
-        x, y, _ = self.origin.to_scene(places[:, 1], places[:, 0], np.zeros(len(places)))
+        longitude, latitude = cast("tuple[Any, Any]", places.T)
+        x, y, _ = self.origin.to_scene(latitude, longitude, cast("Any", np.zeros(len(places))))
         found: Float64Array = np.stack([x, y], axis=1)
         if not np.isfinite(found).all():
             raise AssetError(f"{self.path}: places too far from the origin to be drawn; write --box W,S,E,N")
@@ -385,7 +391,9 @@ class _Assembly:
         bounds = shapely.bounds(shapes)
         there = (bounds[:, :2] <= (east, north)).all(axis=1) & (bounds[:, 2:] >= (west, south)).all(axis=1)
         drawn = shapely.transform(shapes[there], self._project)
-        return [elements[i]._replace(shape=s) for i, s in zip(np.flatnonzero(there), drawn, strict=True)]
+        return [
+            elements[i]._replace(shape=s) for i, s in zip(np.flatnonzero(there).tolist(), drawn, strict=True)
+        ]
 
     def _solids(self, outlines: list[Element], parts: list[Element]) -> list[_Solid]:
         """Bodies of the buildings whose middle is in the box; parts take the place of their outline."""
@@ -401,9 +409,13 @@ class _Assembly:
             best = int(near[shared.argmax()]) if len(near) and shared.max() > 0.5 * part.shape.area else -1
             owned.setdefault(best, []).append(part)
         middles = shapely.centroid(shapes)
-        inside = shapely.contains_xy(shapely.box(x0, y0, x1, y1), shapely.get_x(middles), shapely.get_y(middles))
+        inside = shapely.contains_xy(
+            shapely.box(x0, y0, x1, y1), shapely.get_x(middles), shapely.get_y(middles)
+        )
         known = [self._tagged(outline.tags) for outline in outlines]
-        like = [i for i, found in enumerate(known) if found and outlines[i].tags["building"] not in LOW_BUILDINGS]
+        like = [
+            i for i, found in enumerate(known) if found and outlines[i].tags["building"] not in LOW_BUILDINGS
+        ]
         neighbours = shapely.STRtree(middles[like])
         solids = []
         for index, outline in enumerate(outlines):
@@ -425,7 +437,9 @@ class _Assembly:
                 rest = rest - part.shape
                 solids.append(self._solid(part, part.shape, self._tagged(part.tags) or height))
             # A strip that is narrower than a metre is a matter of how outline and parts were drawn.
-            left = [p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.buffer(-0.5).area > 1.0]
+            left = [
+                p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.buffer(-0.5).area > 1.0
+            ]
             solids += [self._solid(outline, polygon, height) for polygon in left]
         for part in owned.get(-1, ()):
             if shapely.box(x0, y0, x1, y1).contains(part.shape.centroid):
@@ -454,9 +468,8 @@ class _Assembly:
         levels = metres(tags.get("roof:levels", ""))
         if rise is None and levels and 0 < levels < 10:
             rise = levels * STOREY_M
-        compass = "N NNE NE ENE E ESE SE SSE S SSW SW WSW W WNW NW NNW".split()
         towards = tags.get("roof:direction", "").upper()
-        direction = compass.index(towards) * 22.5 if towards in compass else metres(towards)
+        direction = _COMPASS.index(towards) * 22.5 if towards in _COMPASS else metres(towards)
         across = tags.get("roof:orientation") == "across"
         return Roof(tags.get("roof:shape", "flat"), rise or None, across, direction)
 
@@ -482,7 +495,9 @@ class _Assembly:
         body = roofed(solid.polygon, low, high, solid.roof)
         if body is None:
             if solid.roof.shape != "flat":
-                self.notes["roof that is flat here: its shape, or that of its footprint, is none of those known"] += 1
+                self.notes[
+                    "roof that is flat here: its shape, or that of its footprint, is none of those known"
+                ] += 1
             body = prism(solid.polygon, low, high)
         walls = self._material(tags.get("building:material", ""), self.request.material)
         roofs = self._material(tags.get("roof:material", ""), walls)
@@ -526,14 +541,18 @@ class _Assembly:
             high = self._height(element.tags, least=1.0) or TREE_M[0]
             wide = self._height(element.tags, "diameter_crown", least=0.5) or TREE_M[1]
             along = np.arange(0.0, line.length + 1e-6, ROW_M)  # of a point: 0
-            for x, y in shapely.get_coordinates(shapely.line_interpolate_point(line, along) if line.length else line):
+            for x, y in shapely.get_coordinates(
+                shapely.line_interpolate_point(line, along) if line.length else line
+            ):
                 if x0 <= x <= x1 and y0 <= y <= y1:
                     ground = self._lowest(shapely.Point(x, y))
                     crowns[x, y] = crown(x, y, ground + 0.3 * high, ground + high, wide)
         for index, element in enumerate(self.woods):
             ground = self._lowest(element.shape)
             high = self._height(element.tags, least=1.0) or TREE_M[0]
-            self._add(f"foliage-wood-{index}", prism(element.shape, ground, ground + high).mesh, "wood", "foliage")
+            self._add(
+                f"foliage-wood-{index}", prism(element.shape, ground, ground + high).mesh, "wood", "foliage"
+            )
         if crowns:
             self._add("foliage-trees", joined(list(crowns.values())), "wood", "foliage")
 

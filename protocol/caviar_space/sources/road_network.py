@@ -1,9 +1,9 @@
 """Networks of SUMO of the roads of a map, in the axes of the scene, with sidewalks and beside buildings.
 
-The roads are written as a small map of their own, in which no road leaves the box, runs through a building, or
-is in a tunnel, and SUMO's netconvert makes lanes, junctions, sidewalks and crossings of it. Lanes have widths
-that maps do not say: where one reaches into a building, the road loses its sidewalk there, and where that is
-not enough itself, and the network is made again.
+The roads are written as a small map of their own, in which no road leaves the box, runs through a building,
+or is in a tunnel, and SUMO's netconvert makes lanes, junctions, sidewalks and crossings of it. Lanes have
+widths that maps do not say: where one reaches into a building, the road loses its sidewalk there, and where
+that is not enough itself, and the network is made again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Int64Array
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
 
@@ -103,7 +103,9 @@ def network_of(
     try:
         from sumo import SUMO_HOME
     except ImportError as error:
-        raise SetupError(f"roads need SUMO's netconvert ({error}); run: {install_command('world')}") from error
+        raise SetupError(
+            f"roads need SUMO's netconvert ({error}); run: {install_command('world')}"
+        ) from error
     segments = shapely.linestrings([[roads.places[a], roads.places[b]] for a, b in roads.ends])
     solid = np.array([polygon.buffer(-0.05) for polygon in footprints], object)
     buildings = shapely.STRtree(solid)
@@ -145,7 +147,9 @@ def _cut(ways: Sequence[Way], box: tuple[float, float, float, float], left_out: 
             continue
         hidden = tags.get("tunnel", "no") != "no" or tags.get("covered", "no") != "no"
         inside = shapely.contains_xy(frame, way.places)
-        pieces = list(zip(way.nodes, way.nodes[1:], way.places, way.places[1:], inside, inside[1:], strict=False))
+        pieces = list(
+            zip(way.nodes, way.nodes[1:], way.places, way.places[1:], inside, inside[1:], strict=False)
+        )
         pieces = [
             piece for piece in pieces
             if piece[4] or piece[5] or frame.intersects(shapely.LineString(piece[2:4]))
@@ -160,7 +164,10 @@ def _cut(ways: Sequence[Way], box: tuple[float, float, float, float], left_out: 
             if a == b or len(clipped) != 2 or np.linalg.norm(clipped[1] - clipped[0]) < 0.1:
                 continue
             # Nodes on the border are new: numbers of maps are below 2^40.
-            ends = (a if a_in else (1 << 40) + 2 * len(found.way), b if b_in else (1 << 40) + 2 * len(found.way) + 1)
+            ends = (
+                a if a_in else (1 << 40) + 2 * len(found.way),
+                b if b_in else (1 << 40) + 2 * len(found.way) + 1,
+            )
             for end, at in zip(ends, clipped.tolist(), strict=True):
                 found.places.setdefault(end, tuple(at))
             found.way.append(len(found.ways) - 1)
@@ -179,13 +186,16 @@ def _converted(
     """The network that netconvert makes of the segments that are left."""
     _write_types(home, folder / "roads.typ.xml")
     _write_roads(folder / "roads.osm", roads, state, signs, origin)
-    projection = f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k=1 +ellps=WGS84"
+    projection = (
+        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k=1 +ellps=WGS84"
+    )
     command = [
         str(home / "bin" / "netconvert"), "--osm-files", "roads.osm", "--type-files", "roads.typ.xml",
-        "--proj", projection, "--offset.disable-normalization", "--precision", "3", "--output-file", "out.net.xml",
+        "--proj", projection, "--offset.disable-normalization", "--precision", "3",
+        "--output-file", "out.net.xml", "--output.street-names",
         "--crossings.guess", "--walkingareas", "--geometry.remove", "--junctions.join", "--roundabouts.guess",
         "--tls.guess-signals", "--tls.discard-simple", "--tls.join", "--keep-edges.components", "1",
-        "--output.street-names", "--no-turnarounds.except-deadend", "--aggregate-warnings", "3",
+        "--no-turnarounds.except-deadend", "--aggregate-warnings", "3",
     ]  # fmt: skip
     ran = subprocess.run(command, cwd=folder, capture_output=True, check=False, text=True)  # noqa: S603 - SUMO's
     if ran.returncode or not (folder / "out.net.xml").is_file():
@@ -283,4 +293,6 @@ def _less(segments: Any, state: Int64Array, hits: Sequence[tuple[bool, Any]]) ->
             state[full] = np.minimum(state[full], _BARE)
         else:
             state[near] = _NONE
-    return int(np.sum((before == _FULL) & (state == _BARE))), int(np.sum((before != _NONE) & (state == _NONE)))
+    return int(np.sum((before == _FULL) & (state == _BARE))), int(
+        np.sum((before != _NONE) & (state == _NONE))
+    )
