@@ -172,7 +172,8 @@ def _read_osm(path: Path) -> Map:
             tags = dict(thing.tags)
             if thing.is_area():
                 name = f"{'w' if thing.from_way() else 'r'}{thing.orig_id()}"
-                if _is_area(tags):
+                # An outline that crosses itself is an area without rings.
+                if _is_area(tags) and thing.num_rings()[0]:
                     seen.add(name)
                     found.areas.append(Element(name, tags, shapely.from_wkb(wkb.create_multipolygon(thing))))
             elif thing.is_way():
@@ -188,7 +189,7 @@ def _read_osm(path: Path) -> Map:
                 found.trees.append(Element(f"n{thing.id}", tags, place))
             elif tags.get("highway") in _SIGNS:
                 found.signs[thing.id] = tags
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise AssetError(f"{path} cannot be read: {one_line(str(error))}; get the extract again") from error
     for name in rings.keys() - seen:
         what = "building" if _building(rings[name]) else "area"
