@@ -56,14 +56,15 @@ class Skyline:
     low: Float64Array
     """Corner with the lowest x and y [m], Shape ``[2]``."""
     heights: Float64Array
-    """[m], over x and y, Shape ``[X, Y]``; −∞: open ground."""
+    """Of buildings [m], over x and y, Shape ``[X, Y]``; −∞: open ground."""
+    ground: Float64Array
+    """Of the ground [m], Shape ``[X, Y]``."""
 
-    def at(self, places: Float64Array) -> Float64Array:
-        """Heights at x and y [m], Shape ``[…, 2]`` to ``[…]``."""
+    def at(self, places: Float64Array, ground: bool = False) -> Float64Array:
+        """Heights of buildings, or of the ground, at x and y [m], Shape ``[…, 2]`` to ``[…]``."""
         cells = ((places - self.low) / _CELL_M).astype(np.int64)
-        top = np.array(self.heights.shape) - 1
-        x, y = np.moveaxis(np.clip(cells, 0, top), -1, 0)
-        found: Float64Array = self.heights[x, y]
+        x, y = np.moveaxis(np.clip(cells, 0, np.array(self.heights.shape) - 1), -1, 0)
+        found: Float64Array = (self.ground if ground else self.heights)[x, y]
         return found
 
     def sees(self, eye: Float64Array, places: Float64Array) -> BoolArray:
@@ -132,7 +133,7 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
     meshes = [world_mesh(shape) for shape, leaves in zip(shapes, foliage, strict=True) if not leaves]
     level = are_ground(meshes)
     solids = [mesh for mesh, flat in zip(meshes, level, strict=True) if not flat]
-    skyline = skyline_of(solids, meshes)
+    skyline = skyline_of(solids, [mesh for mesh, flat in zip(meshes, level, strict=True) if flat])
     streets = _streets(scene / NET) if (scene / NET).is_file() else None
     targets = _targets(skyline, streets)
     stations = _stations(skyline, solids, targets, streets)
@@ -177,34 +178,39 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
             raise RunError(f"cannot write {file}: {error.strerror}; choose another folder") from error
 
 
-def skyline_of(solids: Sequence[Mesh], meshes: Sequence[Mesh]) -> Skyline:
-    """Heights of buildings.
+def skyline_of(solids: Sequence[Mesh], grounds: Sequence[Mesh]) -> Skyline:
+    """Heights of buildings and ground.
 
     Args:
         solids: Buildings.
-        meshes: All of the scene, whose extent it has.
+        grounds: Ground, and what else is level.
     """
-    if not meshes:
+    if not solids and not grounds:
         raise AssetError("the scene has no meshes; import it again")
-    places = np.concatenate([mesh.vertices[:, :2] for mesh in meshes])
+    places = np.concatenate([mesh.vertices[:, :2] for mesh in (*solids, *grounds)])
     low = places.min(axis=0)
-    heights = np.full(np.ceil((places.max(axis=0) - low) / _CELL_M).astype(int) + 1, -np.inf)
-    for mesh in solids:
-        for corners in mesh.vertices[mesh.faces]:
-            # Cells whose middle is in the triangle, or that have a corner of it.
-            at = (corners[:, :2] - low) / _CELL_M
-            first, last = np.floor(at.min(axis=0)).astype(int), np.floor(at.max(axis=0)).astype(int) + 1
-            x, y = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]), indexing="ij")
-            a, b, c = at
-            area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-            if abs(area) < 1e-3:
-                continue
-            u = ((x + 0.5 - a[0]) * (c[1] - a[1]) - (y + 0.5 - a[1]) * (c[0] - a[0])) / area
-            v = ((b[0] - a[0]) * (y + 0.5 - a[1]) - (b[1] - a[1]) * (x + 0.5 - a[0])) / area
-            inside = (u >= -0.01) & (v >= -0.01) & (u + v <= 1.01)
-            z = corners[0, 2] + u * (corners[1, 2] - corners[0, 2]) + v * (corners[2, 2] - corners[0, 2])
-            np.maximum.at(heights, (x[inside], y[inside]), z[inside])
-    return Skyline(low, heights)
+    shape = np.ceil((places.max(axis=0) - low) / _CELL_M).astype(int) + 1
+    found = np.full((2, *shape), -np.inf)
+    for heights, meshes in zip(found, (solids, grounds), strict=True):
+        for mesh in meshes:
+            for corners in mesh.vertices[mesh.faces]:
+                _raise_to(heights, np.column_stack([(corners[:, :2] - low) / _CELL_M, corners[:, 2]]))
+    return Skyline(low, found[0], np.where(np.isneginf(found[1]), 0.0, found[1]))
+
+
+def _raise_to(heights: Float64Array, triangle: Float64Array) -> None:
+    """Raise cells whose middle is in a triangle to it; its corners have x and y in cells, and z [m]."""
+    a, b, c = triangle
+    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    if abs(area) < 1e-3:
+        return
+    first, last = triangle[:, :2].min(axis=0).astype(int), triangle[:, :2].max(axis=0).astype(int) + 1
+    x, y = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]), indexing="ij")
+    u = ((x + 0.5 - a[0]) * (c[1] - a[1]) - (y + 0.5 - a[1]) * (c[0] - a[0])) / area
+    v = ((b[0] - a[0]) * (y + 0.5 - a[1]) - (b[1] - a[1]) * (x + 0.5 - a[0])) / area
+    inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9)
+    z = a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2])
+    np.maximum.at(heights, (x[inside], y[inside]), z[inside])
 
 
 def _streets(file: Path) -> Streets:
@@ -253,7 +259,7 @@ def _targets(skyline: Skyline, streets: Streets | None) -> Float64Array:
         x, y = (np.arange(0.5, size, 25.0 / _CELL_M) for size in skyline.heights.shape)
         grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2) * _CELL_M + skyline.low
         places = grid[np.isneginf(skyline.at(grid))]
-    return np.column_stack([places, np.full(len(places), 1.5)])
+    return np.column_stack([places, skyline.at(places, ground=True) + 1.5])
 
 
 def _stations(
@@ -262,7 +268,8 @@ def _stations(
     """Base stations, each at the place from which most targets are seen that the others do not see."""
     roofs = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in solids)])
     # Corners of roofs that nothing is on, one in a square of 10 m.
-    exposed = (roofs[:, 2] >= 6.0) & (roofs[:, 2] <= 60.0) & (skyline.at(roofs[:, :2]) < roofs[:, 2] + 0.5)
+    above = roofs[:, 2] - skyline.at(roofs[:, :2], ground=True)
+    exposed = (above >= 6.0) & (above <= 60.0) & (skyline.at(roofs[:, :2]) < roofs[:, 2] + 0.5)
     roofs = roofs[exposed]
     if len(roofs):
         order = np.lexsort((roofs[:, 1], roofs[:, 0], -roofs[:, 2]))
@@ -270,7 +277,8 @@ def _stations(
         roofs = roofs[order][np.sort(first)]
     eyes = list[tuple[Float64Array, str]]((roof + np.array((0, 0, _ON_ROOF_M)), "a roof") for roof in roofs)
     if streets is not None:
-        masts = np.column_stack([streets.corners, np.full(len(streets.corners), _MAST_M)])
+        corners = streets.corners
+        masts = np.column_stack([corners, skyline.at(corners, ground=True) + _MAST_M])
         eyes += [(mast, "a mast at a junction") for mast in masts if np.isneginf(skyline.at(mast[:2]))]
     if not eyes:
         middle = skyline.low + np.array(skyline.heights.shape) * _CELL_M / 2
@@ -327,7 +335,8 @@ def _flight(
         line, how = skyline.low + size / 2 + size.min() / 4 * circle, "A circle about the middle."
     places = _along(line, 40.0)
     around = np.stack(np.meshgrid([-20.0, 0.0, 20.0], [-20.0, 0.0, 20.0]), axis=-1).reshape(-1, 2)
-    high = max(float(skyline.at(_along(line, 5.0)[:, None] + around).max()), 15.0) + 10.0
+    below = _along(line, 5.0)[:, None] + around
+    high = max(float(skyline.at(below).max()), float(skyline.at(below, ground=True).max()) + 15.0) + 10.0
     times = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1) / 8.0)])
     keep = np.concatenate([[True], np.diff(times) > 0.1])
     rows = zip(times[keep].tolist(), places[keep].tolist(), strict=True)

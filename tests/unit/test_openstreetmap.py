@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -153,12 +152,13 @@ def test_trees_are_closed_volumes_and_water_lies_in_the_ground(scene: ImportedSc
 
 
 def test_roads_are_in_the_axes_of_the_scene_and_none_is_in_a_building(scene: ImportedScene) -> None:
-    root = ElementTree.fromstring(scene.files["sumo/net.net.xml"])
+    root = ElementTree.fromstring(scene.files["sumo/net.net.xml"])  # noqa: S314 - SUMO wrote it
     assert root.find("location").get("netOffset") == "0.000,0.000"  # type: ignore[union-attr]
     lanes = [
-        (lane.get("allow") == "pedestrian", shapely.LineString([p.split(",")[:2] for p in lane.get("shape").split()]))  # type: ignore[union-attr]
+        (lane.get("allow") == "pedestrian", [point.split(",")[:2] for point in lane.get("shape", "").split()])
         for edge in root.iter("edge") if edge.get("function") is None for lane in edge.iter("lane")
     ]  # fmt: skip
+    lanes = [(foot, shapely.LineString(np.array(points, float))) for foot, points in lanes]
     main = [line for foot, line in lanes if not foot and abs(np.array(line.coords)[:, 1]).max() < 3]
     assert max(line.bounds[2] for line in main) == pytest.approx(95.0, abs=0.01)  # the border of the box
     assert {abs(round(line.coords[0][1], 2)) for line in main} == {1.6}  # a lane of 3.2 m on either side
@@ -174,7 +174,8 @@ def test_geojson_has_the_same_tags(tmp_path: Path) -> None:
         return [[lon, lat] for lat, lon, _ in (HERE.to_wgs84(x, y) for x, y in points)]
 
     features = [
-        ({"building": "yes", "height": 7}, "Polygon", [at((10, 10), (20, 10), (20, 30), (10, 30), (10, 10))]),
+        ({"building": "yes", "height": 7}, "Polygon",
+         [at((10, 10), (20, 10), (20, 30), (10, 30), (10, 10))]),
         ({"highway": "residential"}, "LineString", at((-100, 0), (0, 0), (100, 0))),
         ({"highway": "residential"}, "LineString", at((0, 0), (0, 100))),
         ({"natural": "tree"}, "Point", at((5, 5))[0]),
@@ -187,15 +188,16 @@ def test_geojson_has_the_same_tags(tmp_path: Path) -> None:
     file.write_text(json.dumps(collection))
     scene = read_source(file, Request(origin=HERE))
     assert volume(scene.pieces["building-f0"].mesh) == pytest.approx(10 * 20 * 7, rel=2e-3)
-    net = ElementTree.fromstring(scene.files["sumo/net.net.xml"])
+    net = ElementTree.fromstring(scene.files["sumo/net.net.xml"])  # noqa: S314 - SUMO wrote it
     assert any(junction.get("type") == "priority" for junction in net.iter("junction"))  # they meet
 
 
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("12", 12.0), ("10,5", 10.5), ("12.13 m", 12.13), ("100 ft", 30.48), ("33'6\"", 10.2108), ("-2", -2.0),
-        ("NaN", None), ("inf", None), ("12 storeys", None), ("", None), ("1e400", None), ("9" * 400, None),
+        ("12", 12.0), ("10,5", 10.5), ("12.13 m", 12.13), ("100 ft", 30.48), ("-2", -2.0),
+        ("33'6\"", 10.2108), ("NaN", None), ("inf", None), ("12 storeys", None), ("", None),
+        ("1e400", None), ("9" * 400, None),
     ],
 )  # fmt: skip
 def test_lengths_of_tags(text: str, found: float | None) -> None:
@@ -266,9 +268,9 @@ DAMAGED: dict[str, bytes] = {
     "cut.geojson": feature({"type": "Point", "coordinates": [24, 60]})[:-20],
     "nested.geojson": b'{"type": "FeatureCollection", "features": ' + b"[" * 100_000,
     "array.geojson": b"[1, 2]",
-    "nan.geojson": b'{"type":"FeatureCollection","features":[{"geometry":{"type":"Point","coordinates":[NaN,1]}}]}',
+    "nan.geojson": feature({"type": "Point", "coordinates": [24, float("nan")]}),
     "huge.geojson": feature({"type": "Polygon", "coordinates": [[[1e30, 0], [1, 0], [1, 1], [1e30, 0]]]}),
-    "metres.geojson": feature({"type": "Polygon", "coordinates": [[[385e3, 667e4], [386e3, 667e4], [385e3, 668e4]]]}),
+    "metres.geojson": feature({"type": "Point", "coordinates": [385e3, 667e4]}, natural="tree"),
     "kind.geojson": feature({"type": "Circle", "coordinates": [24, 60]}),
     "words.geojson": feature({"type": "Point", "coordinates": ["east", "north"]}),
     "short.geojson": feature({"type": "Polygon", "coordinates": [[[24, 60], [24.1, 60]]]}),
@@ -335,3 +337,79 @@ def test_wrong_options_are_refused(arguments: list[str], words: str, tmp_path: P
     with pytest.raises(AssetError, match=words.replace("(", r"\(")):
         CliRunner().invoke(app, ["scene", "import", str(file), *out, *arguments], catch_exceptions=False)
     assert not (tmp_path / "scene").exists()
+
+
+def tiff(file: Path, heights: np.ndarray, west: float, north: float, step: float) -> Path:
+    """GeoTIFF of WGS84 whose values are those of points."""
+    image = pytest.importorskip("PIL.Image")
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    tags = ImageFileDirectory_v2()
+    for tag, kind, value in (
+        (33550, 12, (step, step, 0.0)), (33922, 12, (0.0, 0.0, 0.0, west, north, 0.0)),
+        (34735, 3, (1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326)),
+    ):  # fmt: skip
+        tags.tagtype[tag] = kind
+        tags[tag] = value
+    image.fromarray(heights.astype(np.float32)).save(file, tiffinfo=tags)
+    return file
+
+
+def dted(file: Path, heights: np.ndarray) -> Path:
+    """DTED of 60 to 61° north and 24 to 25° east, whose step is 1/(n − 1)°."""
+    rows, columns = heights.shape
+    step = f"{36000 // (columns - 1):04d}"
+    header = f"UHL10240000E0600000N{step}{step}".ljust(47) + f"{columns:04d}{rows:04d}"
+    encoded = np.where(heights < 0, 0x8000 | -heights.astype(int), heights.astype(int))
+    records = b"".join(
+        b"\xaa" + bytes(7) + encoded[::-1, column].astype(">u2").tobytes() + bytes(4)
+        for column in range(columns)
+    )
+    file.write_bytes(header.ljust(80).encode() + bytes(648 + 2700) + records)
+    return file
+
+
+def test_grids_of_heights_have_the_places_of_their_values(tmp_path: Path) -> None:
+    from caviar_space.sources.height_grids import read_heights
+
+    rows, columns = np.mgrid[:11, :11]
+    heights = 10.0 * (10 - rows) + columns - 3  # 100 m a degree northwards, 10 m eastwards
+    for grid in (read_heights(tiff(tmp_path / "a.tif", heights, 24.0, 61.0, 0.1)),
+                 read_heights(dted(tmp_path / "a.dt0", heights))):  # fmt: skip
+        found = grid.at(np.array([24.0, 24.25, 25.0, 23.9]), np.array([60.0, 60.31, 61.0, 60.5]))
+        np.testing.assert_allclose(found, [-3.0, 30.5, 107.0, np.nan], atol=1e-6)
+
+
+def test_buildings_and_roads_stand_on_the_ground(tmp_path: Path) -> None:
+    _, columns = np.mgrid[:60, :60]
+    west, north, step = 24.935, 60.1725, 0.0002
+    heights = 50.0 + 0.5 * columns  # a slope to the west of 0.5 m on 11 m
+    grid = tiff(tmp_path / "slope.tif", heights, west, north, step)
+    file = town().write(tmp_path / "town.osm")
+    made = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0), heights=grid))
+    assert made.origin is not None
+    slope = 0.5 / (made.origin.to_scene(60.17, west + step)[0] - made.origin.to_scene(60.17, west)[0])
+    ground = made.pieces["ground"].mesh.vertices
+    np.testing.assert_allclose(ground[:, 2], slope * (ground[:, 0] + 90.0), atol=0.02)
+    house = made.pieces["building-w1004"].mesh.vertices
+    assert np.ptp(house[:, 2]) == pytest.approx(20.0)
+    assert house[:, 2].min() == pytest.approx(slope * (20 + 90), abs=0.02)
+    _, _, altitude = made.origin.to_wgs84(20.0, 20.0, float(house[:, 2].min()))
+    assert altitude == pytest.approx(50 + 0.5 * (made.origin.to_wgs84(20, 20)[1] - west) / step, abs=0.05)
+    net = ElementTree.fromstring(made.files["sumo/net.net.xml"])  # noqa: S314 - SUMO wrote it
+    points = [p.split(",") for lane in net.iter("lane") for p in lane.get("shape", "").split()]
+    at = np.array([[*point, "0"][:3] for point in points], float)
+    assert np.abs(at[:, 2] - slope * (at[:, 0] + 90.0)).max() < 0.6  # junctions are level
+
+
+@pytest.mark.parametrize("name", ["text.tif", "cut.dt1", "none.dt2", "grid.asc"])
+def test_damaged_heights_are_refused(name: str, tmp_path: Path) -> None:
+    from caviar_space.sources.height_grids import read_heights
+
+    file = tmp_path / name
+    if name == "cut.dt1":
+        file.write_bytes(dted(file, np.zeros((5, 5))).read_bytes()[:-9])
+    elif name != "none.dt2":
+        file.write_text("no heights")
+    with pytest.raises(AssetError, match=name):
+        read_heights(file)

@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 from pkgutil import resolve_name
 
+import typer
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
@@ -112,7 +113,7 @@ def new_scenario(name: str, scene: Path | None = None) -> Path:
     if _NAME.fullmatch(path.stem) is None:
         raise RunError(f"{path.stem!r} is no name of a scenario: use letters, digits, '_', '.' and '-'")
     if scene is not None:
-        resolve_name(_TOWN)(path, scene)
+        resolve_name(_TOWN)(path, scene, say=typer.echo)
         return path
     text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()
     try:

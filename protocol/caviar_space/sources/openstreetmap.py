@@ -59,6 +59,8 @@ MATERIALS: Mapping[str, str] = {
 ``water``, of which the Recommendation has none: wet ground comes nearest."""
 TREE_M = (10.0, 5.0)
 """Height of a tree and diameter of its crown that are not tagged [m]; the crown begins at 0.3 of it."""
+STEP_M = 20.0
+"""Side of the squares of ground that is not level [m]."""
 ROW_M = 8.0
 """Distance between the trees of a row [m]."""
 THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
@@ -297,6 +299,40 @@ class _Solid(NamedTuple):
     roof: Roof
 
 
+@dataclass(frozen=True, eq=False)
+class _Terrain:
+    """Ground that is not level: heights at the nodes of squares, each of two triangles."""
+
+    corner: tuple[float, float]
+    """With the lowest x and y [m]."""
+    heights: Float64Array
+    """[m], over x and y, Shape ``[X, Y]``."""
+
+    def at(self, places: Float64Array) -> Float64Array:
+        """Heights of the triangles at x and y [m], Shape ``[N, 2]`` to ``[N]``."""
+        cells = np.clip((places - self.corner) / STEP_M, 0, np.array(self.heights.shape) - 1.000001)
+        (i, j), (u, v) = cells.astype(int).T, (cells % 1).T
+        low, high = self.heights[i, j], self.heights[i + 1, j + 1]
+        beside, beyond = self.heights[i + 1, j], self.heights[i, j + 1]
+        found: Float64Array = np.where(
+            u >= v,
+            low + u * (beside - low) + v * (high - beside),
+            low + v * (beyond - low) + u * (high - beyond),
+        )
+        return found
+
+    def mesh(self) -> Mesh:
+        """The triangles."""
+        x, y = self.heights.shape
+        nodes = np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1).reshape(-1, 2)
+        number = np.arange(x * y, dtype=np.int32).reshape(x, y)
+        a, b, c, d = (
+            part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+        )
+        faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+        return Mesh(np.column_stack([nodes * STEP_M + self.corner, self.heights.ravel()]), faces)
+
+
 class _Assembly:
     """Makes a scene of a map."""
 
@@ -336,6 +372,7 @@ class _Assembly:
         self.request.progress("buildings", 0.1)
         outlines, parts = self._areas()
         solids = self._solids(outlines, parts)
+        self._survey([solid.polygon for solid in solids])
         for solid in solids:
             self._add_building(solid)
         self.request.progress("ground and trees", 0.2)
@@ -529,7 +566,37 @@ class _Assembly:
 
     def _lowest(self, shape: Geometry) -> float:
         """Height of the lowest ground under a shape [m]."""
-        return 0.0
+        import shapely
+
+        if self.terrain is None:
+            return 0.0
+        return float(self.terrain.at(shapely.get_coordinates(shapely.segmentize(shape, STEP_M / 4))).min())
+
+    def _survey(self, footprints: Sequence[Any]) -> None:
+        """Take the heights of the ground; z counts from the lowest."""
+        import shapely
+
+        self.terrain = None
+        x0, y0, x1, y1 = shapely.total_bounds([*footprints, shapely.box(*self.box)])
+        self.extent = (float(x0), float(y0), float(x1), float(y1))
+        if self.request.heights is None:
+            return
+        from caviar_space.sources.height_grids import read_heights
+
+        grid = read_heights(self.request.heights)
+        self.made.sources.append(source_of(self.request.heights))
+        x, y = (np.arange(a, b + STEP_M, STEP_M) for a, b in ((x0, x1), (y0, y1)))
+        places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+        latitude, longitude, _ = self.origin.to_wgs84(
+            *cast("Any", (places[..., 0], places[..., 1], 0 * places[..., 0]))
+        )
+        heights = grid.at(np.ravel(longitude), np.ravel(latitude)).reshape(places.shape[:2])
+        if np.isnan(heights).all():
+            raise AssetError(f"{self.request.heights} has no heights within the box; name another grid")
+        lowest = float(np.nanmin(heights))
+        self.notes[f"place of the ground without a height: {lowest:g} m"] += int(np.isnan(heights).sum())
+        self.terrain = _Terrain((float(x0), float(y0)), np.nan_to_num(heights - lowest, nan=0.0))
+        self.origin = self.made.origin = msgspec.structs.replace(self.origin, altitude_m=lowest)
 
     def _add_foliage(self) -> None:
         """Crowns of trees, and woods, of which all of a kind are one piece: volumes may overlap."""
@@ -561,12 +628,12 @@ class _Assembly:
         """Level ground below all pieces, and water in it."""
         import shapely
 
-        x0, y0, x1, y1 = self.box
-        bounds = [piece.mesh.vertices[:, :2] for piece in self.made.pieces.values()]
-        places = np.concatenate([np.array([(x0, y0), (x1, y1)]), *bounds])
-        (x0, y0), (x1, y1) = places.min(axis=0), places.max(axis=0)
+        if self.terrain is not None:
+            self.notes["water on ground that is not level: left out"] += len(self.water)
+            self._add("ground", self.terrain.mesh(), self._material("ground", "concrete"), "ground")
+            return
         water = shapely.union_all(self.water)
-        land = shapely.box(x0, y0, x1, y1) - water
+        land = shapely.box(*self.extent) - water
         for name, area in (("ground", land), ("water", water)):
             flat = [triangulated(p) for p in shapely.get_parts(area) if p.geom_type == "Polygon"]
             if flat:
@@ -578,6 +645,7 @@ class _Assembly:
 
         roads = [road._replace(places=self._project(road.places)) for road in self.map.roads]
         made = network_of(roads, self.map.signs, [solid.polygon for solid in solids], self.box, self.origin,
+                          self.terrain and self.terrain.at,
                           lambda name, share: self.request.progress(name, 0.3 + 0.7 * share))  # fmt: skip
         self.notes.update(made.left_out)
         self.made.notes += made.notes

@@ -8,18 +8,20 @@ that is not enough itself, and the network is made again.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
 
@@ -43,6 +45,8 @@ SIDEWALK_M = 2.0
 """Width of a sidewalk [m]."""
 # Half of what a vehicle needs of its lane [m], on the road and where it turns.
 _HALF_M, _TURNING_HALF_M = 1.05, 1.3
+# Of a road on ground that is not level [m].
+_STEP_M = 20.0
 # Networks that are made at most, each with fewer roads and sidewalks.
 _ATTEMPTS = 6
 _FULL, _BARE, _NONE = 2, 1, 0
@@ -77,6 +81,7 @@ def network_of(
     footprints: Sequence[Any],
     box: tuple[float, float, float, float],
     origin: Georeference,
+    ground: Callable[[Float64Array], Float64Array] | None,
     progress: Callable[[str, float], None],
 ) -> Network:
     """Make the network of roads.
@@ -87,6 +92,7 @@ def network_of(
         footprints: Polygons of buildings [m], which no lane may reach.
         box: Lowest and highest x and y [m]; roads end at its border.
         origin: Of the scene.
+        ground: Heights at x and y [m], Shape ``[N, 2]`` to ``[N]``; None: 0.
         progress: Called with the share that is done.
 
     Raises:
@@ -96,7 +102,7 @@ def network_of(
     import shapely
 
     made = Network()
-    roads = _cut(ways, box, made.left_out)
+    roads = _cut(ways, box, ground is None, made.left_out)
     if not roads.ends:
         made.notes.append("no network of roads: the map has none within the box")
         return made
@@ -122,7 +128,7 @@ def network_of(
             if not state.any():
                 made.notes.append("no network of roads: all of them run through buildings")
                 return made
-            net = _converted(Path(folder), roads, state, signs, origin, Path(SUMO_HOME))
+            net = _converted(Path(folder), roads, state, signs, origin, ground, Path(SUMO_HOME))
             hits = list(_hits(ElementTree.fromstring(net), buildings, solid))  # noqa: S314 - SUMO wrote it
             if not hits or attempt == _ATTEMPTS - 1:
                 break
@@ -135,12 +141,14 @@ def network_of(
     return made
 
 
-def _cut(ways: Sequence[Way], box: tuple[float, float, float, float], left_out: Counter[str]) -> _Roads:
+def _cut(
+    ways: Sequence[Way], box: tuple[float, float, float, float], level: bool, left_out: Counter[str]
+) -> _Roads:
     """Segments of roads above the ground within the box, the last one of which ends at its border."""
     import shapely
 
     frame = shapely.box(*box)
-    found = _Roads()
+    found, new = _Roads(), count(1 << 40)  # nodes of maps have lower numbers
     for way in ways:
         tags = way.tags
         if tags["highway"] not in ROADS or tags.get("area") == "yes":
@@ -163,15 +171,17 @@ def _cut(ways: Sequence[Way], box: tuple[float, float, float, float], left_out: 
             clipped = shapely.get_coordinates(line if a_in and b_in else line & frame)
             if a == b or len(clipped) != 2 or np.linalg.norm(clipped[1] - clipped[0]) < 0.1:
                 continue
-            # Nodes on the border are new: numbers of maps are below 2^40.
-            ends = (
-                a if a_in else (1 << 40) + 2 * len(found.way),
-                b if b_in else (1 << 40) + 2 * len(found.way) + 1,
-            )
-            for end, at in zip(ends, clipped.tolist(), strict=True):
-                found.places.setdefault(end, tuple(at))
-            found.way.append(len(found.ways) - 1)
-            found.ends.append(ends)
+            # Between its ends a road follows the ground.
+            parts = 1 if level else math.ceil(float(np.linalg.norm(clipped[1] - clipped[0])) / _STEP_M)
+            nodes = [
+                a if a_in else next(new),
+                *(next(new) for _ in range(parts - 1)),
+                b if b_in else next(new),
+            ]
+            for node, at in zip(nodes, np.linspace(*clipped, parts + 1).tolist(), strict=True):
+                found.places.setdefault(node, tuple(at))
+            found.way += [len(found.ways) - 1] * parts
+            found.ends += pairwise(nodes)
     return found
 
 
@@ -181,11 +191,12 @@ def _converted(
     state: Int64Array,
     signs: Mapping[int, Mapping[str, str]],
     origin: Georeference,
+    ground: Callable[[Float64Array], Float64Array] | None,
     home: Path,
 ) -> bytes:
     """The network that netconvert makes of the segments that are left."""
     _write_types(home, folder / "roads.typ.xml")
-    _write_roads(folder / "roads.osm", roads, state, signs, origin)
+    _write_roads(folder / "roads.osm", roads, state, signs, origin, ground)
     projection = (
         f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k=1 +ellps=WGS84"
     )
@@ -196,6 +207,7 @@ def _converted(
         "--crossings.guess", "--walkingareas", "--geometry.remove", "--junctions.join", "--roundabouts.guess",
         "--tls.guess-signals", "--tls.discard-simple", "--tls.join", "--keep-edges.components", "1",
         "--no-turnarounds.except-deadend", "--aggregate-warnings", "3",
+        *(["--osm.elevation"] if ground else []),
     ]  # fmt: skip
     ran = subprocess.run(command, cwd=folder, capture_output=True, check=False, text=True)  # noqa: S603 - SUMO's
     if ran.returncode or not (folder / "out.net.xml").is_file():
@@ -222,13 +234,17 @@ def _write_roads(
     state: Int64Array,
     signs: Mapping[int, Mapping[str, str]],
     origin: Georeference,
+    ground: Callable[[Float64Array], Float64Array] | None,
 ) -> None:
     """The map of the segments that are left; those of one way that are alike and connected are one way."""
     root = ElementTree.Element("osm", version="0.6")
     names, places = list(roads.places), np.array(list(roads.places.values()))
+    heights = dict(zip(names, ground(places).tolist(), strict=True)) if ground else {}
     latitude, longitude, *_ = origin.to_wgs84(places[:, 0], places[:, 1], np.zeros(len(places)))  # type: ignore[arg-type]
     for name, north, east in zip(names, latitude.tolist(), longitude.tolist(), strict=True):  # type: ignore[attr-defined]
         node = ElementTree.SubElement(root, "node", id=str(name), lat=f"{north:.10f}", lon=f"{east:.10f}")
+        if ground is not None:
+            ElementTree.SubElement(node, "tag", k="ele", v=f"{heights[name]:.3f}")
         for key, value in signs.get(name, {}).items():
             if key in ("highway", "crossing", "traffic_signals:direction", "direction"):
                 ElementTree.SubElement(node, "tag", k=key, v=value)
