@@ -38,9 +38,9 @@ BEGIN_S = 300.0
 END_S = 1800.0
 """SUMO's time at which the last trip begins [s]."""
 DENSITY = (2.5, 4.0)
-"""Vehicles on a kilometre of lanes, and people on one of sidewalks, about; at most `MOST` of each."""
-MOST = 120
-"""Vehicles, and people, of a scenario at most."""
+"""Vehicles on a kilometre of lanes, and people on one of sidewalks, about, between `LEAST` and `MOST`."""
+LEAST, MOST = 10, 120
+"""Vehicles, and people, of a scenario, about."""
 STATIONS = 3
 """Base stations of a scenario."""
 _CELL_M = 2.0
@@ -313,6 +313,7 @@ def _device(number: int, station: Station) -> str:
 name = "bs{number}"
 kind = "antenna"
 role = "tx"
+world = "sky"
 position_m = [{x}, {y}, {z}]
 yaw_deg = {station.yaw_deg:.1f}
 pitch_deg = {station.pitch_deg:.1f}
@@ -351,19 +352,25 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[str], tuple[int, 
     except ImportError as error:
         raise SetupError(f"traffic needs SUMO ({error}); run: {install_command('world')}") from error
     home = Path(SUMO_HOME)
-    lanes_km, walks_km = streets.length_km
-    # Little's law, with trips of some 150 s and walks of 400 s.
-    wanted = (min(DENSITY[0] * lanes_km, MOST) / 150.0, min(DENSITY[1] * walks_km, MOST) / 400.0)
+    extent = np.ptp(np.concatenate([*streets.lanes, streets.corners]), axis=0)
+    extent_m = float(extent.max(initial=0.0))
+    apart_m = min(300.0, 0.4 * extent_m)
+    # Little's law, with trips of some 150 s and walks of 400 s in a town of 1.5 km.
+    stays_s = min(0.1 * extent_m, 150.0), min(0.3 * extent_m, 400.0)
+    rates = [
+        min(max(density * km, LEAST), MOST) / stay_s if km else 0.0
+        for density, km, stay_s in zip(DENSITY, streets.length_km, stays_s, strict=True)
+    ]
     root = ElementTree.fromstring(_TYPES)  # noqa: S314 - our own
     trips = list[ElementTree.Element]()
     with tempfile.TemporaryDirectory(prefix="caviar-trips-") as folder:
         for rate, kind, more in (
             (
-                wanted[0],
+                rates[0],
                 "car",
-                ["--vehicle-class", "passenger", "--fringe-factor", "3", "--min-distance", "300"],
+                ["--vehicle-class", "passenger", "--fringe-factor", "3", "--min-distance", f"{apart_m:g}"],
             ),
-            (wanted[1], "walk", ["--pedestrians", "--max-distance", "700"]),
+            (rates[1], "walk", ["--pedestrians", "--max-distance", "700"]),
         ):
             if not rate:
                 continue
@@ -436,6 +443,7 @@ pool = {{ {held} }}  # bodies held ready for those who come
 name = "rx"
 kind = "antenna"
 role = "rx"
+world = "traffic"
 on = "traffic.car-*"
 count = 8
 mount = "roof"

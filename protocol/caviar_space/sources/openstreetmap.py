@@ -21,7 +21,7 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError, one_line
 from caviar_protocol.host import install_command
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, box_in_metres, source_of
-from caviar_space.meshes import Mesh
+from caviar_space.meshes import Mesh, joined
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources.building_shapes import Roof, crown, prism, roofed, triangulated
 
@@ -340,6 +340,7 @@ class _Assembly:
         self.path, self.request, self.map = path, request, found
         self.notes: Counter[str] = found.left_out
         box, bounds = request.box_deg, found.bounds or self._extent()
+        self.boxed = bool(box or request.box_m)
         west, south, east, north = box or bounds
         self.origin = request.origin or Georeference(
             latitude_deg=round((south + north) / 2, 7), longitude_deg=round((west + east) / 2, 7)
@@ -447,9 +448,9 @@ class _Assembly:
             best = int(near[shared.argmax()]) if len(near) and shared.max() > 0.5 * part.shape.area else -1
             owned.setdefault(best, []).append(part)
         middles = shapely.centroid(shapes)
-        inside = shapely.contains_xy(
-            shapely.box(x0, y0, x1, y1), shapely.get_x(middles), shapely.get_y(middles)
-        )
+        # Without a box all buildings of the extract are taken, also those that its border goes through.
+        frame = shapely.box(x0, y0, x1, y1) if self.boxed else shapely.box(-np.inf, -np.inf, np.inf, np.inf)
+        inside = shapely.contains_xy(frame, shapely.get_x(middles), shapely.get_y(middles))
         known = [self._tagged(outline.tags) for outline in outlines]
         like = [
             i for i, found in enumerate(known) if found and outlines[i].tags["building"] not in LOW_BUILDINGS
@@ -480,7 +481,7 @@ class _Assembly:
             ]
             solids += [self._solid(outline, polygon, height) for polygon in left]
         for part in owned.get(-1, ()):
-            if shapely.box(x0, y0, x1, y1).contains(part.shape.centroid):
+            if shapely.contains_xy(frame, *part.shape.centroid.coords[0]):
                 solids.append(self._solid(part, part.shape, self._tagged(part.tags) or DEFAULT_HEIGHT_M))
         return solids
 
@@ -650,14 +651,3 @@ class _Assembly:
         self.notes.update(made.left_out)
         self.made.notes += made.notes
         self.made.files.update(made.files)
-
-
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of several.
-
-    Args:
-        meshes: At least one.
-    """
-    begins = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + begin for mesh, begin in zip(meshes, begins, strict=False)]
-    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces).astype(np.int32))
