@@ -169,6 +169,19 @@ def test_roads_are_in_the_axes_of_the_scene_and_none_is_in_a_building(scene: Imp
     assert any("segment of a road through a building" in note for note in scene.notes)
 
 
+def test_the_sea_is_to_the_right_of_a_coast(tmp_path: Path) -> None:
+    made = MapFile()
+    made.block(-60, 20, 10, 10, building="yes")
+    made.way(
+        (-80, -50), (0, -40), (80, -50), natural="coastline"
+    )  # its ends are lost with an extract's border
+    file = made.write(tmp_path / "coast.osm")
+    scene = read_source(file, Request(origin=HERE, box_m=(-100.0, -100.0, 100.0, 100.0)))
+    sea = scene.pieces["water"].mesh.vertices
+    assert sea[:, 1].max() == pytest.approx(-40.0, abs=0.02)
+    assert sea[:, 1].min() == pytest.approx(-100.0, abs=0.02)
+
+
 def test_geojson_has_the_same_tags(tmp_path: Path) -> None:
     def at(*points: tuple[float, float]) -> list[list[float]]:
         return [[lon, lat] for lat, lon, _ in (HERE.to_wgs84(x, y) for x, y in points)]
@@ -290,6 +303,13 @@ def test_damaged_maps_are_refused_by_name(name: str, tmp_path: Path) -> None:
 
 CROSSED = "1 3 2 4 1"
 ROAD = '<way id="9"><nd ref="1"/><nd ref="2"/><nd ref="99"/><tag k="highway" v="residential"/></way>'
+# A line of a few metres in the middle of two trees that are far apart.
+COAST = (
+    '<node id="10" lat="60.16" lon="24.92"><tag k="natural" v="tree"/></node>'
+    '<node id="11" lat="60.18" lon="24.96"><tag k="natural" v="tree"/></node>'
+    '<node id="5" lat="60.17006" lon="24.9401"/><node id="6" lat="60.17008" lon="24.9402"/>'
+    '<way id="8"><nd ref="5"/><nd ref="6"/><tag k="natural" v="coastline"/></way>'
+)
 
 
 @pytest.mark.parametrize(
@@ -307,6 +327,7 @@ ROAD = '<way id="9"><nd ref="1"/><nd ref="2"/><nd ref="99"/><tag k="highway" v="
         (house({"building": "yes"}, CROSSED) + ROAD, "1 × building without a closed outline"),
         (house({"building": "yes"}, "1 2 3 99 1") + ROAD, "1 × building without a closed outline"),
         (house({"building": "yes"}) + ROAD, "1 × node of a road that is not in the file"),
+        (house({"building": "yes"}) + COAST, "1 × coast that ends within the box"),
         (house({"building": "yes", "height": "5"}), "no network of roads: the map has none"),
     ],
 )

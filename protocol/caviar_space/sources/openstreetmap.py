@@ -66,6 +66,8 @@ ROW_M = 8.0
 THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
 """Of walls and roofs, where it is not 0.2 [m]."""
 _KEYS = ("building", "building:part", "highway", "natural", "landuse", "waterway", "type")
+# Distance from the border of a map to the last node of a coast, at most [m].
+_CUT_M = 100.0
 _COMPASS = (
     "N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW"
 )  # fmt: skip
@@ -99,6 +101,8 @@ class Map:
 
     areas: list[Element] = field(default_factory=list)
     trees: list[Element] = field(default_factory=list)
+    coast: list[Element] = field(default_factory=list)
+    """Lines with the land to their left."""
     roads: list[Way] = field(default_factory=list)
     signs: dict[int, Mapping[str, str]] = field(default_factory=dict)
     """Tags of nodes of roads that stand for traffic signals and the like."""
@@ -181,7 +185,7 @@ def _read_osm(path: Path) -> Map:
             elif thing.is_way():
                 if _is_area(tags) and "highway" not in tags:
                     rings[f"w{thing.id}"] = tags
-                elif "highway" in tags or tags.get("natural") == "tree_row":
+                elif "highway" in tags or tags.get("natural") in ("tree_row", "coastline"):
                     _add_line(found, thing.id, tags, thing.nodes)
             elif thing.is_relation():
                 if _is_area(tags) and tags.get("type") == "multipolygon":
@@ -211,7 +215,8 @@ def _add_line(found: Map, number: int, tags: Mapping[str, str], nodes: Any) -> N
     if "highway" in tags:
         found.roads.append(Way(number, tags, tuple(node.ref for node in there), places))
     else:
-        found.trees.append(Element(f"w{number}", tags, shapely.LineString(places)))
+        lines = found.coast if tags["natural"] == "coastline" else found.trees
+        lines.append(Element(f"w{number}", tags, shapely.LineString(places)))
 
 
 class _Feature(msgspec.Struct):
@@ -633,13 +638,42 @@ class _Assembly:
             self.notes["water on ground that is not level: left out"] += len(self.water)
             self._add("ground", self.terrain.mesh(), self._material("ground", "concrete"), "ground")
             return
-        water = shapely.union_all(self.water)
+        water = shapely.union_all([*self.water, *self._sea()])
         land = shapely.box(*self.extent) - water
         for name, area in (("ground", land), ("water", water)):
-            flat = [triangulated(p) for p in shapely.get_parts(area) if p.geom_type == "Polygon"]
+            flat = [triangulated(p) for p in shapely.get_parts(area) if p.area > 0.1]
             if flat:
                 meshes = [Mesh(np.column_stack([at, np.zeros(len(at))]), faces) for at, faces in flat]
                 self._add(name, joined(meshes), self._material(name, "concrete"), name)
+
+    def _sea(self) -> list[Any]:
+        """Parts of the ground to the right of coasts."""
+        import shapely
+
+        frame = shapely.box(*self.extent)
+        drawn = [element.shape for element in self._near(self.map.coast)]
+        coasts = shapely.line_merge(shapely.union_all(drawn), directed=True) & frame
+        lines = list[Any]()
+        for line in shapely.get_parts(coasts):
+            points = shapely.get_coordinates(line)
+            # An extract ends a coast at its last node within.
+            ends = [shapely.shortest_line(shapely.Point(at), frame.boundary) for at in points[[0, -1]]]
+            first, last = (shapely.get_coordinates(e)[1:] if e.length < _CUT_M else points[:0] for e in ends)
+            lines.append(shapely.LineString(np.concatenate([first, points, last])))
+        parts = shapely.polygonize([shapely.union_all([frame.boundary, *lines])]).geoms
+        found = []
+        for line in lines:
+            points = shapely.get_coordinates(line)
+            steps = np.diff(points, axis=0)
+            longest = int(np.linalg.norm(steps, axis=1).argmax())
+            middle, (x, y) = points[longest] + steps[longest] / 2, steps[longest]
+            aside = 0.1 * np.array((y, -x)) / np.hypot(x, y)
+            sea = [part for part in parts if shapely.contains_xy(part, *(middle + aside))]
+            if any(shapely.contains_xy(part, *(middle - aside)) for part in sea):
+                self.notes["coast that ends within the box: no sea"] += 1
+            else:
+                found += sea
+        return found
 
     def _add_roads(self, solids: Sequence[_Solid]) -> None:
         from caviar_space.sources.road_network import network_of
