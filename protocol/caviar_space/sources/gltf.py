@@ -18,10 +18,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_space.imported_scenes import ImportedScene
 from caviar_space.sources import Request
-from caviar_space.sources.pieces import Colour, SceneBuilder, at, beside, contents, moved, reading
-
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Turns glTF's axes into x east, y north, z up."""
+from caviar_space.sources.pieces import Y_UP, Colour, SceneBuilder, at, beside, contents, moved, reading
 
 _Index = Annotated[int, msgspec.Meta(ge=0)]
 _Numbers3 = tuple[float, float, float]

@@ -145,6 +145,10 @@ def at(items: Sequence[Item], index: int, what: str) -> Item:
     return items[index]
 
 
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Turns axes of which y is up and z south into x east, y north, z up."""
+
+
 def moved(matrix: Float64Array, vertices: Float64Array, faces: Int64Array) -> tuple[Float64Array, Int64Array]:
     """Vertices and triangles after a homogeneous transform, their outside still in front if it mirrors.
 
@@ -240,12 +244,26 @@ class SceneBuilder:
             name: As the source gives it; empty: it gives none.
             colour: Linear sRGB, 0…1.
         """
-        made = RadioMaterial(self.itu(name or "unnamed"), colour=colour)
+        return self.keep(name, RadioMaterial(self.itu(name or "unnamed"), colour=colour))
+
+    def keep(self, name: str, made: RadioMaterial) -> str:
+        """Key of a material with its properties.
+
+        Args:
+            name: As the source gives it.
+            made: Its properties.
+        """
         base = slug(re.sub(r"\.\d{3,}$", "", name)) or "unnamed"
         number, key = 1, base
         while self.scene.materials.setdefault(key, made) != made:
             number, key = number + 1, f"{base}-{number + 1}"
         return key
+
+    def upright(self, vertices: Float64Array) -> Float64Array:
+        """Vertices of a source without axes, turned as the request says which of them is up."""
+        note = f"the format has no axes: {self.request.up} is taken as up"
+        self.scene.notes += [note] if note not in self.scene.notes else []
+        return vertices @ Y_UP[:3, :3].T if self.request.up == "y" else vertices
 
     def add(
         self, name: str, vertices: Float64Array, faces: Any, material: str, kind: str, file: Path, number: int
@@ -265,7 +283,10 @@ class SceneBuilder:
         """
         said = f"{file}: {name!r}"
         corners = np.asarray(faces, np.int64).reshape(-1, 3)
-        if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        if not len(corners):
+            self.scene.notes.append(f"{file.name}: {name!r} has no faces: left out")
+            return
+        if not 0 <= corners.min() <= corners.max() < len(vertices):
             wrong = corners.max() if corners.max() >= len(vertices) else corners.min()
             raise AssetError(f"{said} has a corner at vertex {wrong} of {len(vertices)}; export it again")
         used, corners = np.unique(corners, return_inverse=True)

@@ -22,8 +22,8 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference, ImportedScene
 from caviar_space.sources import Request
-from caviar_space.sources.gltf import Y_UP, Gltf
-from caviar_space.sources.pieces import SceneBuilder, at, beside, contents, moved, reading
+from caviar_space.sources.gltf import Gltf
+from caviar_space.sources.pieces import Y_UP, SceneBuilder, at, beside, contents, moved, reading
 
 _MOST_TILES = 100_000
 # [m] from the Earth's centre, of places on it.
@@ -308,8 +308,7 @@ class _Subtree:
 
     def first(self, level: int) -> int:
         """Count of tiles in the levels of the subtree above one."""
-        many = 2**self._axes
-        return int(many ** (level - self.level) - 1) // (many - 1)
+        return ((1 << self._axes * (level - self.level)) - 1) // ((1 << self._axes) - 1)
 
     def index(self, level: int, place: tuple[int, ...]) -> int:
         """Number of a tile in its subtree: by level, and within one in the order of G. M. Morton."""
