@@ -20,7 +20,7 @@ from caviar_space.imported_scenes import Georeference, ImportedScene
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources import Request
-from caviar_space.sources.pieces import SceneBuilder, at, itu_name, reading, slug, surface_triangles
+from caviar_space.sources.pieces import SceneBuilder, at, itu_name, joined_triangles, reading, slug
 from caviar_space.volumes import outward
 
 # Levels of lists around the surfaces of a geometry.
@@ -95,15 +95,16 @@ def read_cityjson(path: Path, request: Request) -> ImportedScene:
             raise AssetError(
                 f"{path} has no level of detail {request.lod!r}; it has: {', '.join(sorted(levels))}"
             )
-        left_out: dict[str, int] = {}
-        for number, (name, thing) in enumerate(city.objects.items(), 1):
-            if number % 100 == 1:
-                request.progress(name, number / len(city.objects))
-            level = request.lod or _finest(thing)
-            parts = [_finest(city.objects[child]) for child in thing.children if child in city.objects]
-            if not request.lod and level < max(parts, default=""):
-                continue  # its parts have it in more detail
-            groups: dict[str, list[list[Float64Array]]] = {}
+    left_out: dict[str, int] = {}
+    for number, (name, thing) in enumerate(city.objects.items(), 1):
+        if number % 100 == 1:
+            request.progress(name, number / len(city.objects))
+        level = request.lod or _finest(thing)
+        parts = [_finest(city.objects[child]) for child in thing.children if child in city.objects]
+        if not request.lod and level < max(parts, default=""):
+            continue  # its parts have it in more detail
+        with reading(f"{path}: object {name!r}", "CityJSON"):
+            surfaces: dict[str, list[list[Float64Array]]] = {}
             for geometry in (each for each in thing.geometry if _lod(each) == level):
                 if geometry.type not in (*_DEPTHS, "GeometryInstance"):
                     left_out[geometry.type] = left_out.get(geometry.type, 0) + 1
@@ -113,24 +114,19 @@ def read_cityjson(path: Path, request: Request) -> ImportedScene:
                         left_out[surface] = left_out.get(surface, 0) + 1
                         continue
                     said = surface in request.materials or itu_name(surface)
-                    groups.setdefault(builder.itu(surface if said else thing.type), []).append(rings)
-            for itu, surfaces in groups.items():
-                cut = [surface_triangles(rings) for rings in surfaces]
-                starts = np.cumsum([0, *(len(points) for points, _ in cut)])
-                corners = to_scene(np.concatenate([points for points, _ in cut]))
-                faces = np.concatenate(
-                    [faces + start for (_, faces), start in zip(cut, starts, strict=False)]
-                )
-                material, kind = builder.material(itu), slug(thing.type)
+                    surfaces.setdefault(builder.itu(surface if said else thing.type), []).append(rings)
+            for itu, each in surfaces.items():
+                corners, faces = joined_triangles(each)
+                corners, kind = to_scene(corners), slug(thing.type)
                 if thing.type in _LEAVES and _is_closed(corners, faces):
-                    material, kind = "foliage", "foliage"
-                    builder.scene.materials["foliage"] = _FOLIAGE
+                    kind = "foliage"
                 elif thing.type == "SolitaryVegetationObject":
                     left_out["open trees"] = left_out.get("open trees", 0) + 1
                     continue
-                called = f"{kind}-{name}" if len(groups) == 1 else f"{kind}-{name}-{itu}"
+                material = builder.keep(kind, _FOLIAGE) if kind == "foliage" else builder.material(itu)
+                called = f"{kind}-{name}" if len(surfaces) == 1 else f"{kind}-{name}-{itu}"
                 builder.add(called, corners, faces, material, kind, path, number)
-        builder.note_left_out(left_out)
+    builder.note_left_out(left_out)
     return builder.finish(about_corner=builder.scene.origin is None)
 
 

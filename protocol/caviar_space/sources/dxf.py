@@ -15,7 +15,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_space.imported_scenes import ImportedScene
 from caviar_space.sources import Request
-from caviar_space.sources.pieces import SceneBuilder, reading, slug, surface_triangles
+from caviar_space.sources.pieces import SceneBuilder, joined_triangles, reading, slug
 
 # A few blocks within each other expand to as many as a machine can hold.
 _MOST_ENTITIES = 2_000_000
@@ -52,13 +52,10 @@ def read_dxf(path: Path, request: Request) -> ImportedScene:
             if len(polygons) == before:
                 left_out[entity.dxftype()] = left_out.get(entity.dxftype(), 0) + 1
         for number, (layer, polygons) in enumerate(layers.items(), 1):
-            cut = [surface_triangles([polygon]) for polygon in polygons]
-            starts = np.cumsum([0, *(len(points) for points, _ in cut)])
-            faces = [triangles + start for (_, triangles), start in zip(cut, starts, strict=False)]
-            if faces:
-                vertices, kind = np.concatenate([points for points, _ in cut]), slug(layer) or "layer"
-                material = builder.material(layer)
-                builder.add(layer, vertices, np.concatenate(faces), material, kind, path, number)
+            if polygons:
+                vertices, faces = joined_triangles([[polygon] for polygon in polygons])
+                kind, material = slug(layer) or "layer", builder.material(layer)
+                builder.add(layer, vertices, faces, material, kind, path, number)
         builder.note_left_out({f"{kind} without faces": count for kind, count in left_out.items()})
     return builder.finish()
 

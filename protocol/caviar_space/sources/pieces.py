@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -27,6 +28,7 @@ Colour = tuple[float, float, float]
 Item = TypeVar("Item")
 
 _MOST_BYTES = 1 << 29
+_MOST_TRIANGLES = 20_000_000
 # [m] from the origin: beyond, float32, which meshes have, steps by more than 1 mm.
 _NEAR_M = 1e4
 _WORDS = {
@@ -49,6 +51,7 @@ def slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", re.sub(r"(?<=[a-z])(?=[A-Z])", "-", text).lower()).strip("-")
 
 
+@cache
 def itu_name(text: str) -> str:
     """Material in ITU-R P.2040 by the words of a name; empty where none is of one.
 
@@ -80,7 +83,8 @@ def reading(where: object, form: str) -> Iterator[None]:
         SetupError: A library is not installed.
     """
     try:
-        yield
+        with np.errstate(all="ignore"):  # damaged numbers are refused where pieces are added
+            yield
     except CaviarError:
         raise
     except ImportError as error:
@@ -176,6 +180,8 @@ def surface_triangles(rings: Sequence[Float64Array]) -> tuple[Float64Array, Int6
     if not rings:
         return none
     points, outline = np.concatenate(rings), rings[0]
+    if len(points) == 3:
+        return points, np.array([[0, 1, 2]])
     sides = np.roll(outline, -1, axis=0) - outline
     arms = outline - outline[0]
     normal = np.cross(arms, np.roll(arms, -1, axis=0)).sum(0)  # Newell's
@@ -209,6 +215,14 @@ def surface_triangles(rings: Sequence[Float64Array]) -> tuple[Float64Array, Int6
     return points, faces
 
 
+def joined_triangles(surfaces: Sequence[Sequence[Float64Array]]) -> tuple[Float64Array, Int64Array]:
+    """Corners and triangles of several surfaces; see `surface_triangles`."""
+    cut = [surface_triangles(rings) for rings in surfaces]
+    starts = np.cumsum([0, *(len(points) for points, _ in cut)])
+    faces = [triangles + start for (_, triangles), start in zip(cut, starts, strict=False)]
+    return np.concatenate([points for points, _ in cut]), np.concatenate(faces)
+
+
 class SceneBuilder:
     """A scene in the making.
 
@@ -222,7 +236,7 @@ class SceneBuilder:
         self.request = request
         self._path = path
         self._assumed: dict[str, str] = {}
-        self._dropped = 0
+        self._dropped = self._triangles = 0
         for name in {request.material, *request.materials.values()}:
             if name not in ITU_MATERIALS:
                 raise AssetError(f"ITU-R P.2040 has no material {name!r}; {suggestion(name, ITU_MATERIALS)}")
@@ -282,6 +296,9 @@ class SceneBuilder:
             AssetError: A coordinate is not finite or too large, or a corner is no vertex.
         """
         said = f"{file}: {name!r}"
+        self._triangles += len(faces)
+        if self._triangles > _MOST_TRIANGLES:
+            raise AssetError(f"{self._path} has more than {_MOST_TRIANGLES} triangles; import it in parts")
         corners = np.asarray(faces, np.int64).reshape(-1, 3)
         if not len(corners):
             self.scene.notes.append(f"{file.name}: {name!r} has no faces: left out")

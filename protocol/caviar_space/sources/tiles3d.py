@@ -376,7 +376,7 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
         tileset = msgspec.json.decode(contents(path), type=_Tileset)
         origin = _origin(tileset.root)
     builder.scene.notes += dict.fromkeys(walk.notes)
-    found: list[tuple[Any, Path, int]] = []
+    to_scene: Callable[[Float64Array], Float64Array] | None = None
     for number, (file, node) in enumerate(walk.chosen, 1):
         request.progress(file.name, number / len(walk.chosen))
         data = builder.read(file)
@@ -385,15 +385,13 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
                 gltf = Gltf(model, file.parent, str(file))
                 for surface in gltf.surfaces(node.turn):
                     vertices, faces = moved(node.matrix @ matrix, surface.vertices, surface.faces)
-                    found.append((surface._replace(vertices=vertices, faces=faces), file, number))
+                    to_scene = to_scene or _conversion(builder, origin, vertices)
+                    material = builder.material(surface.material, surface.colour)
+                    name = f"{file.stem}-{surface.name}"
+                    builder.add(name, to_scene(vertices), faces, material, "tile", file, number)
                 for what, count in gltf.left_out.items():
                     left_out[what] = left_out.get(what, 0) + count
     builder.note_left_out(left_out)
-    to_scene = _conversion(builder, origin, [surface.vertices for surface, _, _ in found])
-    for surface, file, number in found:
-        material = builder.material(surface.material, surface.colour)
-        name = f"{file.stem}-{surface.name}"
-        builder.add(name, to_scene(surface.vertices), surface.faces, material, "tile", file, number)
     return builder.finish()
 
 
@@ -423,10 +421,10 @@ def _origin(root: _Tile) -> Georeference | None:
 
 
 def _conversion(
-    builder: SceneBuilder, origin: Georeference | None, vertices: list[Float64Array]
+    builder: SceneBuilder, origin: Georeference | None, vertices: Float64Array
 ) -> Callable[[Float64Array], Float64Array]:
-    """Conversion of the tileset's coordinates into those of the scene, whose origin it sets."""
-    radius = np.concatenate([np.linalg.norm(points, axis=1) for points in vertices] or [np.zeros(0)])
+    """Conversion of the tileset's coordinates, such as these, into those of the scene; sets its origin."""
+    radius = np.linalg.norm(vertices, axis=1)
     if origin is None or not len(radius) or not _EARTH_M[0] < np.median(radius) < _EARTH_M[1]:
         builder.scene.notes.append(
             "the tileset is not on the Earth: its axes are taken as east, north and up"
