@@ -6,7 +6,6 @@ Cadmapper's and other programs' drawings of towns; units are those that the draw
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from caviar_space.sources import Request
 from caviar_space.sources.pieces import SceneBuilder, joined_triangles, reading, slug
 
 # A few blocks within each other expand to as many as a machine can hold.
-_MOST_ENTITIES = 2_000_000
+_MOST_ENTITIES = 1_000_000
 # [m] between an arc and the lines that stand for it.
 _ARC_M = 0.02
 
@@ -43,10 +42,9 @@ def read_dxf(path: Path, request: Request) -> ImportedScene:
             builder.scene.notes.append("the drawing has no unit ($INSUNITS): metres are taken")
         layers: dict[str, list[Float64Array]] = {}
         left_out: dict[str, int] = {}
-        entities = recursive_decompose(drawing.modelspace())
-        for number, entity in enumerate(islice(entities, _MOST_ENTITIES + 1)):
-            if number == _MOST_ENTITIES:
-                raise ValueError(f"more than {_MOST_ENTITIES} entities")
+        if (count := _expanded(drawing, drawing.modelspace(), {})) > _MOST_ENTITIES:
+            raise ValueError(f"blocks expand to {count} entities: at most {_MOST_ENTITIES} are read")
+        for entity in recursive_decompose(drawing.modelspace()):
             before = len(polygons := layers.setdefault(entity.dxf.layer, []))
             polygons += (polygon * metre for polygon in _polygons(entity, metre))
             if len(polygons) == before:
@@ -58,6 +56,19 @@ def read_dxf(path: Path, request: Request) -> ImportedScene:
                 builder.add(layer, vertices, faces, material, kind, path, number)
         builder.note_left_out({f"{kind} without faces": count for kind, count in left_out.items()})
     return builder.finish()
+
+
+def _expanded(drawing: Any, layout: Any, known: dict[str, int]) -> int:
+    """Count of entities of a layout once the blocks that it holds are written out."""
+    count = 0
+    for entity in layout:
+        count += 1
+        name = entity.dxf.name if entity.dxftype() == "INSERT" else ""
+        if name in drawing.blocks:
+            if known.setdefault(name, -1) < 0:
+                known[name] = _expanded(drawing, drawing.blocks[name], known)
+            count += entity.mcount * known[name]
+    return count
 
 
 def _polygons(entity: Any, metre: float) -> Iterator[Float64Array]:

@@ -259,14 +259,12 @@ class Gltf:
             raise ValueError(f"accessor {index} is sparse or without data; export it without shape keys")
         kind = np.dtype(_COMPONENTS[accessor.component_type])
         data, stride = self._view(accessor.buffer_view)
-        # Raises where the data are shorter than the accessor claims.
-        values = np.ndarray(
-            (accessor.count, width),
-            kind,
-            data,
-            accessor.byte_offset,
-            (stride or kind.itemsize * width, kind.itemsize),
-        ).astype(np.float64)
+        row = kind.itemsize * width
+        step = stride or row
+        if accessor.count and accessor.byte_offset + step * (accessor.count - 1) + row > len(data):
+            raise ValueError(f"accessor {index} of {accessor.count} rows ends after its buffer view")
+        shape, steps = (accessor.count, width), (step, kind.itemsize)
+        values = np.ndarray(shape, kind, data, accessor.byte_offset, steps).astype(np.float64)
         if accessor.normalized and kind.kind != "f":
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
@@ -275,7 +273,10 @@ class Gltf:
         """Bytes of a buffer view, and its stride."""
         view: _View = at(self._document.buffer_views, index, "buffer view")
         if view.buffer not in self._buffers:
-            self._buffers[view.buffer] = self._buffer(at(self._document.buffers, view.buffer, "buffer"))
+            buffer = at(self._document.buffers, view.buffer, "buffer")
+            self._buffers[view.buffer] = data = self._buffer(buffer)
+            if buffer.byte_length > len(data):
+                raise ValueError(f"buffer {view.buffer} has {len(data)} bytes, not {buffer.byte_length}")
         data = self._buffers[view.buffer]
         end = view.byte_offset + view.byte_length
         if end > len(data):

@@ -81,11 +81,10 @@ def _lines(data: bytes) -> Iterator[tuple[int, list[str]]]:
     """Number and words of each line; one that ends in a backslash goes on."""
     begun: list[str] = []
     for number, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
-        words = line.partition("#")[0].split()
-        if words and words[-1].endswith("\\"):
-            begun += [*words[:-1], words[-1][:-1]]
-        elif words := begun + words:
-            yield number, words
+        text = line.partition("#")[0].rstrip()
+        begun += text.removesuffix("\\").split()
+        if begun and not text.endswith("\\"):
+            yield number, begun
             begun = []
 
 

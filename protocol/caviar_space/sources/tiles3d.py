@@ -25,7 +25,7 @@ from caviar_space.sources import Request
 from caviar_space.sources.gltf import Gltf
 from caviar_space.sources.pieces import Y_UP, SceneBuilder, at, beside, contents, moved, reading
 
-_MOST_TILES = 100_000
+_MOST_TILES = 20_000
 # [m] from the Earth's centre, of places on it.
 _EARTH_M = (6.2e6, 6.6e6)
 _WGS84 = "EPSG:4979"
@@ -413,7 +413,8 @@ def _origin(root: _Tile) -> Georeference | None:
 
         longitude, latitude, low = Transformer.from_crs(_ECEF, _WGS84, always_xy=True).transform(*centre)
         if volume.box is not None:
-            up = centre / np.linalg.norm(centre)
+            lon, lat = math.radians(longitude), math.radians(latitude)
+            up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
             low -= float(np.abs(up @ matrix[:3, :3] @ numbers[3:].reshape(3, 3).T).sum())
     return Georeference(
         latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7), altitude_m=round(low, 3)
