@@ -60,6 +60,9 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "wireless-insite": (
         (".study.xml", ".city", ".ter", ".object", ".veg"), f"{_SOURCES}.wireless_insite:read_project",
     ),
+    "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
+    "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
+    "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
 }  # fmt: skip
 """Ends of the names of files, and the place of the reader, by the name of the format.
 
