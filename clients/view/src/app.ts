@@ -92,7 +92,7 @@ export class App {
       follow: () => this.follow(),
     });
     const actions = this.keyActions();
-    const header = new Header(store, runs.map((run) => run.about), isSaved(), () => this.goHome(), () => showHelp(actions));
+    const header = new Header(store, runs.map((run) => run.about), isSaved(), this.pace.rests, () => this.goHome(), () => showHelp(actions));
     const overlays = [this.layers, this.inspector, this.pictures, this.banner].map(({ element }) => element);
     document.body.append(
       el(

@@ -2,7 +2,7 @@
 
 /** Time of rest after a picture, in times of the picture. */
 const REST = 30;
-const MOST_REST_MS = 10_000;
+const MOST_REST_MS = 5000;
 
 export class Pace {
   private wake = (): void => undefined;
