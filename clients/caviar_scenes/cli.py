@@ -43,6 +43,35 @@ def import_command(
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder of the scene, which is made")],
+    box: Annotated[
+        str, typer.Option(help="W,S,E,N of what is taken, longitudes and latitudes [°]; by default all")
+    ] = "",
+    box_m: Annotated[
+        str, typer.Option("--box-m", help="X0,Y0,X1,Y1 of what is taken, in the scene [m]; by default all")
+    ] = "",
+    form: Annotated[
+        str, typer.Option("--format", help="format of the source; by default by the names of files")
+    ] = "",
+    material: Annotated[
+        str, typer.Option(help="material of ITU-R P.2040 of what the source gives none")
+    ] = "concrete",
+    materials: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=MATERIAL: that of ITU-R P.2040 for a name of the source; several times"),
+    ] = None,
+    lod: Annotated[
+        str, typer.Option(help="level of detail, where there are several; by default the finest")
+    ] = "",
+    error_m: Annotated[
+        float, typer.Option("--error-m", min=0.0, help="largest geometric error of tiles [m]; 0: the finest")
+    ] = 0.0,
+    heights: Annotated[
+        Path | None,
+        typer.Option(help="heights of the ground, GeoTIFF or DTED; by default the ground of a map is level"),
+    ] = None,
+    origin: Annotated[
+        str, typer.Option(help="LAT,LON of the scene's origin [°]; by default the source's, or its middle")
+    ] = "",
     sumo: Annotated[
         Path | None,
         typer.Option(help="SUMO configuration, .sumocfg; by default the one in the project's folder"),
@@ -52,18 +81,33 @@ def import_command(
         typer.Option(help="X0,Y0,X1,Y1 of the grid of LIDARs beside the receivers [m]; by default no LIDAR"),
     ] = "",
 ) -> None:
-    """Import a scene: meshes, materials, and scenarios with the project's transmitters and traffic."""
-    from caviar_space.imported_scenes import write_scene
+    """Import a scene: meshes, materials, roads of a map, or scenarios with a project's transmitters."""
+    from rich.progress import TimeRemainingColumn
+
+    from caviar_space.imported_scenes import Georeference, write_scene
     from caviar_space.sources import Request, read_source
+    from caviar_space.sources.road_network import NET
 
     console = Console()
-    with progress_bar(Console(stderr=True), transient=True) as bar:
+    with progress_bar(Console(stderr=True), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task(path.name, total=1.0)
-        scene = read_source(
-            path,
-            Request(progress=lambda name, share: bar.update(task, description=name, completed=share)),
+        latitude, longitude = _numbers("--origin", origin, 2, "LAT,LON [°]: 60.17,24.94") or (0.0, 0.0)
+        request = Request(
+            box_deg=_box("--box", box, "W,S,E,N [°]: 24.93,60.16,24.95,60.18"),
+            box_m=_box("--box-m", box_m, "X0,Y0,X1,Y1 [m]: -300,-300,300,300"),
+            origin=Georeference(latitude_deg=latitude, longitude_deg=longitude) if origin else None,
+            heights=heights,
+            material=material,
+            materials=_named_materials(materials or [], material),
+            lod=lod,
+            error_m=error_m,
+            progress=lambda name, share: bar.update(task, description=name, completed=share),
         )
-    more = _scenarios(scene, path, sumo, lidar)
+        if box and box_m:
+            raise AssetError("--box and --box-m both say what is taken; write one of them")
+        scene = read_source(path, request, form)
+    of_project = scene.transmitters_m or scene.receivers_m or scene.frequencies_hz or sumo
+    more = _scenarios(scene, path, sumo, lidar) if of_project else {}
     write_scene(scene, out, more)
     for note in scene.notes:
         print_line(console, f"note: {note}")
@@ -75,6 +119,48 @@ def import_command(
             print_line(
                 console, f"{out / name} is a scenario; run it with: caviar run {shlex.quote(str(out / name))}"
             )
+    if NET in scene.files:
+        print_line(
+            console,
+            f"{out / NET} has its roads; a scenario on them: caviar new NAME --scene {shlex.quote(str(out))}",
+        )
+
+
+def _numbers(option: str, text: str, count: int, example: str) -> tuple[float, ...]:
+    """Numbers of an option with commas between them; none: it is empty."""
+    if not text:
+        return ()
+    try:
+        found = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise AssetError(f"{option} {text}: write {example}")
+    return found
+
+
+def _box(option: str, text: str, example: str) -> tuple[float, float, float, float] | None:
+    if not text:
+        return None
+    x0, y0, x1, y1 = _numbers(option, text, 4, example)
+    if not (x0 < x1 and y0 < y1):
+        raise AssetError(f"{option} {text}: the lower corner comes first; write {example}")
+    return x0, y0, x1, y1
+
+
+def _named_materials(given: list[str], default: str) -> dict[str, str]:
+    """Materials of ITU-R P.2040 by the source's names for them; each is looked up, and the default."""
+    from caviar_protocol.errors import suggestion
+    from caviar_space.mitsuba_xml import ITU_MATERIALS
+
+    pairs = [text.partition("=") for text in given]
+    for name, sign, value in [("", "=", default), *pairs]:
+        if not sign or value not in ITU_MATERIALS:
+            raise AssetError(
+                f"{f'--materials {name}{sign}' if name else '--material '}{value}: ITU-R P.2040 has no "
+                f"material {value!r}; write NAME=MATERIAL; {suggestion(value, ITU_MATERIALS)}"
+            )
+    return {name: value for name, _, value in pairs}
 
 
 @app.command("picture")
@@ -259,14 +345,10 @@ def _toml(value: object) -> str:
 
 def _grid(lidar: str) -> str:
     """Service of LIDARs with a grid of 20 by 200 by 10 cells, the longer axis with more; empty: none."""
-    if not lidar:
+    area = _box("--lidar", lidar, "X0,Y0,X1,Y1 [m], the lower corner first: 744,429,767,679")
+    if area is None:
         return ""
-    try:
-        x0, y0, x1, y1 = (float(word) for word in lidar.split(","))
-    except ValueError:
-        x0 = y0 = x1 = y1 = 0.0
-    if not (x0 < x1 and y0 < y1):
-        raise AssetError(f"--lidar {lidar}: write X0,Y0,X1,Y1 [m], the lower corner first: 744,429,767,679")
+    x0, y0, x1, y1 = area
     cells = [20, 200, 10] if x1 - x0 < y1 - y0 else [200, 20, 10]
     grid = f"{{ minimum_m = [{x0}, {y0}, 0.0], maximum_m = [{x1}, {y1}, 10.0], cells = {cells} }}"
     return (

@@ -14,9 +14,7 @@ from pkgutil import resolve_name
 from typing import Literal, Protocol
 
 from caviar_protocol.errors import AssetError
-from caviar_space.imported_scenes import Georeference, ImportedScene
-
-Box = tuple[float, float, float, float]
+from caviar_space.imported_scenes import Box, Georeference, ImportedScene, box_in_metres, cut_to_box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +60,8 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "wireless-insite": (
         (".study.xml", ".city", ".ter", ".object", ".veg"), f"{_SOURCES}.wireless_insite:read_project",
     ),
+    "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
+                      f"{_SOURCES}.openstreetmap:read_map"),
     "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
     "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
     "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
@@ -75,6 +75,9 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 Of several ends that fit, the longest counts. A folder is of the first format of whose files it has some.
 """
+
+# Maps have more within the box than the triangles of it: roads.
+_CUT_THEMSELVES = ("openstreetmap",)
 
 
 def read_source(path: Path, request: Request | None = None, form: str = "") -> ImportedScene:
@@ -96,7 +99,15 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
     if name not in READERS:
         raise AssetError(f"{path}: no format of scenes {name!r}; write --format: {', '.join(READERS)}")
     reader: Reader = resolve_name(READERS[name][1])
-    return reader(path, request)
+    scene = reader(path, request)
+    box = request.box_m
+    if request.box_deg:
+        if scene.origin is None:
+            raise AssetError(f"{path} has no place on the Earth; write --origin LAT,LON, or --box-m")
+        box = box_in_metres(request.box_deg, scene.origin)
+    if box and name not in _CUT_THEMSELVES:
+        cut_to_box(scene, box)
+    return scene
 
 
 def _format_of(path: Path) -> str:
