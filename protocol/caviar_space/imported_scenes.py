@@ -56,6 +56,17 @@ class Georeference(msgspec.Struct, frozen=True, kw_only=True):
         longitude, latitude, altitude = self._transformer().transform(x, y, z, direction="INVERSE")
         return latitude, longitude, altitude
 
+    def places(self, degrees: Float64Array) -> Float64Array:
+        """Convert places on WGS84 to x, y, z in the scene [m], Shape ``[N, 3]``.
+
+        Args:
+            degrees: Longitude [°], latitude [°] and altitude [m], Shape ``[N, 3]``.
+
+        Raises:
+            SetupError: See `to_scene`.
+        """
+        return np.stack(self._transformer().transform(*degrees.T), axis=-1)
+
     def _transformer(self) -> Any:
         try:
             from pyproj import Transformer

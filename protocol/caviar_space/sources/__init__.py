@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Protocol
+from typing import Literal, Protocol
 
 from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Box, Georeference, ImportedScene, box_in_metres, cut_to_box
@@ -33,6 +33,8 @@ class Request:
     """Material in ITU-R P.2040 of what the source gives none."""
     materials: Mapping[str, str] = field(default_factory=dict)
     """Material in ITU-R P.2040 by the name that the source gives."""
+    up: Literal["y", "z"] = "z"
+    """Axis that points up in sources of meshes that do not say: OBJ, PLY, STL, Mitsuba."""
     lod: str = ""
     """Level of detail to take, where the source has several; empty: the finest."""
     error_m: float = 0.0
@@ -60,6 +62,14 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     ),
     "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
                       f"{_SOURCES}.openstreetmap:read_map"),
+    "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
+    "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
+    "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
+    "obj": ((".obj",), f"{_SOURCES}.mesh_files:read_obj"),
+    "ply": ((".ply",), f"{_SOURCES}.mesh_files:read_ply_scene"),
+    "stl": ((".stl",), f"{_SOURCES}.mesh_files:read_stl"),
+    "dxf": ((".dxf",), f"{_SOURCES}.dxf:read_dxf"),
+    "mitsuba": ((".xml",), f"{_SOURCES}.mitsuba:read_mitsuba"),
 }  # fmt: skip
 """Ends of the names of files, and the place of the reader, by the name of the format.
 

@@ -1,0 +1,438 @@
+"""3D Tiles 1.0 and 1.1: the tiles of one level of detail, from the Earth's axes into those of a scene.
+
+Open Geospatial Consortium, "3D Tiles Specification 1.1", 22-025r4. Explicit and implicit tiling, external
+tilesets, contents of b3dm, cmpt and glTF. All positions are in float64: at the Earth's radius float32 has
+steps of half a metre.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from caviar_protocol.arrays import Float64Array
+from caviar_protocol.errors import AssetError
+from caviar_space.imported_scenes import Georeference, ImportedScene
+from caviar_space.sources import Request
+from caviar_space.sources.gltf import Gltf
+from caviar_space.sources.pieces import Y_UP, SceneBuilder, at, beside, contents, moved, reading
+
+_MOST_TILES = 20_000
+# [m] from the Earth's centre, of places on it.
+_EARTH_M = (6.2e6, 6.6e6)
+_WGS84 = "EPSG:4979"
+_ECEF = "EPSG:4978"
+_Index = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _Part(msgspec.Struct, frozen=True, rename="camel"):
+    """A part of a tileset; what scenes do not need is not read."""
+
+
+class _Content(_Part, frozen=True):
+    uri: str = ""
+    url: str = ""
+    """Its name before 1.0."""
+
+
+class _Volume(_Part, frozen=True):
+    box: list[float] | None = None
+    region: list[float] | None = None
+    sphere: list[float] | None = None
+
+
+class _Uri(_Part, frozen=True):
+    uri: str
+
+
+class _Implicit(_Part, frozen=True):
+    subdivision_scheme: str
+    subtree_levels: Annotated[int, msgspec.Meta(ge=1, le=20)]
+    available_levels: Annotated[int, msgspec.Meta(ge=1, le=60)]
+    subtrees: _Uri
+
+
+class _Tile(_Part, frozen=True):
+    geometric_error: float
+    bounding_volume: _Volume = _Volume()
+    refine: str = ""
+    content: _Content | None = None
+    contents: list[_Content] = []
+    children: list[_Tile] = []
+    transform: list[float] | None = None
+    implicit_tiling: _Implicit | None = None
+
+
+class _Asset(_Part, frozen=True):
+    version: str
+    gltf_up_axis: str = "Y"
+
+
+class _Tileset(_Part, frozen=True):
+    asset: _Asset
+    root: _Tile
+
+
+class _Availability(_Part, frozen=True):
+    constant: int | None = None
+    bitstream: _Index | None = None
+    buffer_view: _Index | None = None
+    """Name of the bitstream in drafts of 1.1."""
+
+
+class _Buffer(_Part, frozen=True):
+    byte_length: _Index
+    uri: str | None = None
+
+
+class _View(_Part, frozen=True):
+    buffer: _Index
+    byte_offset: _Index
+    byte_length: _Index
+
+
+class _SubtreeHead(_Part, frozen=True):
+    tile_availability: _Availability
+    child_subtree_availability: _Availability
+    content_availability: list[_Availability] = []
+    buffers: list[_Buffer] = []
+    buffer_views: list[_View] = []
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A tile of explicit or implicit tiling."""
+
+    uris: tuple[str, ...]
+    error: float
+    adds: bool
+    """Whether its content stays beside that of its children."""
+    matrix: Float64Array
+    children: Callable[[], list[_Node]]
+    chain: tuple[Path, ...]
+    """Tilesets, from the outermost to the tile's."""
+    turn: Float64Array
+    """From the axes of its glTF into those of the tile, Shape ``[4, 4]``."""
+
+
+@dataclass
+class _Walk:
+    """Search for the contents of one level of detail."""
+
+    path: Path
+    error_m: float
+    chosen: list[tuple[Path, _Node]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    tiles: int = 0
+
+    def choose(self, node: _Node) -> bool:
+        """Take the contents of a tile, or of those below it that are finer; False where a file is missing."""
+        self.tiles += 1
+        if self.tiles > _MOST_TILES:
+            raise AssetError(
+                f"{self.path} has more than {_MOST_TILES} tiles; ask for a larger geometric error"
+            )
+        files, outer = [], list[_Node]()
+        for uri in node.uris:
+            file = beside(node.chain[-1].parent, uri, node.chain[-1], self.path.parent)
+            if file.is_file() and _is_tileset(file):
+                outer.append(_root(self.path, file, node.chain, node.matrix, node.adds))
+            else:
+                files.append(file)
+        children = outer
+        if not 0 < node.error <= self.error_m:
+            children = outer + node.children()
+        before = len(self.chosen)
+        whole = not [child for child in children if not self.choose(child)]
+        missing = [file for file in files if not file.is_file()]
+        if children and whole and not node.adds:
+            return True
+        if children and not whole and not node.adds and files and not missing:
+            del self.chosen[before:]  # tiles of two levels would overlap
+            self.notes.append(f"{files[0].name} stands for finer tiles that are not there")
+            whole = True
+        self.chosen += [(file, node) for file in files if file not in missing]
+        self.notes += [f"{node.chain[-1].name} names {file.name}, which is not there" for file in missing]
+        return whole and not missing
+
+
+def _is_tileset(file: Path) -> bool:
+    with file.open("rb") as opened:
+        return file.suffix.lower() != ".gltf" and opened.read(64).lstrip()[:1] == b"{"
+
+
+def _root(top: Path, file: Path, chain: tuple[Path, ...], matrix: Float64Array, adds: bool) -> _Node:
+    """Open a tileset."""
+    if file.resolve() in (each.resolve() for each in chain):
+        raise AssetError(f"{file} names itself, by way of {chain[-1].name}; take out the loop of tilesets")
+    with reading(file, "a tileset of 3D Tiles"):
+        tileset = msgspec.json.decode(contents(file), type=_Tileset)
+        turn = {"Y": Y_UP, "Z": np.eye(4)}[tileset.asset.gltf_up_axis.upper()]
+        return _explicit(top, tileset.root, (*chain, file), matrix, adds, turn)
+
+
+def _explicit(
+    top: Path, tile: _Tile, chain: tuple[Path, ...], above: Float64Array, adds: bool, turn: Float64Array
+) -> _Node:
+    matrix = above
+    if tile.transform is not None:
+        matrix = above @ np.reshape(tile.transform, (4, 4)).T
+    if tile.refine:
+        adds = tile.refine.upper() == "ADD"
+    found = [*tile.contents, *([tile.content] if tile.content else [])]
+    uris = tuple(each.uri or each.url for each in found)
+    if tile.implicit_tiling is not None:
+        implicit = _ImplicitTiles(
+            top, tile.implicit_tiling, uris, tile.geometric_error, chain, matrix, adds, turn
+        )
+        return implicit.root()
+    return _Node(
+        uris,
+        tile.geometric_error,
+        adds,
+        matrix,
+        lambda: [_explicit(top, child, chain, matrix, adds, turn) for child in tile.children],
+        chain,
+        turn,
+    )
+
+
+@dataclass(frozen=True)
+class _ImplicitTiles:
+    """Tiles of a quadtree or an octree, of which subtrees say which are there."""
+
+    top: Path
+    tiling: _Implicit
+    uris: tuple[str, ...]
+    error: float
+    chain: tuple[Path, ...]
+    matrix: Float64Array
+    adds: bool
+    turn: Float64Array
+
+    @property
+    def axes(self) -> int:
+        return {"QUADTREE": 2, "OCTREE": 3}[self.tiling.subdivision_scheme]
+
+    def root(self) -> _Node:
+        place = (0,) * self.axes
+        return self.node(_Subtree(self, 0, place), 0, place)
+
+    def name(self, template: str, level: int, place: tuple[int, ...]) -> str:
+        """Put level and place into a template of URIs."""
+        values = {"level": level, **dict(zip("xyz", place, strict=False))}
+        return re.sub(r"\{(level|x|y|z)\}", lambda found: str(values[found[1]]), template)
+
+    def node(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> _Node:
+        index = subtree.index(level, place)
+        uris = tuple(
+            self.name(template, level, place)
+            for template, availability in zip(self.uris, subtree.head.content_availability, strict=True)
+            if subtree.has(availability, index)
+        )
+        return _Node(
+            uris,
+            self.error / 2**level,
+            self.adds,
+            self.matrix,
+            lambda: self.children(subtree, level, place),
+            self.chain,
+            self.turn,
+        )
+
+    def children(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> list[_Node]:
+        below = level + 1
+        if below >= self.tiling.available_levels:
+            return []
+        places = [
+            tuple(2 * at + (number >> axis & 1) for axis, at in enumerate(place))
+            for number in range(2**self.axes)
+        ]
+        if below - subtree.level < self.tiling.subtree_levels:
+            here = subtree.head.tile_availability
+            return [
+                self.node(subtree, below, each)
+                for each in places
+                if subtree.has(here, subtree.index(below, each))
+            ]
+        there, first = subtree.head.child_subtree_availability, subtree.first(below)
+        return [
+            self.node(_Subtree(self, below, each), below, each)
+            for each in places
+            if subtree.has(there, subtree.index(below, each) - first)
+        ]
+
+
+class _Subtree:
+    """Bits that say which tiles, contents and subtrees are there, of some levels below a tile."""
+
+    def __init__(self, tiles: _ImplicitTiles, level: int, place: tuple[int, ...]) -> None:
+        self.level = level
+        self._place, self._axes = place, tiles.axes
+        tileset = tiles.chain[-1]
+        name = tiles.name(tiles.tiling.subtrees.uri, level, place)
+        file = beside(tileset.parent, name, tileset, tiles.top.parent)
+        with reading(file, "a subtree of 3D Tiles"):
+            text, binary = data = contents(file), b""
+            if text[:4] == b"subt":
+                version, first, second = struct.unpack_from("<IQQ", data[0], 4)
+                if version != 1 or 24 + first + second > len(text):
+                    raise ValueError(
+                        f"version {version}, JSON of {first} and binary of {second} bytes announced, "
+                        f"{len(text)} there"
+                    )
+                text, binary = text[24 : 24 + first], text[24 + first : 24 + first + second]
+            self.head = msgspec.json.decode(text, type=_SubtreeHead)
+            buffers = [
+                contents(beside(file.parent, buffer.uri, file, tiles.top.parent)) if buffer.uri else binary
+                for buffer in self.head.buffers
+            ]
+            self._views = [
+                at(buffers, view.buffer, "buffer")[view.byte_offset : view.byte_offset + view.byte_length]
+                for view in self.head.buffer_views
+            ]
+            if len(self.head.content_availability) not in (0, len(tiles.uris)):
+                raise ValueError(
+                    f"contentAvailability is of {len(self.head.content_availability)} contents, the tileset "
+                    f"has {len(tiles.uris)}"
+                )
+        self._where = file
+
+    def first(self, level: int) -> int:
+        """Count of tiles in the levels of the subtree above one."""
+        return ((1 << self._axes * (level - self.level)) - 1) // ((1 << self._axes) - 1)
+
+    def index(self, level: int, place: tuple[int, ...]) -> int:
+        """Number of a tile in its subtree: by level, and within one in the order of G. M. Morton."""
+        deep, morton = level - self.level, 0
+        for bit in range(deep):
+            for axis, (value, begin) in enumerate(zip(place, self._place, strict=True)):
+                morton |= ((value - (begin << deep)) >> bit & 1) << (bit * self._axes + axis)
+        return self.first(level) + morton
+
+    def has(self, availability: _Availability, index: int) -> bool:
+        """Whether a bit is set."""
+        if availability.constant is not None:
+            return availability.constant == 1
+        view = availability.bitstream if availability.bitstream is not None else availability.buffer_view
+        with reading(self._where, "a subtree of 3D Tiles"):
+            bits = at(self._views, -1 if view is None else view, "bitstream")
+            return bool(at(bits, index // 8, "byte of bits") >> index % 8 & 1)
+
+
+def _models(data: bytes, left_out: dict[str, int]) -> Iterator[tuple[bytes, Float64Array]]:
+    """glTF in a content, and the transform that its tile's format adds."""
+    magic = data[:4]
+    if magic == b"glTF" or data[:1] == b"{":
+        yield data, np.eye(4)
+        return
+    if magic not in (b"b3dm", b"cmpt"):
+        known = {b"pnts": "contents of points", b"i3dm": "contents of instances (i3dm)"}
+        if magic not in known:
+            raise ValueError(f"it begins with {magic!r}: b3dm, cmpt and glTF are read")
+        left_out[known[magic]] = left_out.get(known[magic], 0) + 1
+        return
+    version, length = struct.unpack_from("<2I", data, 4)
+    if version != 1 or length > len(data):
+        raise ValueError(f"version {version}, {length} bytes announced, {len(data)} there")
+    if magic == b"cmpt":
+        (count,), begin = struct.unpack_from("<I", data, 12), 16
+        for _ in range(count):
+            (size,) = struct.unpack_from("<I", data, begin + 8)
+            if size < 16 or begin + size > length:
+                raise ValueError(f"an inner tile of {size} bytes at byte {begin} of {length}")
+            yield from _models(data[begin : begin + size], left_out)
+            begin += size
+        return
+    sizes = struct.unpack_from("<4I", data, 12)
+    if 28 + sum(sizes) > length:
+        raise ValueError(f"tables of {sum(sizes)} bytes announced, {length - 28} there")
+    table = msgspec.json.decode(data[28 : 28 + sizes[0]] or b"{}", type=dict[str, Any])
+    matrix = np.eye(4)
+    if "RTC_CENTER" in table:
+        matrix[:3, 3] = msgspec.convert(table["RTC_CENTER"], tuple[float, float, float])
+    yield data[28 + sum(sizes) : length], matrix
+
+
+def read_tileset(path: Path, request: Request) -> ImportedScene:
+    """Read a tileset as a scene; see `caviar_space.sources.Reader`.
+
+    Its origin is at the bottom of the root's volume, in its middle, and its axes are east, north and up
+    there. A tileset that is not on the Earth keeps its axes.
+    """
+    builder = SceneBuilder(path, request)
+    builder.read(path)
+    walk, left_out = _Walk(path, request.error_m), dict[str, int]()
+    with reading(path, "a tileset of 3D Tiles"):
+        walk.choose(_root(path, path, (), np.eye(4), False))
+        tileset = msgspec.json.decode(contents(path), type=_Tileset)
+        origin = _origin(tileset.root)
+    builder.scene.notes += dict.fromkeys(walk.notes)
+    to_scene: Callable[[Float64Array], Float64Array] | None = None
+    for number, (file, node) in enumerate(walk.chosen, 1):
+        request.progress(file.name, number / len(walk.chosen))
+        data = builder.read(file)
+        with reading(file, "a content of 3D Tiles"):
+            for model, matrix in _models(data, left_out):
+                gltf = Gltf(model, file.parent, str(file))
+                for surface in gltf.surfaces(node.turn):
+                    vertices, faces = moved(node.matrix @ matrix, surface.vertices, surface.faces)
+                    to_scene = to_scene or _conversion(builder, origin, vertices)
+                    material = builder.material(surface.material, surface.colour)
+                    name = f"{file.stem}-{surface.name}"
+                    builder.add(name, to_scene(vertices), faces, material, "tile", file, number)
+                for what, count in gltf.left_out.items():
+                    left_out[what] = left_out.get(what, 0) + count
+    builder.note_left_out(left_out)
+    return builder.finish()
+
+
+def _origin(root: _Tile) -> Georeference | None:
+    """Place at the bottom of the root's volume, in its middle; None: that is not on the Earth."""
+    volume = root.bounding_volume
+    if volume.region is not None:
+        west, south, east, north, low, _ = volume.region
+        east += 2 * math.pi if east < west else 0.0
+        longitude, latitude = math.degrees((west + east) / 2), math.degrees((south + north) / 2)
+        longitude = (longitude + 180) % 360 - 180
+    else:
+        numbers = np.array(volume.box or volume.sphere or [0.0] * 4)
+        matrix = np.reshape(root.transform or np.eye(4), (4, 4)).T
+        centre = matrix[:3, :3] @ numbers[:3] + matrix[:3, 3]
+        if not _EARTH_M[0] < np.linalg.norm(centre) < _EARTH_M[1]:
+            return None
+        from pyproj import Transformer
+
+        longitude, latitude, low = Transformer.from_crs(_ECEF, _WGS84, always_xy=True).transform(*centre)
+        if volume.box is not None:
+            lon, lat = math.radians(longitude), math.radians(latitude)
+            up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+            low -= float(np.abs(up @ matrix[:3, :3] @ numbers[3:].reshape(3, 3).T).sum())
+    return Georeference(
+        latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7), altitude_m=round(low, 3)
+    )
+
+
+def _conversion(
+    builder: SceneBuilder, origin: Georeference | None, vertices: Float64Array
+) -> Callable[[Float64Array], Float64Array]:
+    """Conversion of the tileset's coordinates, such as these, into those of the scene; sets its origin."""
+    radius = np.linalg.norm(vertices, axis=1)
+    if origin is None or not len(radius) or not _EARTH_M[0] < np.median(radius) < _EARTH_M[1]:
+        builder.scene.notes.append(
+            "the tileset is not on the Earth: its axes are taken as east, north and up"
+        )
+        return lambda points: points
+    from pyproj import Transformer
+
+    to_wgs84 = Transformer.from_crs(_ECEF, _WGS84, always_xy=True)
+    builder.scene.origin = there = builder.request.origin or origin
+    return lambda points: there.places(np.stack(to_wgs84.transform(*points.T), axis=-1))
