@@ -683,7 +683,7 @@ class _Assembly:
 
         roads = [road._replace(places=self._project(road.places)) for road in self.map.roads]
         made = network_of(roads, self.map.signs, [solid.polygon for solid in solids], self.box, self.origin,
-                          self.terrain and self.terrain.at,
+                          self.terrain.at if self.terrain else None,
                           lambda name, share: self.request.progress(name, 0.3 + 0.7 * share))  # fmt: skip
         self.notes.update(made.left_out)
         self.made.notes += made.notes
