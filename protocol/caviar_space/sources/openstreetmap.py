@@ -237,7 +237,7 @@ def _read_geojson(path: Path) -> Map:
 
     try:
         collection = msgspec.json.decode(path.read_bytes(), type=_Collection)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
         raise AssetError(
             f"{path} is no GeoJSON: {one_line(str(error))}; write a FeatureCollection"
         ) from error
