@@ -436,6 +436,25 @@ def test_damaged_heights_are_refused(name: str, tmp_path: Path) -> None:
         read_heights(file)
 
 
+@pytest.mark.parametrize("source", ["overpass", "josm"])
+def test_nodes_may_come_last_and_numbers_be_negative(
+    source: str, tmp_path: Path, scene: ImportedScene
+) -> None:
+    root = town().root
+    if source == "overpass":
+        root[:] = sorted(root, key=lambda element: ("way", "relation", "node").index(element.tag))
+    else:
+        for element in root.iter():
+            for key in ("id", "ref"):
+                if key in element.attrib:
+                    element.set(key, f"-{element.get(key)}")
+    file = tmp_path / "town.osm"
+    ElementTree.ElementTree(root).write(file)
+    found = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0)))
+    assert found.pieces.keys() == scene.pieces.keys()
+    assert found.files.keys() == scene.files.keys()
+
+
 @pytest.mark.parametrize("form", ["osm", "osm.pbf", "geojson"])
 def test_maps_with_flipped_bytes_are_read_or_refused(form: str, tmp_path: Path) -> None:
     """Twenty-five files, each with four bytes that are others, or cut: a scene, or an error by name."""
