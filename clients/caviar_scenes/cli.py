@@ -9,7 +9,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 from xml.etree import ElementTree
 
 import msgspec
@@ -72,6 +72,9 @@ def import_command(
     origin: Annotated[
         str, typer.Option(help="LAT,LON of the scene's origin [°]; by default the source's, or its middle")
     ] = "",
+    up: Annotated[
+        Literal["y", "z"], typer.Option(help="axis that is up in OBJ, PLY, STL and Mitsuba's XML")
+    ] = "z",
     sumo: Annotated[
         Path | None,
         typer.Option(help="SUMO configuration, .sumocfg; by default the one in the project's folder"),
@@ -99,6 +102,7 @@ def import_command(
             heights=heights,
             material=material,
             materials=_named_materials(materials or [], material),
+            up=up,
             lod=lod,
             error_m=error_m,
             progress=lambda name, share: bar.update(task, description=name, completed=share),
