@@ -36,7 +36,8 @@ _WORDS = {
     "cement": "concrete", "copper": "metal", "door": "wood", "drywall": "plasterboard", "glazing": "glass",
     "gypsum": "plasterboard", "iron": "metal", "masonry": "brick", "plaster": "plasterboard",
     "road": "asphalt_concrete", "roads": "asphalt_concrete", "steel": "metal", "timber": "wood",
-    "tin": "metal", "water": "wet_ground", "window": "glass", "windows": "glass", "wooden": "wood", "zinc": "metal",
+    "tin": "metal", "water": "wet_ground", "window": "glass", "windows": "glass", "wooden": "wood",
+    "zinc": "metal",
 }  # fmt: skip
 """Material in ITU-R P.2040 by a word of a name."""
 
@@ -237,9 +238,6 @@ class SceneBuilder:
         self._path = path
         self._assumed: dict[str, str] = {}
         self._dropped = self._triangles = 0
-        for name in {request.material, *request.materials.values()}:
-            if name not in ITU_MATERIALS:
-                raise AssetError(f"ITU-R P.2040 has no material {name!r}; {suggestion(name, ITU_MATERIALS)}")
 
     def itu(self, name: str) -> str:
         """Material in ITU-R P.2040 by the name that the source gives; what that does not say is noted."""
