@@ -59,6 +59,9 @@ def import_command(
         list[str] | None,
         typer.Option(help="NAME=MATERIAL: that of ITU-R P.2040 for a name of the source; several times"),
     ] = None,
+    up: Annotated[
+        str, typer.Option(help="y or z: axis that points up in meshes that do not say; by default z")
+    ] = "z",
     lod: Annotated[
         str, typer.Option(help="level of detail, where there are several; by default the finest")
     ] = "",
@@ -99,10 +102,13 @@ def import_command(
             heights=heights,
             material=material,
             materials=_named_materials(materials or [], material),
+            up="y" if up == "y" else "z",
             lod=lod,
             error_m=error_m,
             progress=lambda name, share: bar.update(task, description=name, completed=share),
         )
+        if up not in ("y", "z"):
+            raise AssetError(f"--up {up}: write y or z")
         if box and box_m:
             raise AssetError("--box and --box-m both say what is taken; write one of them")
         scene = read_source(path, request, form)
