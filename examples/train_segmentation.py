@@ -1,16 +1,17 @@
-"""Train a small network that names materials in pictures of streets, and export it for `caviar scene materials`.
+"""Train a small network that names materials in pictures of streets, for `caviar scene materials`.
 
     python examples/train_segmentation.py CAMVID [--streets 24] [--minutes 20] [--out segmentation.onnx]
 
-Needs the extras ``learning``, ``sensors``, ``plot`` and ``formats``. CAMVID is a folder with ``train``, ``trainannot``, ``test``
-and ``testannot``, as the CamVid data set in eleven classes is handed around: pictures, and labels by number,
-under the same names. Pictures of one's own need only be put there. Beside them the network learns from
-renderings of streets with known materials: what is a building in a photograph may be of any material of walls,
-so its loss is of their sum. The exported network takes pictures as they are, and has its classes, and the
-materials that they stand for, inside.
+Needs the extras ``learning``, ``sensors``, ``plot`` and ``formats``. CAMVID is a folder with ``train``,
+``trainannot``, ``test`` and ``testannot``, as the CamVid data set in eleven classes is handed around:
+pictures, and labels by number, under the same names. Pictures of one's own need only be put there. Beside
+them the network learns from renderings of streets with known materials: a building in a photograph may be of
+any material of walls, so its loss is of their sum. The exported network takes pictures as they are; the
+file beside it has its classes, and the materials that they stand for.
 """
 
 import argparse
+import itertools
 import json
 import math
 import time
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from caviar_scenes.streets import MATERIALS, SKY, street
+from caviar_scenes.streets import MATERIALS, street
 from caviar_scenes.views import viewpoints
 
 SIZE = 320, 240
@@ -29,10 +30,13 @@ PHOTOS = (
 )  # fmt: skip
 WALLS = ("concrete", "brick", "glass", "wood", "metal")
 CLASSES = (*(name for name in PHOTOS if name != "building"), *WALLS, "grass")
-MEANT = {"road": "asphalt_concrete", "pavement": "concrete", "grass": "medium_dry_ground"} | dict(zip(WALLS, WALLS))
+MEANT = {"road": "asphalt_concrete", "pavement": "concrete", "grass": "medium_dry_ground"}
+MEANT |= {name: name for name in WALLS}
 # Which classes a label may be: of photographs, then of renderings.
 LABELS = [(name,) if name != "building" else WALLS for name in PHOTOS]
-LABELS += [({"asphalt_concrete": "road", "medium_dry_ground": "grass"}.get(name, name),) for name in MATERIALS] + [("sky",)]
+LABELS += [
+    ({"asphalt_concrete": "road", "medium_dry_ground": "grass"}.get(name, name),) for name in MATERIALS
+] + [("sky",)]
 NOTHING = 255
 
 
@@ -47,9 +51,9 @@ class UNet(torch.nn.Module):
     def __init__(self, widths: tuple[int, ...] = (16, 32, 48, 64)) -> None:
         super().__init__()
         self.stem = layer(3, widths[0], 2)
-        sizes = zip(widths, widths[1:])
+        sizes = itertools.pairwise(widths)
         self.down = torch.nn.ModuleList([torch.nn.Sequential(layer(a, b, 2), layer(b, b)) for a, b in sizes])
-        sizes = zip(reversed(widths[:-1]), reversed(widths[1:]))
+        sizes = zip(reversed(widths[:-1]), reversed(widths[1:]), strict=True)
         self.up = torch.nn.ModuleList([layer(a + b, a) for a, b in sizes])
         self.out = torch.nn.Conv2d(widths[0], len(CLASSES), 1)
 
@@ -62,7 +66,9 @@ class UNet(torch.nn.Module):
             other = kept.pop()
             x = torch.nn.functional.interpolate(x, other.shape[2:], mode="bilinear", align_corners=False)
             x = step(torch.cat([x, other], 1))
-        return torch.nn.functional.interpolate(self.out(x), scale_factor=2.0, mode="bilinear", align_corners=False)
+        return torch.nn.functional.interpolate(
+            self.out(x), scale_factor=2.0, mode="bilinear", align_corners=False
+        )
 
 
 class Exported(torch.nn.Module):
@@ -81,10 +87,14 @@ def photographs(folder: Path, part: str) -> list[tuple[np.ndarray, np.ndarray]]:
     found = []
     for file in sorted((folder / part).glob("*.png")):
         picture = Image.open(file).convert("RGB").resize(SIZE, Image.Resampling.BOX)
-        label = np.array(Image.open(folder / f"{part}annot" / file.name).resize(SIZE, Image.Resampling.NEAREST))
+        label = np.array(
+            Image.open(folder / f"{part}annot" / file.name).resize(SIZE, Image.Resampling.NEAREST)
+        )
         found.append((np.array(picture), np.where(label < len(PHOTOS), label, NOTHING).astype(np.uint8)))
     if not found:
-        raise SystemExit(f"{folder / part} has no *.png; give a folder with train, trainannot, test, testannot")
+        raise SystemExit(
+            f"{folder / part} has no *.png; give a folder with train, trainannot, test, testannot"
+        )
     return found
 
 
@@ -134,7 +144,7 @@ def score(net: UNet, pictures: list, labels: range) -> tuple[float, list[float],
                 hits[n] += ((guess == number) & (label == number)).sum()
                 either[n] += (((guess == number) | (label == number)) & known).sum()
     net.train()
-    iou = [hit / one if one else math.nan for hit, one in zip(hits, either)]
+    iou = [hit / one if one else math.nan for hit, one in zip(hits, either, strict=True)]
     return float(np.nanmean(iou)), iou, right / total
 
 
@@ -151,11 +161,14 @@ rng = np.random.default_rng(1)
 tests = photographs(options.camvid, "test")
 photos, drawn = photographs(options.camvid, "train"), renderings(range(1000, 1000 + options.streets))
 held_out = renderings(range(1, 3))  # the first of those that `caviar paper materials` takes
-counts = np.bincount(np.concatenate([label.ravel() for _, label in photos + drawn]), minlength=256)[: len(LABELS)]
+counts = np.bincount(np.concatenate([label.ravel() for _, label in photos + drawn]), minlength=256)[
+    : len(LABELS)
+]
 weights = torch.tensor(1 / np.sqrt(np.maximum(counts, counts.sum() * 1e-4)), dtype=torch.float32)
 weights *= (counts.sum()) / float((weights * torch.tensor(counts)).sum())
 net = UNet()
-print(f"{len(photos)} photographs, {len(drawn)} renderings, {sum(p.numel() for p in net.parameters())} parameters")
+size = sum(parameters.numel() for parameters in net.parameters())
+print(f"{len(photos)} photographs, {len(drawn)} renderings, {size} parameters")
 
 optimiser = torch.optim.AdamW(net.parameters(), lr=4e-3, weight_decay=1e-4)
 begin, curve, losses, next_score = time.monotonic(), [], [], 0.1
@@ -176,20 +189,24 @@ while (share := (time.monotonic() - begin) / (60 * options.minutes)) < 1:
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-    losses.append(float(loss))
+    losses.append(loss.item())
     step += 1
     if share > next_score:
         next_score += 0.1
-        found = score(net, tests[::4], range(len(PHOTOS)))[0], score(net, held_out[::2], range(len(PHOTOS), len(LABELS)))[0]
+        found = (
+            score(net, tests[::4], range(len(PHOTOS)))[0],
+            score(net, held_out[::2], range(len(PHOTOS), len(LABELS)))[0],
+        )
         curve.append((step, float(np.mean(losses[-50:])), *found))
-        print(f"step {step}: loss {curve[-1][1]:.3f}, mean IoU {found[0]:.3f} photographs, {found[1]:.3f} renderings", flush=True)
+        of_both = f"mean IoU {found[0]:.3f} photographs, {found[1]:.3f} renderings"
+        print(f"step {step}: loss {curve[-1][1]:.3f}, {of_both}", flush=True)
 
 mean, each, right = score(net, tests, range(len(PHOTOS)))
 print(f"{len(tests)} held-out photographs: mean IoU {mean:.3f}, pixels right {right:.3f}")
-print("  " + ", ".join(f"{name} {value:.2f}" for name, value in zip(PHOTOS, each)))
+print("  " + ", ".join(f"{name} {value:.2f}" for name, value in zip(PHOTOS, each, strict=True)))
 drawn_mean, each, right = score(net, held_out, range(len(PHOTOS), len(LABELS)))
 print(f"{len(held_out)} held-out renderings: mean IoU {drawn_mean:.3f}, pixels right {right:.3f}")
-print("  " + ", ".join(f"{name} {value:.2f}" for name, value in zip((*MATERIALS, "sky"), each)))
+print("  " + ", ".join(f"{name} {value:.2f}" for name, value in zip((*MATERIALS, "sky"), each, strict=True)))
 curve.append((step, float(np.mean(losses[-50:])), mean, drawn_mean))
 
 net.eval()
@@ -199,8 +216,8 @@ torch.onnx.export(
     dynamic_axes={"picture": {1: "height", 2: "width"}, "probabilities": {2: "height", 3: "width"}},
 )  # fmt: skip
 card = {
-    "classes": CLASSES, "layout": "NHWC", "dtype": "uint8", "width": SIZE[0], "multiple": 16, "output": "probabilities",
-    "materials": MEANT,
+    "classes": CLASSES, "layout": "NHWC", "dtype": "uint8", "width": SIZE[0], "multiple": 16,
+    "output": "probabilities", "materials": MEANT,
 }  # fmt: skip
 options.out.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
 
@@ -213,7 +230,7 @@ figure, (left, right_axis) = plt.subplots(1, 2, figsize=(9, 3.2))
 smooth = np.convolve(losses, np.ones(25) / 25, "valid")
 left.plot(np.arange(len(smooth)) + 25, smooth)
 left.set(xlabel="step", ylabel="loss, mean of 25 steps")
-steps, _, of_photos, of_drawn = zip(*curve)
+steps, _, of_photos, of_drawn = zip(*curve, strict=True)
 right_axis.plot(steps, of_photos, "o-", label="photographs")
 right_axis.plot(steps, of_drawn, "s-", label="renderings")
 right_axis.set(xlabel="step", ylabel="mean IoU, held out", ylim=(0, 1))

@@ -1,7 +1,7 @@
 """Crossings of two streets with planted materials: scenes whose true materials are known, and their pictures.
 
 Buildings of random sizes stand around a crossing; each wall is of a material of its own above the ground
-floor and another, at times, below. Pictures are our renderer's with a pattern of each material in place of one
+floor and another, at times, below. Pictures are our renderer's with a pattern of each material, not with one
 colour: bricks in their bond, panels of concrete, panes, boards, ribs of sheet metal, in tints that differ
 from building to building. Walls that are not of glass have windows, which are of glass in the true picture
 and no faces of the model, as in most models of cities.
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array, UInt8Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import CameraDevice
 from caviar_scenes.views import Eye
 from caviar_space.imported_scenes import ImportedScene, Piece
@@ -71,9 +71,7 @@ class Street:
         face, points = seen.face[met], seen.points[met]
         normal = eye.normals[face].astype(np.float64)
         flat = np.abs(normal[:, 2]) > 0.7
-        along = np.where(
-            flat, points[:, 0], normal[:, 0] * points[:, 1] - normal[:, 1] * points[:, 0]
-        )
+        along = np.where(flat, points[:, 0], normal[:, 0] * points[:, 1] - normal[:, 1] * points[:, 0])
         up = np.where(flat, points[:, 1], points[:, 2])
         albedo, labels[met] = _patterns(of_face[face], styles[face], along, up, flat)
         colours[met] = light[met] * albedo
@@ -113,12 +111,13 @@ def street(seed: int) -> Street:
                 plots.append((wy, wy + depth, y, y + width))
                 y += width + rng.choice([0.0, 0.0, 4.0])
             for x0, x1, y0, y1 in plots:
-                xs, ys = sorted((sx * x0, sx * x1)), sorted((sy * y0, sy * y1))
+                xs, ys = sorted((sx * float(x0), sx * float(x1))), sorted((sy * float(y0), sy * float(y1)))
                 _add_building(made, f"b{number:02d}", xs, ys, rng, names, weights)
                 number += 1
     far = 95.0
     mesh, tops = _quads([_rectangle((-far, far), (-far, far), 0.0)])
-    _add(made, "ground", mesh, [str(rng.choice(["asphalt_concrete", "asphalt_concrete", "concrete"]))], tops, rng)
+    road = str(rng.choice(["asphalt_concrete", "asphalt_concrete", "concrete"]))
+    _add(made, "ground", mesh, [road], tops, rng)
     verges = [
         _rectangle((a, b), (c, d), 0.05)
         for a, b in ((-far, -75.0), (75.0, far))
@@ -135,14 +134,16 @@ def _rectangle(x: tuple[float, float], y: tuple[float, float], z: float) -> list
 
 def _quads(quads: list[list[tuple[float, float, float]]]) -> tuple[Mesh, int]:
     vertices = np.array(quads, np.float64).reshape(-1, 3)
-    faces = [(4 * q + a, 4 * q + b, 4 * q + c) for q in range(len(quads)) for a, b, c in ((0, 1, 2), (0, 2, 3))]
-    return Mesh(vertices, np.array(faces, np.int32)), len(quads)
+    halves = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    faces = 4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves
+    return Mesh(vertices, faces.reshape(-1, 3)), len(quads)
 
 
 def _add(
     made: Street, name: str, mesh: Mesh, materials: list[str], quads: int, rng: np.random.Generator
 ) -> None:
-    made.scene.pieces[name] = Piece(mesh, "concrete", "ground" if name in ("ground", "verge") else "building", "street", 1)
+    kind = "ground" if name in ("ground", "verge") else "building"
+    made.scene.pieces[name] = Piece(mesh, "concrete", kind, "street", 1)
     made.truth[name] = [material for material in materials for _ in range(2)]
     made.style[name] = [int(style) for style in rng.integers(0, 1 << 16, quads) for _ in range(2)]
 
@@ -189,20 +190,22 @@ _TINTS = {
 
 
 def _patterns(
-    material: Int64Array, style: Int64Array, u: Float64Array, v: Float64Array, flat: Float64Array
+    material: Int64Array, style: Int64Array, u: Float64Array, v: Float64Array, flat: BoolArray
 ) -> tuple[Float64Array, Int64Array]:
     """Linear sRGB and material of points of surfaces, ``[N, 3]`` and ``[N]``; u along them, v upwards [m]."""
     from caviar_services.sensors.shading import linear
 
     tints = np.array([_TINTS[name] for name in MATERIALS])
-    base = linear(tints)[material, style % 4]
+    base: Float64Array = linear(tints)[material, style % 4]
     # Of the tint a little more of one colour or another.
-    base = base * (0.85 + 0.3 * _random(style[:, None] * 7 + np.arange(3), 3))
+    hue: Float64Array = style[:, None] * 7.0 + np.arange(3.0)
+    base *= 0.85 + 0.3 * _random(hue, 3)
     label = material.copy()
     shade = np.ones(len(u))
 
-    def of(name: str) -> Any_:
-        return material == MATERIALS.index(name)
+    def of(name: str) -> BoolArray:
+        found: BoolArray = material == MATERIALS.index(name)
+        return found
 
     row, course = np.floor(v / 0.24), v / 0.24 % 1
     column = u / 0.5 + 0.5 * (row % 2)
@@ -229,10 +232,8 @@ def _patterns(
     return np.where(window[:, None], glass, np.clip(base * shade[:, None], 0, 1)), label
 
 
-Any_ = np.ndarray
-
-
 def _random(key: Float64Array, salt: int) -> Float64Array:
     """Numbers 0…1 that look random, the same for the same keys."""
     value = np.sin(np.asarray(key, np.float64) * 12.9898 + salt * 78.233) * 43758.5453
-    return value - np.floor(value)
+    part: Float64Array = value - np.floor(value)
+    return part

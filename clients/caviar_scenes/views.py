@@ -139,7 +139,9 @@ def _rows(table: Path) -> list[tuple[int, dict[str, Any]]]:
         try:
             return list(enumerate(msgspec.json.decode(text, type=list[dict[str, Any]]), 1))
         except (msgspec.DecodeError, msgspec.ValidationError) as error:
-            raise AssetError(f"{table}: {error}; write a list of objects with {', '.join(COLUMNS)}") from error
+            raise AssetError(
+                f"{table}: {error}; write a list of objects with {', '.join(COLUMNS)}"
+            ) from error
     return read_table(table, text, COLUMNS[:-2] + COLUMNS[-1:])
 
 
@@ -320,7 +322,9 @@ def viewpoints(
     for x, y, z in streets:
         turn = rng.uniform(0, 90)
         poses += [((x, y, z + EYES), (turn + 90.0 * k, -12.0, 0.0)) for k in range(4)]
-        poses += [((x, y, float(high[2]) + rng.uniform(5, 25)), (turn + 90.0 * k, 40.0, 0.0)) for k in range(2)]
+        poses += [
+            ((x, y, float(high[2]) + rng.uniform(5, 25)), (turn + 90.0 * k, 40.0, 0.0)) for k in range(2)
+        ]
     small = (48, max(2, 48 * size[1] // size[0]))
     squares: list[Int64Array] = []
     for place, turn_deg in poses:
@@ -337,6 +341,4 @@ def viewpoints(
         gains = [int((views[part] < 2).sum()) if k in open_to else -1 for k, part in enumerate(parts)]
         chosen.append(int(np.argmax(gains)))
         views[parts[chosen[-1]]] += 1
-    return [
-        camera(f"view-{number:02d}", *poses[k], fov_deg, size) for number, k in enumerate(chosen)
-    ]
+    return [camera(f"view-{number:02d}", *poses[k], fov_deg, size) for number, k in enumerate(chosen)]
