@@ -159,7 +159,9 @@ class OnnxSegmenter:
             Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR) for plane in found
         ]
         share = np.stack([np.array(plane) for plane in planes], axis=-1)
-        return (share / np.maximum(share.sum(-1, keepdims=True), 1e-12)).astype(np.float32)
+        total = np.maximum(share.sum(-1, keepdims=True), 1e-12)
+        result: Float32Array = (share / total).astype(np.float32)
+        return result
 
 
 def class_materials(table: str | Path) -> dict[str, dict[str, float]]:
