@@ -9,7 +9,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 from xml.etree import ElementTree
 
 import msgspec
@@ -18,12 +18,14 @@ from rich.console import Console
 
 from caviar_clients.cli.shared import print_line, progress_bar
 from caviar_protocol.errors import AssetError
+from caviar_scenes.materials_cli import app as materials_app
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import ImportedScene
     from caviar_space.mitsuba_xml import SceneryShape
 
 app = typer.Typer()
+app.add_typer(materials_app, name="materials")
 TEMPLATE = "new/imported.toml"
 """The scenarios of an imported scene, in the package of scenarios."""
 
@@ -59,6 +61,9 @@ def import_command(
         list[str] | None,
         typer.Option(help="NAME=MATERIAL: that of ITU-R P.2040 for a name of the source; several times"),
     ] = None,
+    up: Annotated[
+        str, typer.Option(help="y or z: axis that points up in meshes that do not say; by default z")
+    ] = "z",
     lod: Annotated[
         str, typer.Option(help="level of detail, where there are several; by default the finest")
     ] = "",
@@ -72,9 +77,6 @@ def import_command(
     origin: Annotated[
         str, typer.Option(help="LAT,LON of the scene's origin [°]; by default the source's, or its middle")
     ] = "",
-    up: Annotated[
-        Literal["y", "z"], typer.Option(help="axis that is up in OBJ, PLY, STL and Mitsuba's XML")
-    ] = "z",
     sumo: Annotated[
         Path | None,
         typer.Option(help="SUMO configuration, .sumocfg; by default the one in the project's folder"),
@@ -102,11 +104,13 @@ def import_command(
             heights=heights,
             material=material,
             materials=_named_materials(materials or [], material),
-            up=up,
+            up="y" if up == "y" else "z",
             lod=lod,
             error_m=error_m,
             progress=lambda name, share: bar.update(task, description=name, completed=share),
         )
+        if up not in ("y", "z"):
+            raise AssetError(f"--up {up}: write y or z")
         if box and box_m:
             raise AssetError("--box and --box-m both say what is taken; write one of them")
         scene = read_source(path, request, form)

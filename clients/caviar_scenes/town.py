@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -99,10 +100,8 @@ class Streets:
     file: Path
     offset: tuple[float, float]
     """Place of its origin in the scene [m]."""
-    lanes: list[Float64Array]
-    """Centre lines to drive on [m], Shape ``[P, 2]`` each."""
-    edges: dict[str, Float64Array]
-    """Centre line of one lane of each road that vehicles take [m]."""
+    lanes: dict[str, Float64Array]
+    """Centre line of one lane to drive on [m], Shape ``[P, 2]``, by road."""
     corners: Float64Array
     """Corners of junctions [m], Shape ``[N, 2]``."""
     length_km: tuple[float, float]
@@ -135,8 +134,6 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
     solids = [mesh for mesh, flat in zip(meshes, level, strict=True) if not flat]
     skyline = skyline_of(solids, [mesh for mesh, flat in zip(meshes, level, strict=True) if flat])
     streets = _streets(scene / NET) if (scene / NET).is_file() else None
-    targets = _targets(skyline, streets)
-    stations = _stations(skyline, solids, targets, streets)
     files: dict[Path, bytes] = {}
     values = {"traffic": "", "bodies": "", "receivers": ""}
     # A scenario names its files relative to itself, with `/` on every system.
@@ -145,18 +142,22 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
     def named(file: Path) -> str:
         return f'"file:{Path(os.path.relpath(file.resolve(), here)).as_posix()}"'
 
-    route: list[str] = []
+    routes: list[list[str]] = []
     if streets is None:
         say(f"{scene} has no network of roads: base stations and a UAV alone")
         scenery = f"scenery = {named(description)}\n"
     else:
-        routes, route, counts = _traffic(streets, seed)
-        files[path.with_suffix(".rou.xml")] = routes
+        files[path.with_suffix(".rou.xml")], routes, counts = _traffic(streets, seed)
         say(f"{counts[0]} vehicles and {counts[1]} people at {BEGIN_S:g} s")
         scenery = ""
         values.update(_traffic_tables(streets, counts, named(description), named(streets.file),
                                       f'"file:{path.stem}.rou.xml"'))  # fmt: skip
     what = "traffic, people, " if streets else ""
+    targets = _targets(skyline, streets, routes)
+    stations, seen = _stations(skyline, solids, targets, streets)
+    lit = Counter(road for road, one in zip(targets.roads, seen.tolist(), strict=True) if one)
+    # The UAV takes the way that is most in sight.
+    route = max(routes, key=lambda roads: sum(lit[road] for road in set(roads)), default=[])
     waypoints, how = _flight(skyline, streets, route)
     values |= {
         "title": f"Scene {scene.resolve().name} with {what}base stations and a UAV",
@@ -226,22 +227,21 @@ def _streets(file: Path) -> Streets:
     try:
         root = ElementTree.parse(file).getroot()  # noqa: S314 - expat bounds what entities expand to
         x, y = (-float(word) + 0.0 for word in root.find("location").get("netOffset").split(","))  # type: ignore[union-attr]
-        lanes, edges, on_foot = list[Float64Array](), dict[str, Float64Array](), 0.0
+        lanes, driven, on_foot = dict[str, Float64Array](), 0.0, 0.0
         for edge in root.iter("edge"):
             for lane in edge.iter("lane") if edge.get("function", "normal") == "normal" else ():
                 if lane.get("allow") == "pedestrian":
                     on_foot += float(lane.get("length", 0))
                 else:
-                    lanes.append(points(lane) + np.array((x, y)))
-                    edges.setdefault(edge.get("id", ""), lanes[-1])
+                    driven += float(lane.get("length", 0))
+                    lanes[edge.get("id", "")] = points(lane) + np.array((x, y))
         corners = [
             points(junction)[:1] for junction in root.iter("junction") if junction.get("type") != "internal"
         ]
-        driven = sum(float(np.linalg.norm(np.diff(lane, axis=0), axis=1).sum()) for lane in lanes)
         places = np.concatenate([np.zeros((0, 2)), *corners]) + np.array((x, y))
     except (OSError, ValueError, AttributeError, ElementTree.ParseError) as error:
         raise AssetError(f"{file} is no network of SUMO: {error}; import the scene again") from error
-    return Streets(file, (x, y), lanes, edges, places, (driven / 1e3, on_foot / 1e3))
+    return Streets(file, (x, y), lanes, places, (driven / 1e3, on_foot / 1e3))
 
 
 def _along(line: Float64Array, step_m: float) -> Float64Array:
@@ -251,21 +251,37 @@ def _along(line: Float64Array, step_m: float) -> Float64Array:
     return np.stack([np.interp(at, way, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _targets(skyline: Skyline, streets: Streets | None) -> Float64Array:
-    """Places that base stations are to see: on lanes, or on open ground [m], Shape ``[N, 3]``."""
+class _Targets(NamedTuple):
+    """Places that base stations are to see."""
+
+    places: Float64Array
+    """[m], Shape ``[N, 3]``."""
+    weights: Float64Array
+    """Vehicles that pass by, Shape ``[N]``."""
+    roads: list[str]
+    """Of each, in the network."""
+
+
+def _targets(skyline: Skyline, streets: Streets | None, routes: Sequence[Sequence[str]]) -> _Targets:
+    """Places on lanes, or on open ground."""
     if streets is not None and streets.lanes:
-        places = np.concatenate([_along(lane, 15.0) for lane in streets.lanes])
+        lines = [_along(lane, 15.0) for lane in streets.lanes.values()]
+        places, sizes = np.concatenate(lines), [len(line) for line in lines]
+        passing = Counter(road for route in routes for road in route)
+        weights = np.repeat([1.0 + passing[road] for road in streets.lanes], sizes)
+        roads = [road for road, size in zip(streets.lanes, sizes, strict=True) for _ in range(size)]
     else:
         x, y = (np.arange(0.5, size, 25.0 / _CELL_M) for size in skyline.heights.shape)
         grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2) * _CELL_M + skyline.low
         places = grid[np.isneginf(skyline.at(grid))]
-    return np.column_stack([places, skyline.at(places, ground=True) + 1.5])
+        weights, roads = np.ones(len(places)), [""] * len(places)
+    return _Targets(np.column_stack([places, skyline.at(places, ground=True) + 1.5]), weights, roads)
 
 
 def _stations(
-    skyline: Skyline, solids: Sequence[Mesh], targets: Float64Array, streets: Streets | None
-) -> list[Station]:
-    """Base stations, each at the place from which most targets are seen that the others do not see."""
+    skyline: Skyline, solids: Sequence[Mesh], targets: _Targets, streets: Streets | None
+) -> tuple[list[Station], BoolArray]:
+    """Base stations, each where most is seen that the others do not see; and which targets they see."""
     roofs = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in solids)])
     # Corners of roofs that nothing is on, one in a square of 10 m.
     above = roofs[:, 2] - skyline.at(roofs[:, :2], ground=True)
@@ -283,26 +299,29 @@ def _stations(
     if not eyes:
         middle = skyline.low + np.array(skyline.heights.shape) * _CELL_M / 2
         eyes = [(np.array([*middle, _MAST_M]), "a mast")]
-    near = [np.linalg.norm(targets - eye, axis=1) < _REACH_M for eye, _ in eyes]
+    places, weights = targets.places, targets.weights
+    near = [np.linalg.norm(places - eye, axis=1) < _REACH_M for eye, _ in eyes]
     # Only the eyes with most targets around them are looked through.
-    promising = sorted(range(len(eyes)), key=lambda i: (eyes[i][1] != "a roof", -near[i].sum()))[:600]
-    seen = np.zeros((len(promising), len(targets)), bool)
+    promising = sorted(range(len(eyes)), key=lambda i: (eyes[i][1] != "a roof", -weights[near[i]].sum()))[
+        :600
+    ]
+    seen = np.zeros((len(promising), len(places)), bool)
     for row, i in enumerate(promising):
-        seen[row, near[i]] = skyline.sees(eyes[i][0], targets[near[i]])
-    found, covered = list[Station](), np.zeros(len(targets), bool)
+        seen[row, near[i]] = skyline.sees(eyes[i][0], places[near[i]])
+    found, covered = list[Station](), np.zeros(len(places), bool)
     for _ in range(STATIONS):
         new = seen & ~covered
-        best = int(new.sum(axis=1).argmax())
+        best = int((new @ weights).argmax())
         if found and new[best].sum() < 10:
             break
         eye, on = eyes[promising[best]]
-        towards = targets[new[best]] - eye if new[best].any() else np.array([[1.0, 0.0, 0.0]])
+        towards = places[new[best]] - eye if new[best].any() else np.array([[1.0, 0.0, 0.0]])
         level = np.linalg.norm(towards[:, :2], axis=1)
         x, y = (towards[:, :2] / np.maximum(level, 1.0)[:, None]).sum(axis=0)
         pitch = math.degrees(math.atan2(-float(np.median(towards[:, 2])), float(np.median(level))))
         found.append(Station(eye, math.degrees(math.atan2(y, x)), min(max(pitch, 0.0), 45.0), on))
         covered |= seen[best]
-    return found
+    return found, covered
 
 
 def _device(number: int, station: Station) -> str:
@@ -326,7 +345,7 @@ def _flight(
     skyline: Skyline, streets: Streets | None, route: Sequence[str]
 ) -> tuple[list[tuple[float, float, float, float]], str]:
     """Waypoints of the UAV, t [s], x, y, z [m], at 8 m/s, 10 m above all within 20 m; and their kind."""
-    ways = [streets.edges[name] for name in route if name in streets.edges] if streets else []
+    ways = [streets.lanes[name] for name in route if name in streets.lanes] if streets else []
     if ways:
         line, how = np.concatenate(ways), "Along the streets of one of the trips."
     else:
@@ -344,15 +363,15 @@ def _flight(
     return [(t, x, y, high) for t, (x, y) in rows], how
 
 
-def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[str], tuple[int, int]]:
-    """Trips of vehicles and people: SUMO's file, the longest route, and how many of both are there at the
-    beginning of a run."""
+def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[list[str]], tuple[int, int]]:
+    """Trips of vehicles and people: SUMO's file, the roads of each vehicle, and how many of both are there
+    at the beginning of a run."""
     try:
         from sumo import SUMO_HOME
     except ImportError as error:
         raise SetupError(f"traffic needs SUMO ({error}); run: {install_command('world')}") from error
     home = Path(SUMO_HOME)
-    extent = np.ptp(np.concatenate([*streets.lanes, streets.corners]), axis=0)
+    extent = np.ptp(np.concatenate([*streets.lanes.values(), streets.corners]), axis=0)
     extent_m = float(extent.max(initial=0.0))
     apart_m = min(300.0, 0.4 * extent_m)
     # Little's law, with trips of some 150 s and walks of 400 s in a town of 1.5 km.
@@ -398,7 +417,7 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[str], tuple[int, 
             steps = ElementTree.parse(Path(folder, name)).getroot().findall("step")  # noqa: S314 - SUMO wrote it
             counts.append(int(steps[-1].get(key, 0)) if steps else 0)
     routed = [route.get("edges", "").split() for route in root.iter("route")]
-    return routes, max(routed, key=len, default=[]), (counts[0], counts[1])
+    return routes, routed, (counts[0], counts[1])
 
 
 def _run(command: Sequence[str], folder: str) -> None:

@@ -762,6 +762,25 @@ def test_an_episode_of_one_traffic_begins_where_a_run_comes_that_long_after_the_
     assert [device.name for device in first.devices] == [device.name for device in then.devices]
 
 
+def test_people_walk_on_in_an_episode_of_one_traffic(
+    make: Make, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = repository / "deploy" / "caviar_scenarios" / "crossing"
+    files = {key: str(folder / name) for key, name in CROSSING.items()}
+    found = []
+    for settings, episode in (({"begin_s": 30.0, "between_episodes_s": 30.0}, 1), ({"begin_s": 60.0}, 0)):
+        world = make(**files, **settings)
+        world.reset(episode, 3, 0)
+        scene = scene_at(world, 0)
+        found.append(dict(zip(scene.names, scene.position.tolist(), strict=True)))
+        assert list(scene.classes).count("pedestrian") > 10
+    shared, passed = found
+    assert shared.keys() == passed.keys()
+    for name, place in shared.items():
+        assert place == pytest.approx(passed[name], abs=1e-3), name
+
+
 @pytest.mark.parametrize("spacing", [0.0, -1.0, 0.25, math.inf])
 def test_a_spacing_that_is_no_number_of_steps_is_refused(make: Make, spacing: float) -> None:
     with pytest.raises(ScenarioError, match=r"between_episodes_s.*100 ms"):

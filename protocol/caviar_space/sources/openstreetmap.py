@@ -59,6 +59,8 @@ MATERIALS: Mapping[str, str] = {
 ``water``, of which the Recommendation has none: wet ground comes nearest."""
 TREE_M = (10.0, 5.0)
 """Height of a tree and diameter of its crown that are not tagged [m]; the crown begins at 0.3 of it."""
+BEYOND_M = 500.0
+"""Distance from the box of an extract within which buildings are taken, where none is asked for [m]."""
 STEP_M = 20.0
 """Side of the squares of ground that is not level [m]."""
 ROW_M = 8.0
@@ -279,7 +281,7 @@ def _building(tags: Mapping[str, str]) -> str:
         return "part"
     kind = tags.get("building", "no")
     underground = tags.get("location") == "underground" or (metres(tags.get("layer", "0")) or 0) < 0
-    return "" if kind in ("no", "entrance", "underpass_entrance") or underground else kind
+    return "" if kind == "no" or underground else kind
 
 
 def _is_water(tags: Mapping[str, str]) -> bool:
@@ -429,7 +431,9 @@ class _Assembly:
         if not elements:
             return []
         shapes = np.array([element.shape for element in elements])
-        x0, y0, x1, y1 = self.box
+        # Without a box buildings are taken that an extract has beyond its own.
+        beyond = 0.0 if self.boxed else BEYOND_M
+        x0, y0, x1, y1 = np.array(self.box) + beyond * np.array((-1, -1, 1, 1))
         places = [self.origin.to_wgs84(x, y)[:2] for x in (x0, x1) for y in (y0, y1)]
         (south, west), (north, east) = np.min(places, axis=0), np.max(places, axis=0)
         bounds = shapely.bounds(shapes)
@@ -453,7 +457,6 @@ class _Assembly:
             best = int(near[shared.argmax()]) if len(near) and shared.max() > 0.5 * part.shape.area else -1
             owned.setdefault(best, []).append(part)
         middles = shapely.centroid(shapes)
-        # Without a box all buildings of the extract are taken, also those that its border goes through.
         frame = shapely.box(x0, y0, x1, y1) if self.boxed else shapely.box(-np.inf, -np.inf, np.inf, np.inf)
         inside = shapely.contains_xy(frame, shapely.get_x(middles), shapely.get_y(middles))
         known = [self._tagged(outline.tags) for outline in outlines]
@@ -680,7 +683,7 @@ class _Assembly:
 
         roads = [road._replace(places=self._project(road.places)) for road in self.map.roads]
         made = network_of(roads, self.map.signs, [solid.polygon for solid in solids], self.box, self.origin,
-                          self.terrain and self.terrain.at,
+                          self.terrain.at if self.terrain else None,
                           lambda name, share: self.request.progress(name, 0.3 + 0.7 * share))  # fmt: skip
         self.notes.update(made.left_out)
         self.made.notes += made.notes

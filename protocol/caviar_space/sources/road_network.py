@@ -178,7 +178,7 @@ def _cut(
                 *(next(new) for _ in range(parts - 1)),
                 b if b_in else next(new),
             ]
-            for node, at in zip(nodes, np.linspace(*clipped, parts + 1).tolist(), strict=True):
+            for node, at in zip(nodes, np.linspace(clipped[0], clipped[1], parts + 1).tolist(), strict=True):
                 found.places.setdefault(node, tuple(at))
             found.way += [len(found.ways) - 1] * parts
             found.ends += pairwise(nodes)
