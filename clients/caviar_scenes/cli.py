@@ -18,12 +18,14 @@ from rich.console import Console
 
 from caviar_clients.cli.shared import print_line, progress_bar
 from caviar_protocol.errors import AssetError
+from caviar_scenes.materials_cli import app as materials_app
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import ImportedScene
     from caviar_space.mitsuba_xml import SceneryShape
 
 app = typer.Typer()
+app.add_typer(materials_app, name="materials")
 TEMPLATE = "new/imported.toml"
 """The scenarios of an imported scene, in the package of scenarios."""
 

@@ -443,6 +443,9 @@ def test_known_places_on_the_earth_are_within_a_millimetre(
         (latitude, longitude), abs=1e-7
     )
     assert own.origin.altitude_m == pytest.approx(height - 10, abs=1e-2)
+    # Of tiles beyond a box, no content is opened.
+    near = read_source(tmp_path / "tileset.json", Request(origin=origin, box_m=(0, 0, 40, 40)))
+    assert [each["file"] for each in near.sources] == ["tileset.json", "a.glb"]
 
 
 def test_tiles_by_level_of_detail_external_and_missing_ones(tmp_path: Path) -> None:
@@ -542,8 +545,9 @@ def test_implicit_tiles_of_two_subtrees(binary: bool, tmp_path: Path) -> None:
     (tmp_path / "tileset.json").write_text(tileset(root))
     (tmp_path / "s").mkdir()
     (tmp_path / "t").mkdir()
-    for level, x, y in ((1, 1, 0), (2, 3, 1)):
-        (tmp_path / "t" / f"{level}-{x}-{y}.glb").write_bytes(content((level, x, y)))
+    places = {"1-1-0": (1, -8, 0), "2-3-1": (6, -4, 0)}
+    for name, place in places.items():
+        (tmp_path / "t" / f"{name}.glb").write_bytes(content(place))
     # Bits in the order of Morton: the root, then (0, 0), (1, 0), (0, 1), (1, 1).
     heads: dict[str, tuple[dict[str, Any], bytes]] = {
         "0.0.0": (
@@ -580,12 +584,13 @@ def test_implicit_tiles_of_two_subtrees(binary: bool, tmp_path: Path) -> None:
 
     read = read_source(tmp_path / "tileset.json")
 
-    assert {tuple(piece.mesh.vertices.min(0).round(6)) for piece in read.pieces.values()} == {
-        (1, 1, 0),
-        (2, 3, 1),
-    }
+    assert {tuple(piece.mesh.vertices.min(0).round(6)) for piece in read.pieces.values()} == set(
+        places.values()
+    )
+    boxed = read_source(tmp_path / "tileset.json", Request(box_m=(0, -9, 4, -6)))
+    assert [each["file"] for each in boxed.sources] == ["tileset.json", "1-1-0.glb"]
     coarse = read_source(tmp_path / "tileset.json", Request(error_m=2))
-    assert {tuple(piece.mesh.vertices.min(0).round(6)) for piece in coarse.pieces.values()} == {(1, 1, 0)}
+    assert {tuple(piece.mesh.vertices.min(0).round(6)) for piece in coarse.pieces.values()} == {(1, -8, 0)}
 
 
 # --- Mitsuba ------------------------------------------------------------------------------------------------

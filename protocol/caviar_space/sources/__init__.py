@@ -62,9 +62,9 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     ),
     "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
                       f"{_SOURCES}.openstreetmap:read_map"),
+    "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
     "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
     "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
-    "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
     "obj": ((".obj",), f"{_SOURCES}.mesh_files:read_obj"),
     "ply": ((".ply",), f"{_SOURCES}.mesh_files:read_ply_scene"),
     "stl": ((".stl",), f"{_SOURCES}.mesh_files:read_stl"),
@@ -100,7 +100,14 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
         raise AssetError(f"{path}: no format of scenes {name!r}; write --format: {', '.join(READERS)}")
     if request.heights and name not in _MAPS:
         raise AssetError(f"{path} has its own ground; heights are for maps: {', '.join(_MAPS)}")
-    reader: Reader = resolve_name(READERS[name][1])
+    ends, reader_place = READERS[name]
+    if path.is_dir() and name != "wireless-insite":
+        files = sorted(file for file in path.iterdir() if file.name.lower().endswith(ends))
+        if len(files) != 1:
+            said = ", ".join(file.name for file in files[:5]) or "none"
+            raise AssetError(f"{path} has {len(files)} files of {name} ({said}); name one")
+        path = files[0]
+    reader: Reader = resolve_name(reader_place)
     scene = reader(path, request)
     scene.origin = scene.origin or request.origin
     box = request.box_m

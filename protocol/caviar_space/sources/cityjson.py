@@ -198,7 +198,7 @@ def _projection(
     up = whole.axis_info[2].unit_conversion_factor if len(whole.axis_info) > 2 else 1.0
     to_wgs84 = Transformer.from_crs(flat, CRS.from_epsg(4326), always_xy=True)
     if builder.request.origin is not None:
-        origin = builder.request.origin
+        origin = msgspec.structs.replace(builder.request.origin, projection="tmerc")
     else:
         x, y = (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
         longitude, latitude = to_wgs84.transform(x, y, errcheck=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from caviar_protocol.arrays import MAX_COORDINATE_M, Float64Array, Int64Array
 from caviar_protocol.assets import ITU_MATERIALS
-from caviar_protocol.errors import AssetError, CaviarError, SetupError, suggestion
+from caviar_protocol.errors import AssetError, CaviarError, SetupError
 from caviar_protocol.host import install_command
 from caviar_space.imported_scenes import ImportedScene, Piece, source_of
 from caviar_space.meshes import Mesh
@@ -36,7 +36,8 @@ _WORDS = {
     "cement": "concrete", "copper": "metal", "door": "wood", "drywall": "plasterboard", "glazing": "glass",
     "gypsum": "plasterboard", "iron": "metal", "masonry": "brick", "plaster": "plasterboard",
     "road": "asphalt_concrete", "roads": "asphalt_concrete", "steel": "metal", "timber": "wood",
-    "tin": "metal", "window": "glass", "windows": "glass", "wooden": "wood", "zinc": "metal",
+    "tin": "metal", "water": "wet_ground", "window": "glass", "windows": "glass", "wooden": "wood",
+    "zinc": "metal",
 }  # fmt: skip
 """Material in ITU-R P.2040 by a word of a name."""
 
@@ -237,9 +238,6 @@ class SceneBuilder:
         self._path = path
         self._assumed: dict[str, str] = {}
         self._dropped = self._triangles = 0
-        for name in {request.material, *request.materials.values()}:
-            if name not in ITU_MATERIALS:
-                raise AssetError(f"ITU-R P.2040 has no material {name!r}; {suggestion(name, ITU_MATERIALS)}")
 
     def itu(self, name: str) -> str:
         """Material in ITU-R P.2040 by the name that the source gives; what that does not say is noted."""
@@ -363,6 +361,7 @@ class SceneBuilder:
                 pieces[name] = Piece(mesh, piece.material, piece.kind, piece.file, piece.line)
             x, y, z = low.tolist()
             scene.notes.append(f"the origin of the scene is at {x:.0f}, {y:.0f}, {z:.0f} m of the source")
+        scene.origin = scene.origin or self.request.origin
         used = {piece.material for piece in pieces.values()}
         scene.materials = {key: made for key, made in scene.materials.items() if key in used}
         self.request.progress("", 1.0)

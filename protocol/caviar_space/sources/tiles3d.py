@@ -20,7 +20,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
-from caviar_space.imported_scenes import Georeference, ImportedScene
+from caviar_space.imported_scenes import Georeference, ImportedScene, box_in_metres
 from caviar_space.sources import Request
 from caviar_space.sources.gltf import Gltf
 from caviar_space.sources.pieces import Y_UP, SceneBuilder, at, beside, contents, moved, reading
@@ -121,6 +121,25 @@ class _Node:
     """Tilesets, from the outermost to the tile's."""
     turn: Float64Array
     """From the axes of its glTF into those of the tile, Shape ``[4, 4]``."""
+    volume: _Volume
+
+    def corners(self) -> Float64Array:
+        """Corners around it, in the Earth's axes or those of the tileset [m], Shape ``[8, 3]``."""
+        signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+        volume = self.volume
+        if volume.region is not None:
+            west, south, east, north, low, high = volume.region
+            halves = np.array([east - west, north - south, high - low]) / 2
+            places = np.array([west + east, south + north, low + high]) / 2 + signs * halves
+            return _to_earth(np.degrees(places[:, :2]), places[:, 2])
+        if volume.box is not None:
+            numbers = np.array(volume.box)
+            corners = numbers[:3] + signs @ numbers[3:].reshape(3, 3)
+        else:
+            x, y, z, radius = volume.sphere or (0.0, 0.0, 0.0, math.inf)
+            corners = np.array([x, y, z]) + signs * radius
+        placed: Float64Array = corners @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+        return placed
 
 
 @dataclass
@@ -129,6 +148,8 @@ class _Walk:
 
     path: Path
     error_m: float
+    within: Callable[[_Node], bool]
+    """Whether something of a tile may be in what is asked for."""
     chosen: list[tuple[Path, _Node]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     tiles: int = 0
@@ -138,8 +159,10 @@ class _Walk:
         self.tiles += 1
         if self.tiles > _MOST_TILES:
             raise AssetError(
-                f"{self.path} has more than {_MOST_TILES} tiles; ask for a larger geometric error"
+                f"{self.path} has more than {_MOST_TILES} tiles; ask for a box or a larger geometric error"
             )
+        if not self.within(node):
+            return True
         files, outer = [], list[_Node]()
         for uri in node.uris:
             file = beside(node.chain[-1].parent, uri, node.chain[-1], self.path.parent)
@@ -191,7 +214,15 @@ def _explicit(
     uris = tuple(each.uri or each.url for each in found)
     if tile.implicit_tiling is not None:
         implicit = _ImplicitTiles(
-            top, tile.implicit_tiling, uris, tile.geometric_error, chain, matrix, adds, turn
+            top,
+            tile.implicit_tiling,
+            uris,
+            tile.geometric_error,
+            chain,
+            matrix,
+            adds,
+            turn,
+            tile.bounding_volume,
         )
         return implicit.root()
     return _Node(
@@ -202,6 +233,7 @@ def _explicit(
         lambda: [_explicit(top, child, chain, matrix, adds, turn) for child in tile.children],
         chain,
         turn,
+        tile.bounding_volume,
     )
 
 
@@ -217,6 +249,7 @@ class _ImplicitTiles:
     matrix: Float64Array
     adds: bool
     turn: Float64Array
+    volume: _Volume
 
     @property
     def axes(self) -> int:
@@ -230,6 +263,23 @@ class _ImplicitTiles:
         """Put level and place into a template of URIs."""
         values = {"level": level, **dict(zip("xyz", place, strict=False))}
         return re.sub(r"\{(level|x|y|z)\}", lambda found: str(values[found[1]]), template)
+
+    def part(self, level: int, place: tuple[int, ...]) -> _Volume:
+        """Volume of a tile."""
+        parts = np.array([2.0**level] * self.axes + [1.0] * (3 - self.axes))
+        at = np.array([*place, 0.0][:3])
+        if self.volume.region is not None:
+            region = np.array(self.volume.region)
+            low, high = region[[0, 1, 4]], region[[2, 3, 5]]
+            size = (high - low) / parts
+            (west, south, bottom), (east, north, top) = low + at * size, low + (at + 1) * size
+            return _Volume(region=[west, south, east, north, bottom, top])
+        if self.volume.box is None:
+            return self.volume
+        numbers = np.array(self.volume.box)
+        halves = numbers[3:].reshape(3, 3)
+        centre = numbers[:3] + ((2 * at + 1) / parts - 1) @ halves
+        return _Volume(box=[*centre, *(halves / parts[:, None]).reshape(-1)])
 
     def node(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> _Node:
         index = subtree.index(level, place)
@@ -246,6 +296,7 @@ class _ImplicitTiles:
             lambda: self.children(subtree, level, place),
             self.chain,
             self.turn,
+            self.part(level, place),
         )
 
     def children(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> list[_Node]:
@@ -370,11 +421,12 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
     """
     builder = SceneBuilder(path, request)
     builder.read(path)
-    walk, left_out = _Walk(path, request.error_m), dict[str, int]()
+    left_out: dict[str, int] = {}
     with reading(path, "a tileset of 3D Tiles"):
-        walk.choose(_root(path, path, (), np.eye(4), False))
-        tileset = msgspec.json.decode(contents(path), type=_Tileset)
-        origin = _origin(tileset.root)
+        root = _root(path, path, (), np.eye(4), False)
+        origin = _origin(root)
+        walk = _Walk(path, request.error_m, _within(request, origin))
+        walk.choose(root)
     builder.scene.notes += dict.fromkeys(walk.notes)
     to_scene: Callable[[Float64Array], Float64Array] | None = None
     for number, (file, node) in enumerate(walk.chosen, 1):
@@ -395,30 +447,55 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
     return builder.finish()
 
 
-def _origin(root: _Tile) -> Georeference | None:
-    """Place at the bottom of the root's volume, in its middle; None: that is not on the Earth."""
-    volume = root.bounding_volume
-    if volume.region is not None:
-        west, south, east, north, low, _ = volume.region
-        east += 2 * math.pi if east < west else 0.0
-        longitude, latitude = math.degrees((west + east) / 2), math.degrees((south + north) / 2)
-        longitude = (longitude + 180) % 360 - 180
-    else:
-        numbers = np.array(volume.box or volume.sphere or [0.0] * 4)
-        matrix = np.reshape(root.transform or np.eye(4), (4, 4)).T
-        centre = matrix[:3, :3] @ numbers[:3] + matrix[:3, 3]
-        if not _EARTH_M[0] < np.linalg.norm(centre) < _EARTH_M[1]:
-            return None
-        from pyproj import Transformer
+def _to_earth(degrees: Float64Array, heights: Float64Array) -> Float64Array:
+    """Longitudes and latitudes [°], and heights [m], in the Earth's axes [m], Shape ``[N, 3]``."""
+    from pyproj import Transformer
 
-        longitude, latitude, low = Transformer.from_crs(_ECEF, _WGS84, always_xy=True).transform(*centre)
-        if volume.box is not None:
-            lon, lat = math.radians(longitude), math.radians(latitude)
-            up = np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
-            low -= float(np.abs(up @ matrix[:3, :3] @ numbers[3:].reshape(3, 3).T).sum())
-    return Georeference(
-        latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7), altitude_m=round(low, 3)
+    return np.stack(
+        Transformer.from_crs(_WGS84, _ECEF, always_xy=True).transform(*degrees.T, heights), axis=-1
     )
+
+
+def _within(request: Request, origin: Georeference | None) -> Callable[[_Node], bool]:
+    """Test whether tiles reach into the box that is asked for: of a country's tiles no others are opened."""
+    there = request.origin or origin
+    box = request.box_m
+    if request.box_deg is not None and there is not None:
+        box = box_in_metres(request.box_deg, there)
+    if box is None:
+        return lambda node: True
+    to_scene = _to_scene(there) if origin is not None and there is not None else lambda points: points
+    low, high = np.array(box[:2]), np.array(box[2:])
+
+    def within(node: _Node) -> bool:
+        corners = to_scene(node.corners())[:, :2]
+        return bool(((corners.min(0) <= high) & (corners.max(0) >= low)).all())
+
+    return within
+
+
+def _to_scene(origin: Georeference) -> Callable[[Float64Array], Float64Array]:
+    from pyproj import Transformer
+
+    to_wgs84 = Transformer.from_crs(_ECEF, _WGS84, always_xy=True)
+    return lambda points: origin.places(np.stack(to_wgs84.transform(*points.T), axis=-1))
+
+
+def _origin(root: _Node) -> Georeference | None:
+    """Place at the bottom of the root's volume, in its middle; None: that is not on the Earth."""
+    corners = root.corners()
+    centre = corners.mean(0)
+    if not _EARTH_M[0] < np.linalg.norm(centre) < _EARTH_M[1]:
+        return None
+    from pyproj import Transformer
+
+    longitude, latitude, _ = Transformer.from_crs(_ECEF, _WGS84, always_xy=True).transform(*centre)
+    origin = Georeference(latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7))
+    if root.volume.region is not None:
+        low = root.volume.region[4]
+    else:
+        low = float(_to_scene(origin)(corners)[:, 2].min())
+    return msgspec.structs.replace(origin, altitude_m=round(low, 3))
 
 
 def _conversion(
@@ -431,8 +508,5 @@ def _conversion(
             "the tileset is not on the Earth: its axes are taken as east, north and up"
         )
         return lambda points: points
-    from pyproj import Transformer
-
-    to_wgs84 = Transformer.from_crs(_ECEF, _WGS84, always_xy=True)
-    builder.scene.origin = there = builder.request.origin or origin
-    return lambda points: there.places(np.stack(to_wgs84.transform(*points.T), axis=-1))
+    builder.scene.origin = builder.request.origin or origin
+    return _to_scene(builder.scene.origin)

@@ -66,7 +66,7 @@ class CameraSettings(SensorSettings, frozen=True, kw_only=True, forbid_unknown_f
 
 
 @dataclass(frozen=True, eq=False)
-class _Hits:
+class Hits:
     """Hits of the rays of a view, Shape ``[H·W]`` each."""
 
     distance: Float32Array
@@ -131,7 +131,7 @@ class CameraSensors(Sensors[CameraSettings]):
             products["camera"] = self._pictures(mi, traced, scene, views)
         # Both come of the same rays, one a pixel; pictures have more, and shadows.
         if self._demand.keys() & {"depth", "segmentation"}:
-            hits = [_first_hits(mi, traced, view) for view in views]
+            hits = [first_hits(mi, traced, view) for view in views]
             if "depth" in self._demand:
                 products["depth"] = self._depth(traced, views, hits)
             if "segmentation" in self._demand:
@@ -180,7 +180,7 @@ class CameraSensors(Sensors[CameraSettings]):
         colours = [shape_colour(shape, self.settings.colours) for shape in self.shapes]
         return np.array(colours).reshape(-1, 3)
 
-    def _depth(self, traced: TracedScene, views: list[View], hits: list[_Hits]) -> Depth:
+    def _depth(self, traced: TracedScene, views: list[View], hits: list[Hits]) -> Depth:
         of_face = traced.face_normals() if "normals" in self._demand["depth"] else None
         return Depth(
             images=tuple(
@@ -193,7 +193,7 @@ class CameraSensors(Sensors[CameraSettings]):
             )
         )
 
-    def _segmentation(self, traced: TracedScene, views: list[View], hits: list[_Hits]) -> Segmentation:
+    def _segmentation(self, traced: TracedScene, views: list[View], hits: list[Hits]) -> Segmentation:
         owners = [hit.owner for hit in hits]
         of_owner = list(traced.owner_names)
         names, index = visible_names(of_owner, owners)
@@ -217,11 +217,17 @@ class CameraSensors(Sensors[CameraSettings]):
         )
 
 
-def _first_hits(mi: Any, traced: TracedScene, view: View) -> _Hits:
-    """Hits of the rays through the centres of pixels."""
+def first_hits(mi: Any, traced: TracedScene, view: View) -> Hits:
+    """Find what the rays through the centres of pixels hit.
+
+    Args:
+        mi: Mitsuba, with the variant that is active.
+        traced: The scene for rays.
+        view: The camera.
+    """
     import drjit as dr
 
-    world = _ray_directions(view)
+    world = ray_directions(view)
     origin = np.repeat((np.array(view.pose.position) - traced.centre)[:, None], world.shape[1], axis=1)
     # Every value is an array, never a Python number: a number becomes part of the kernel, and
     # each new one makes a kernel to compile.
@@ -233,15 +239,15 @@ def _first_hits(mi: Any, traced: TracedScene, view: View) -> _Hits:
     # A ray that hits nothing has no face; 0 stands in, so that the tables can be read.
     face = np.where(found, faces.numpy(), 0).astype(np.int64)
     if not len(traced.face_owner):
-        return _Hits(distance, np.full(len(distance), NO_HIT, dtype=np.int32), face)
-    return _Hits(distance, np.where(found, traced.face_owner[face], np.int32(NO_HIT)), face)
+        return Hits(distance, np.full(len(distance), NO_HIT, dtype=np.int32), face)
+    return Hits(distance, np.where(found, traced.face_owner[face], np.int32(NO_HIT)), face)
 
 
 def _pixel_rays(view: View) -> Float64Array:
     return pixel_rays(view.device.width, view.device.height, view.optics)
 
 
-def _ray_directions(view: View) -> Float64Array:
+def ray_directions(view: View) -> Float64Array:
     """Unit vectors of a view's rays in world axes, Shape ``[3, H·W]``."""
     local = _pixel_rays(view)
     # Written out instead of a matrix product, whose rounding may depend on the BLAS and its threads.
@@ -253,7 +259,7 @@ def _ray_directions(view: View) -> Float64Array:
     )
 
 
-def _depths(view: View, hits: _Hits) -> Float32Array:
+def _depths(view: View, hits: Hits) -> Float32Array:
     """Distances along the optical axis [m], Shape ``[H·W]``; 0 where nothing is hit."""
     found = hits.owner != NO_HIT
     depth = np.zeros(len(found), dtype=np.float32)
@@ -262,13 +268,13 @@ def _depths(view: View, hits: _Hits) -> Float32Array:
     return depth
 
 
-def _normals(view: View, hits: _Hits, of_face: Float32Array) -> Float32Array:
+def _normals(view: View, hits: Hits, of_face: Float32Array) -> Float32Array:
     """Unit normals in world axes, Shape ``[H·W, 3]``; 0 where nothing is hit."""
     found = hits.owner != NO_HIT
     normals = np.zeros((len(found), 3), dtype=np.float32)
     normals[found] = of_face[hits.face[found]]
     # Meshes of scenery are often open sheets, of which either side may be seen.
-    away = np.einsum("ij,ji->i", normals, _ray_directions(view)) > 0
+    away = np.einsum("ij,ji->i", normals, ray_directions(view)) > 0
     normals[away] *= -1
     return normals
 
