@@ -599,8 +599,10 @@ class _Assembly:
 
     def _add(self, name: str, mesh: Mesh, material: str, kind: str, line: int = 0) -> None:
         self.made.pieces[name] = Piece(mesh, material, kind, self.path.name, line)
-        thickness = THICKNESS_M.get(material, 0.2)
-        self.made.materials.setdefault(material, RadioMaterial(material, thickness_m=thickness))
+        radio = RadioMaterial(material, thickness_m=THICKNESS_M.get(material, 0.2))
+        if kind == "foliage":  # is to waves what a channel says of its volume
+            radio = RadioMaterial(colour=(0.0, 0.25, 0.0))
+        self.made.materials.setdefault(material, radio)
 
     def _lowest(self, shape: Geometry) -> float:
         """Height of the lowest ground under a shape [m]."""
@@ -657,10 +659,13 @@ class _Assembly:
             ground = self._lowest(element.shape)
             high = self._height(element.tags, least=1.0) or TREE_M[0]
             self._add(
-                f"foliage-wood-{index}", prism(element.shape, ground, ground + high).mesh, "wood", "foliage"
+                f"foliage-wood-{index}",
+                prism(element.shape, ground, ground + high).mesh,
+                "foliage",
+                "foliage",
             )
         if crowns:
-            self._add("foliage-trees", joined(list(crowns.values())), "wood", "foliage")
+            self._add("foliage-trees", joined(list(crowns.values())), "foliage", "foliage")
 
     def _add_ground(self) -> None:
         """Level ground below all pieces, and water in it."""
