@@ -516,3 +516,17 @@ def test_any_scene_is_cut_to_a_box() -> None:
     assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
     with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
         cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))
+
+
+def test_netconvert_that_fails_is_named_with_its_last_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sumo = pytest.importorskip("sumo")
+    program = tmp_path / "bin" / "netconvert"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\necho 'Error: no edges left' >&2\nexit 1\n")
+    program.chmod(0o755)
+    (tmp_path / "data").symlink_to(Path(sumo.SUMO_HOME) / "data")
+    monkeypatch.setattr(sumo, "SUMO_HOME", str(tmp_path))
+    with pytest.raises(AssetError, match="netconvert makes no network of the roads: Error: no edges left"):
+        read_source(town().write(tmp_path / "town.osm"), Request(origin=HERE))
