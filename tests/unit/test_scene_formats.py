@@ -238,7 +238,7 @@ def test_dxf_with_every_kind_of_faces(tmp_path: Path) -> None:
     low = read.pieces["tower"].mesh.vertices.min(0) / foot
     np.testing.assert_allclose(low, [49, 60, 0], atol=1e-9)
     assert read.materials[read.pieces["brick-houses"].material].itu_material == "brick"
-    assert "1 LWPOLYLINE without faces: left out" in read.notes
+    assert "1 entities without faces (LWPOLYLINE): left out" in read.notes
 
 
 @pytest.mark.parametrize(

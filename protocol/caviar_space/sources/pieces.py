@@ -346,7 +346,8 @@ class SceneBuilder:
         """
         scene, pieces = self.scene, self.scene.pieces
         if not pieces:
-            raise AssetError(f"{self._path} holds no surface; export it with faces")
+            said = "".join(f"; {note}" for note in scene.notes if note.endswith("left out"))[:200]
+            raise AssetError(f"{self._path} holds no surface{said}; export it with faces")
         if self._dropped:
             scene.notes.append(f"{self._dropped} triangles have no area: left out")
         if self._assumed:
