@@ -1,7 +1,7 @@
 """Faults of a scene's geometry that rays meet: found, counted, and named with their places.
 
-Corners nearer than `WELD_M` are one. A part is what hangs together by edges' corners within a piece: of a
-mesh that holds a whole quarter, one house.
+Corners in one cell of a grid of `WELD_M` are one. A part is what hangs together by corners within a piece: of
+a mesh that holds a whole quarter, one house.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from caviar_space.vectors import cross
 from caviar_space.walls import overlapping_pieces, planes_of, solid_wall
 
 WELD_M = 1e-4
-"""Corners this near are one [m]."""
+"""Grid of corners that are one [m]."""
 THIN_M = 0.5
 """Closed bodies up to this thickness are walls [m]."""
 SLIVER_M = 1e-3
@@ -50,7 +50,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind("thin closed wall", "with refraction, waves cross two slabs in place of one",
-             'repair folds it, or walls = "solid" of the channel', wrong=True),
+             'repair folds it, or solid_walls_m of the channel', wrong=True),
         Kind("duplicate face", "with refraction, a slab more is crossed; reflections are drawn among both",
              "repair drops it", wrong=True),
         Kind("overlapping materials", "waves meet the first piece's material alone",
@@ -94,8 +94,8 @@ class Parts:
         self.piece: Int64Array = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         """Number of the piece of each triangle, Shape ``[F]``."""
         grid = np.round(self.triangles.reshape(-1, 3) / WELD_M).astype(np.int64)
-        points, corner = np.unique(grid, axis=0, return_inverse=True)
-        self.points: Float64Array = (points * WELD_M).astype(np.float64)
+        points, origin, corner = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+        self.points: Float64Array = self.triangles.reshape(-1, 3)[origin]
         """Corners [m], Shape ``[V, 3]``."""
         self.corner: Int64Array = corner.reshape(-1, 3)
         """Numbers of the corners of each triangle, equal in all pieces, Shape ``[F, 3]``."""

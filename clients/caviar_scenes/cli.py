@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 import sys
+from dataclasses import astuple
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -214,6 +215,40 @@ def check_command(
         else f"{len(faults)} faults, none of which makes received powers wrong",
     )
     raise typer.Exit(bool(wrong))
+
+
+@app.command("repair")
+def repair_command(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="folder of the repaired scene, which is made")],
+    thin_m: Annotated[
+        float,
+        typer.Option("--thin-m", min=0.0, help="closed plates up to this become sheets [m]; 0: none"),
+    ] = 0.5,
+    union: Annotated[
+        bool, typer.Option("--union", help="unite closed bodies of one material that overlap")
+    ] = False,
+) -> None:
+    """Repair a scene: weld, drop slivers and duplicates, turn bodies, fold walls; print what changed."""
+    from rich.table import Table
+
+    from caviar_scenes.opened import open_scene, write_changed
+    from caviar_scenes.repairs import repair
+
+    opened, console = open_scene(scene), Console()
+    done, changes = repair(opened, thin_m, union)
+    said = f"repaired by caviar scene repair: {len(changes)} pieces changed"
+    write_changed(opened, done, out, {}, said)
+    table = Table("piece", "triangles", "area m²", "volume m³", "what")
+    for change in changes:
+        before, after = change.before, change.after
+        pairs = zip(astuple(before), astuple(after), strict=True)
+        table.add_row(change.piece, *(f"{a:.6g} → {b:.6g}" for a, b in pairs), ", ".join(change.what))
+    if changes:
+        console.print(table)
+    print_line(
+        console, f"{out}: {len(changes)} of {len(opened.meshes)} pieces changed; materials as they were"
+    )
 
 
 @app.command("look")

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_space.meshes import Mesh
+from caviar_space.mesh_detail import piece_numbers
+from caviar_space.meshes import Mesh, joined
 from caviar_space.planes import PlaneTable, is_closed, plane_numbers, plane_numbers_of, shared_planes
 from caviar_space.vectors import cross
 
@@ -185,3 +186,29 @@ def solid_wall(mesh: Mesh, most: float) -> tuple[Mesh, float] | None:
     inwards = -np.sign(np.einsum("fx,fx->", a, areas)) * normal * thickness / 2
     used, faces = np.unique(mesh.faces[number == largest], return_inverse=True)
     return Mesh(mesh.vertices[used] + inwards, faces.reshape(-1, 3).astype(np.int32)), thickness
+
+
+def solid_walls(mesh: Mesh, most: float) -> list[tuple[Mesh, float | None]]:
+    """Replace the plates of a mesh by their middle sheets (`solid_wall`).
+
+    Args:
+        mesh: Any; its parts hang together by common corners.
+        most: Thickness of a plate at most [m].
+
+    Returns:
+        Meshes with the thickness of their walls [m], to 0.1 mm; None: of what is no plate, which comes first.
+    """
+    part = piece_numbers(mesh)
+    sheets: dict[float, list[Mesh]] = {}
+    rest = np.ones(len(part), np.bool_)
+    for number in range(int(part.max(initial=-1)) + 1):
+        chosen = part == number
+        used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+        found = solid_wall(Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)), most)
+        if found is not None:
+            sheets.setdefault(round(found[1], 4), []).append(found[0])
+            rest[chosen] = False
+    made: list[tuple[Mesh, float | None]] = [(joined(of), thickness) for thickness, of in sheets.items()]
+    if not sheets:
+        return [(mesh, None)]
+    return [(Mesh(mesh.vertices, mesh.faces[rest]), None), *made] if rest.any() else made

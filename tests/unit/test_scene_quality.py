@@ -15,6 +15,7 @@ from caviar_scenes.checks import KINDS, check
 from caviar_scenes.cli import app
 from caviar_scenes.look import look
 from caviar_scenes.opened import open_scene
+from caviar_scenes.repairs import repair
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, write_scene
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.mitsuba_xml import RadioMaterial
@@ -86,6 +87,37 @@ def test_a_planted_fault_is_found_and_named(kind: str, tmp_path: Path) -> None:
     low, high = np.ptp(PLANTED[kind][name][0].vertices, axis=0), np.array(faults[0]["place"])
     assert (np.abs(high - PLANTED[kind][name][0].vertices.mean(0)) <= low / 2 + 0.01).all()
     assert found.exit_code == KINDS[kind].wrong
+
+
+@pytest.mark.parametrize(
+    "kind", ["thin closed wall", "duplicate face", "mixed normals", "inside out", "sliver"]
+)
+def test_a_fault_is_repaired_and_nothing_else_changes(kind: str, tmp_path: Path) -> None:
+    without = "house" if kind == "duplicate face" else ""
+    folder = town(tmp_path, PLANTED[kind], without)
+    done = CliRunner().invoke(app, ["repair", str(folder), "--out", str(tmp_path / "better")])
+    assert done.exit_code == 0, done.output
+    before, after = open_scene(str(folder)), open_scene(str(tmp_path / "better"))
+    assert not check(after)
+    (name,) = PLANTED[kind]
+    for other in before.meshes.keys() - {name}:
+        one, same = before.meshes[other], after.meshes[other]
+        assert np.array_equal(one.vertices[one.faces], same.vertices[same.faces])
+    if kind == "thin closed wall":
+        shape = after.shapes[name]
+        assert shape.radio is not None
+        assert 'name="thickness" value="0.2"' in shape.radio.xml
+        assert np.unique(after.meshes[name].vertices[:, 1]) == pytest.approx([5.1])
+
+
+def test_overlapping_bodies_of_one_material_are_united(tmp_path: Path) -> None:
+    wing = box((0.0, 8.0), (5.0, 30.0), (0.0, 6.0))
+    scene = open_scene(str(town(tmp_path, {"wing": (wing, "concrete")})))
+    done, changes = repair(scene, union=True)
+    assert not done["wing"]
+    (change,) = (change for change in changes if change.piece == "house")
+    assert change.after.volume_m3 == pytest.approx(8 * 30 * 6, rel=1e-5)
+    assert len(done["neighbour"]) == len(done["chimney"]) == 1
 
 
 def test_a_clean_town_has_no_fault(tmp_path: Path) -> None:

@@ -93,7 +93,8 @@ def closed_walls(shapes: Sequence[Shape], face: Int64Array, transparent: Collect
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     note = (
         f"{WARNING}{name!r}{more} is a closed wall, {apart:.3g} m between its faces: each face is a slab of "
-        f"{thickness:g} m of {material!r}, so that waves cross two slabs; make it one open sheet"
+        f"{thickness:g} m of {material!r}, so that waves cross two slabs; set solid_walls_m, or make it one "
+        "open sheet"
     )
     return (note,)
 
