@@ -238,7 +238,7 @@ def test_dxf_with_every_kind_of_faces(tmp_path: Path) -> None:
     low = read.pieces["tower"].mesh.vertices.min(0) / foot
     np.testing.assert_allclose(low, [49, 60, 0], atol=1e-9)
     assert read.materials[read.pieces["brick-houses"].material].itu_material == "brick"
-    assert "1 LWPOLYLINE without faces: left out" in read.notes
+    assert "1 entities without faces (LWPOLYLINE): left out" in read.notes
 
 
 @pytest.mark.parametrize(
@@ -311,18 +311,21 @@ def test_cityjson_has_the_areas_and_volumes_of_its_polygons(shared_data: Path, n
 
     read = read_source(file)
 
-    if epsg:
-        assert read.origin is not None
+    city = json.loads(file.read_text())
+    source = np.array(city["vertices"]) * city["transform"]["scale"] + city["transform"]["translate"]
+
+    def to_scene(points: Float64Array) -> Float64Array:
+        if read.origin is None:
+            return points - np.floor(source.min(0))
         middle = f"+lat_0={read.origin.latitude_deg} +lon_0={read.origin.longitude_deg}"
-        frame = f"+proj=tmerc {middle} +k=1 +datum=WGS84"
-        crs = pyproj.Transformer.from_crs(epsg, pyproj.CRS(frame), always_xy=True)
-        expected = independent(
-            file, lambda points: np.stack([*crs.transform(*points.T[:2]), points[:, 2]], -1)
-        )
-    else:
-        city = json.loads(file.read_text())
-        low = np.array(city["vertices"]).min(0) * city["transform"]["scale"] + city["transform"]["translate"]
-        expected = independent(file, lambda points: points - np.floor(low))
+        frame = pyproj.CRS(f"+proj=tmerc {middle} +k=1 +datum=WGS84")
+        crs = pyproj.Transformer.from_crs(epsg, frame, always_xy=True)
+        return np.stack([*crs.transform(*points.T[:2]), points[:, 2]], axis=-1)
+
+    assert (read.origin is None) == (epsg == 0)
+    expected = independent(file, to_scene)
+    here = to_scene(source)
+    np.testing.assert_allclose(bounds(read), [here.min(0), here.max(0)], atol=1e-3)
     got = {key.split("-", 1)[1]: value for key, value in measured(read).items()}
     assert len(got) == len(read.pieces) == len(expected)
     keys = [
@@ -646,4 +649,4 @@ def test_mitsuba_with_what_blender_and_people_write(tmp_path: Path) -> None:
     assert (materials["box"].thickness_m, materials["box"].scattering_coefficient) == (0.3, 0.4)
     assert [materials[name].itu_material for name in ("l", "pane", "cube")] == ["brick", "glass", "brick"]
     assert materials["cube"].colour == (0.5, 0.25, 0)
-    assert "s.xml: 'nothing' has no faces: left out" in read.notes
+    assert "without faces: 'nothing' of s.xml: left out" in read.notes

@@ -197,19 +197,18 @@ def _projection(
     flat = whole.sub_crs_list[0] if whole.sub_crs_list else whole
     up = whole.axis_info[2].unit_conversion_factor if len(whole.axis_info) > 2 else 1.0
     to_wgs84 = Transformer.from_crs(flat, CRS.from_epsg(4326), always_xy=True)
+    x, y = (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
+    longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
     if builder.request.origin is not None:
         origin = msgspec.structs.replace(builder.request.origin, projection="tmerc")
     else:
-        x, y = (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
-        longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
         origin = Georeference(
             latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7), projection="tmerc"
         )
     builder.scene.origin = origin
-    if to_wgs84.accuracy > 0.1:
-        builder.scene.notes.append(
-            f"{flat.name} to WGS84 by {to_wgs84.description}, accurate to {to_wgs84.accuracy:g} m"
-        )
+    way = to_wgs84.get_last_used_operation()
+    known = f"accurate to {way.accuracy:g} m" if way.accuracy >= 0 else "of unknown accuracy"
+    builder.scene.notes.append(f"{way.description}: {known}")
 
     def to_scene(points: Float64Array) -> Float64Array:
         longitude, latitude = to_wgs84.transform(points[:, 0], points[:, 1])

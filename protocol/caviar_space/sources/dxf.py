@@ -5,7 +5,7 @@ Cadmapper's and other programs' drawings of towns; units are those that the draw
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ def read_dxf(path: Path, request: Request) -> ImportedScene:
     with reading(path, "DXF"):
         import ezdxf
         from ezdxf import units
-        from ezdxf.disassemble import recursive_decompose
 
         drawing = ezdxf.readfile(path)
         if drawing.units:
@@ -44,17 +43,19 @@ def read_dxf(path: Path, request: Request) -> ImportedScene:
         left_out: dict[str, int] = {}
         if (count := _expanded(drawing, drawing.modelspace(), {})) > _MOST_ENTITIES:
             raise ValueError(f"blocks expand to {count} entities: at most {_MOST_ENTITIES} are read")
-        for entity in recursive_decompose(drawing.modelspace()):
-            before = len(polygons := layers.setdefault(entity.dxf.layer, []))
-            polygons += (polygon * metre for polygon in _polygons(entity, metre))
-            if len(polygons) == before:
+        for entity in _without_blocks(drawing.modelspace()):
+            polygons = [polygon * metre for polygon in _polygons(entity, metre)]
+            if polygons:
+                layers.setdefault(entity.dxf.layer, []).extend(polygons)
+            else:
                 left_out[entity.dxftype()] = left_out.get(entity.dxftype(), 0) + 1
         for number, (layer, polygons) in enumerate(layers.items(), 1):
-            if polygons:
-                vertices, faces = joined_triangles([[polygon] for polygon in polygons])
-                kind, material = slug(layer) or "layer", builder.material(layer)
-                builder.add(layer, vertices, faces, material, kind, path, number)
-        builder.note_left_out({f"{kind} without faces": count for kind, count in left_out.items()})
+            vertices, faces = joined_triangles([[polygon] for polygon in polygons])
+            kind, material = slug(layer) or "layer", builder.material(layer)
+            builder.add(layer, vertices, faces, material, kind, path, number)
+        kinds = ", ".join(sorted(left_out))[:100]
+        if kinds:
+            builder.note_left_out({f"entities without faces ({kinds})": sum(left_out.values())})
     return builder.finish()
 
 
@@ -69,6 +70,17 @@ def _expanded(drawing: Any, layout: Any, known: dict[str, int]) -> int:
                 known[name] = _expanded(drawing, drawing.blocks[name], known)
             count += entity.mcount * known[name]
     return count
+
+
+def _without_blocks(entities: Iterable[Any]) -> Iterator[Any]:
+    """Entities, in place of blocks those that they hold; dimensions stay, whose arrows are faces."""
+    for entity in entities:
+        if entity.dxftype() != "INSERT":
+            yield entity
+        elif entity.mcount > 1:
+            yield from _without_blocks(entity.multi_insert())
+        else:
+            yield from _without_blocks(entity.virtual_entities())
 
 
 def _polygons(entity: Any, metre: float) -> Iterator[Float64Array]:

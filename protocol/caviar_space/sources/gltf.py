@@ -192,7 +192,6 @@ class Gltf:
                 continue
             mesh = at(document.meshes, node.mesh, "mesh")
             name = node.name or mesh.name or f"node-{index}"
-            instances = self._instances(node)
             for primitive in mesh.primitives:
                 if (read := self._triangles(primitive)) is None:
                     continue
@@ -204,9 +203,8 @@ class Gltf:
                 if pbr is not None:
                     red, green, blue = (min(max(part, 0.0), 1.0) for part in pbr.base_color_factor[:3])
                     colour = red, green, blue
-                for number, instance in enumerate(instances):
-                    called = f"{name}-{number}" if len(instances) > 1 else name
-                    yield Surface(called, *moved(here @ instance, *read), material.name, colour)
+                for instance in self._instances(node):
+                    yield Surface(name, *moved(here @ instance, *read), material.name, colour)
 
     def _triangles(self, primitive: _Primitive) -> tuple[Float64Array, Int64Array] | None:
         if primitive.mode not in (4, 5, 6):
@@ -234,21 +232,20 @@ class Gltf:
             faces[:, 0] = corners[0]
         return vertices, faces
 
-    def _instances(self, node: _Node) -> list[Float64Array]:
+    def _instances(self, node: _Node) -> Iterator[Float64Array]:
         """Transforms of the instances of a node (EXT_mesh_gpu_instancing)."""
         attributes = node.extensions.get("EXT_mesh_gpu_instancing", {}).get("attributes")
         if not attributes:
-            return [np.eye(4)]
+            yield np.eye(4)
+            return
         read = {
-            name: self._values(attributes[name], width)
+            name.lower(): self._values(attributes[name], width)
             for name, width in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3))
             if name in attributes
         }
-        count = len(next(iter(read.values()), ()))
-        return [
-            _matrix(msgspec.convert({name.lower(): rows[i].tolist() for name, rows in read.items()}, _Node))
-            for i in range(count)
-        ]
+        for rows in zip(*read.values(), strict=True):
+            given = {name: row.tolist() for name, row in zip(read, rows, strict=True)}
+            yield _matrix(msgspec.convert(given, _Node))
 
     def _values(self, index: int, width: int) -> Float64Array:
         """Numbers of an accessor, Shape ``[count, width]``."""

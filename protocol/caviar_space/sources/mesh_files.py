@@ -54,10 +54,8 @@ def wavefront(file: Path) -> Wavefront:
                 case ["v", *numbers]:
                     x, y, z = (float(number) for number in numbers[:3])
                     vertices.append([x, y, z])
-                case ["f", *corners]:
-                    if len(corners) < 3:
-                        raise ValueError(f"a face of {len(corners)} corners")
-                    indices = [_index(corner, len(vertices)) for corner in corners]
+                case ["f", _, _, _, *_]:
+                    indices = [_index(corner, len(vertices)) for corner in words[1:]]
                     of, sizes = polygons.setdefault((name, material), ([], []))
                     of += indices
                     sizes.append(len(indices))
@@ -67,8 +65,10 @@ def wavefront(file: Path) -> Wavefront:
                     material = " ".join(given)
                 case ["mtllib", *given]:
                     found.libraries.append(" ".join(given))
-                case ["p" | "l" | "curv" | "surf" as what, *_]:
-                    called = {"p": "points", "l": "lines"}.get(what, "curved surfaces")
+                case ["p" | "l" | "f" | "curv" | "surf" as what, *_]:
+                    called = {"p": "points", "l": "lines", "f": "faces of fewer than three corners"}.get(
+                        what, "curved surfaces"
+                    )
                     found.left_out[called] = found.left_out.get(called, 0) + 1
     with reading(file, "OBJ"):
         found.vertices = np.array(vertices, np.float64).reshape(-1, 3)

@@ -238,6 +238,7 @@ class SceneBuilder:
         self._path = path
         self._assumed: dict[str, str] = {}
         self._dropped = self._triangles = 0
+        self._empty: list[str] = []
 
     def itu(self, name: str) -> str:
         """Material in ITU-R P.2040 by the name that the source gives; what that does not say is noted."""
@@ -294,12 +295,12 @@ class SceneBuilder:
             AssetError: A coordinate is not finite or too large, or a corner is no vertex.
         """
         said = f"{file}: {name!r}"
-        self._triangles += len(faces)
+        self._triangles += max(len(faces), 1)
         if self._triangles > _MOST_TRIANGLES:
             raise AssetError(f"{self._path} has more than {_MOST_TRIANGLES} triangles; import it in parts")
         corners = np.asarray(faces, np.int64).reshape(-1, 3)
         if not len(corners):
-            self.scene.notes.append(f"{file.name}: {name!r} has no faces: left out")
+            self._empty.append(f"{name!r} of {file.name}")
             return
         if not 0 <= corners.min() <= corners.max() < len(vertices):
             wrong = corners.max() if corners.max() >= len(vertices) else corners.min()
@@ -345,14 +346,16 @@ class SceneBuilder:
             AssetError: It holds no piece.
         """
         scene, pieces = self.scene, self.scene.pieces
+        if self._empty:
+            scene.notes.append(f"without faces: {_shortened(self._empty)}: left out")
         if not pieces:
-            raise AssetError(f"{self._path} holds no surface; export it with faces")
+            said = "".join(f"; {note}" for note in scene.notes if note.endswith("left out"))[:200]
+            raise AssetError(f"{self._path} holds no surface{said}; export it with faces")
         if self._dropped:
             scene.notes.append(f"{self._dropped} triangles have no area: left out")
         if self._assumed:
-            said = ", ".join(f"{name} {itu}" for name, itu in sorted(self._assumed.items())[:12])
-            more = f" and {len(self._assumed) - 12} more" if len(self._assumed) > 12 else ""
-            scene.notes.append(f"materials by names of the source: {said}{more}")
+            assumed = [f"{name} {itu}" for name, itu in sorted(self._assumed.items())]
+            scene.notes.append(f"materials by names of the source: {_shortened(assumed)}")
         low = np.floor(np.min([piece.mesh.vertices.min(0) for piece in pieces.values()], axis=0))
         high = np.max([piece.mesh.vertices.max(0) for piece in pieces.values()], axis=0)
         if scene.origin is None and (about_corner or max(-low.min(), high.max()) > _NEAR_M):
@@ -372,3 +375,7 @@ class SceneBuilder:
         data = contents(file)
         self.scene.sources.append(source_of(file))
         return data
+
+
+def _shortened(names: list[str]) -> str:
+    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")

@@ -495,7 +495,7 @@ def _origin(root: _Node) -> Georeference | None:
         low = root.volume.region[4]
     else:
         low = float(_to_scene(origin)(corners)[:, 2].min())
-    return msgspec.structs.replace(origin, altitude_m=round(low, 3))
+    return msgspec.structs.replace(origin, altitude_m=round(low, 3) + 0.0)
 
 
 def _conversion(
