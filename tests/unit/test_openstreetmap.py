@@ -17,7 +17,7 @@ from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, cut_to_box
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.sources import Request, read_source
-from caviar_space.sources.openstreetmap import metres
+from caviar_space.sources.map_files import metres
 from caviar_space.volumes import outward
 
 pytest.importorskip("osmium")

@@ -27,7 +27,7 @@ from caviar_protocol.host import install_command
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import Georeference
-    from caviar_space.sources.openstreetmap import Way
+    from caviar_space.sources.map_files import Way
 
 NET = "sumo/net.net.xml"
 """Path of the network in the folder of a scene."""
