@@ -63,7 +63,7 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
                       f"{_SOURCES}.openstreetmap:read_map"),
     "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
-    "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
+    "cityjson": ((".city.json", ".json", ".jsonl"), f"{_SOURCES}.cityjson:read_cityjson"),
     "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
     "obj": ((".obj",), f"{_SOURCES}.mesh_files:read_obj"),
     "ply": ((".ply",), f"{_SOURCES}.mesh_files:read_ply_scene"),
