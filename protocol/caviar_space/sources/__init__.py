@@ -125,4 +125,11 @@ def _format_of(path: Path) -> str:
         for end in ends
         if any(name.endswith(end) for name in names)
     ]
-    return max(fitting, default=(0, ""))[1]
+    found = max(fitting, default=(0, ""))[1]
+    if found == "cityjson" and path.is_file():  # .json says little
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+        for word, form in ((b'"geometricError"', "3d-tiles"), (b'"FeatureCollection"', "openstreetmap")):
+            if word in head:
+                return form
+    return found
