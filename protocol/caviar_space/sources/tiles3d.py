@@ -166,7 +166,7 @@ class _Walk:
         self.tiles += 1
         if self.tiles > _MOST_TILES:
             raise AssetError(
-                f"{node.chain[0]} has more than {_MOST_TILES} tiles; ask for a box or a larger geometric error"
+                f"{node.chain[0]} has more than {_MOST_TILES} tiles; ask for a box or a larger error"
             )
         if not self.within(node):
             return True
