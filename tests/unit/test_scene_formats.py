@@ -405,6 +405,18 @@ def test_cityjson_levels_holes_semantics_and_templates(tmp_path: Path) -> None:
     assert {"1 ClosureSurface: left out", "1 MultiLineString: left out"} <= set(read.notes)
     coarse = read_source(tmp_path / "a.city.json", Request(lod="1"))
     assert set(coarse.pieces) == {"building-house", "building-block", "road-way"}
+    # The same as lines of features, of which each has vertices of its own.
+    first = json.dumps(city | {"CityObjects": {}, "vertices": []})
+    features = [
+        json.dumps({"type": "CityJSONFeature", "CityObjects": {name: thing}, "vertices": SQUARE["vertices"]})
+        for name, thing in city["CityObjects"].items()
+        if name in ("house", "bench")
+    ]
+    (tmp_path / "a.city.jsonl").write_text("\n".join([first, *features]))
+    lines = read_source(tmp_path / "a.city.jsonl", Request(materials={"WallSurface": "brick"}))
+    assert {name: value for name, value in measured(read).items() if "house" in name or "bench" in name} == (
+        measured(lines)
+    )
     with pytest.raises(AssetError, match=r"has no level of detail '3'; it has: .*1, 1\.2, 2\.2"):
         read_source(tmp_path / "a.city.json", Request(lod="3"))
 
