@@ -265,7 +265,7 @@ class Answers:
                 "there is no radio map beside the recording; make one with: caviar plot map RUN"
             )
         try:
-            with np.load(file, allow_pickle=False) as found:
+            with file.open("rb") as opened, np.load(opened, allow_pickle=False) as found:
                 x, y, z = (found[name].astype(float) for name in ("x", "y", "z"))
                 gain = np.where(np.isnan(found["gain"]), -np.inf, found["gain"]).max(0).astype(float)
         except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
