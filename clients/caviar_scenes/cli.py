@@ -1,4 +1,4 @@
-"""``caviar scene``: scenes of other programs are imported, and looked at with their traffic."""
+"""``caviar scene``: scenes are imported, checked, repaired, simplified, and looked at with their traffic."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 import sys
+from dataclasses import astuple
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -32,7 +33,7 @@ TEMPLATE = "new/imported.toml"
 
 @app.callback()
 def scenes() -> None:
-    """Scenes: import, picture."""
+    """Scenes: import, look, check, repair, simplify, picture."""
 
 
 @app.command("import")
@@ -169,6 +170,123 @@ def _named_materials(given: list[str], default: str) -> dict[str, str]:
                 f"material {value!r}; write NAME=MATERIAL; {suggestion(value, ITU_MATERIALS)}"
             )
     return {name: value for name, _, value in pairs}
+
+
+SceneArgument = Annotated[
+    str,
+    typer.Argument(help="folder of an imported scene, XML, sionna:NAME, or scenario", show_default=False),
+]
+
+
+@app.command("check")
+def check_command(
+    scene: SceneArgument,
+    thin_m: Annotated[
+        float, typer.Option("--thin-m", min=0.0, help="closed bodies up to this thickness are walls [m]")
+    ] = 0.5,
+    as_json: Annotated[bool, typer.Option("--json", help="print all faults, each with its place")] = False,
+) -> None:
+    """Check a scene for faults that rays meet; status 1 where received powers are wrong by one."""
+    from collections import Counter
+
+    from rich.table import Table
+
+    from caviar_scenes.checks import KINDS, check
+    from caviar_scenes.opened import open_scene
+
+    opened = open_scene(scene)
+    faults = check(opened, thin_m)
+    counts = Counter(fault.kind for fault in faults)
+    wrong = [kind for kind in counts if KINDS[kind].wrong]
+    if as_json:
+        sys.stdout.write(
+            msgspec.json.encode({"scene": opened.name, "wrong": wrong, "faults": faults}).decode()
+        )
+        sys.stdout.write("\n")
+        raise typer.Exit(bool(wrong))
+    console = Console()
+    table = Table("fault", "count", "where (first three) [m]", "effect on rays", "remedy")
+    for kind, count in counts.items():
+        where = [
+            f"{fault.piece} {fault.place}{f': {fault.note}' if fault.note else ''}"
+            for fault in [fault for fault in faults if fault.kind == kind][:3]
+        ]
+        table.add_row(kind, str(count), "\n".join(where), KINDS[kind].effect, KINDS[kind].remedy)
+    triangles = sum(len(mesh.faces) for mesh in opened.meshes.values())
+    print_line(console, f"{opened.name}: {len(opened.meshes)} pieces, {triangles} triangles")
+    if counts:
+        console.print(table)
+    print_line(
+        console,
+        f"received powers are wrong by: {', '.join(wrong)}"
+        if wrong
+        else f"{len(faults)} faults, none of which makes received powers wrong",
+    )
+    raise typer.Exit(bool(wrong))
+
+
+@app.command("repair")
+def repair_command(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="folder of the repaired scene, which is made")],
+    thin_m: Annotated[
+        float,
+        typer.Option("--thin-m", min=0.0, help="closed plates up to this become sheets [m]; 0: none"),
+    ] = 0.5,
+    union: Annotated[
+        bool, typer.Option("--union", help="unite closed bodies of one material that overlap")
+    ] = False,
+) -> None:
+    """Repair a scene: weld, drop slivers and duplicates, turn bodies, fold walls; print what changed."""
+    from rich.table import Table
+
+    from caviar_scenes.opened import open_scene, write_changed
+    from caviar_scenes.repairs import repair
+
+    opened, console = open_scene(scene), Console()
+    done, changes = repair(opened, thin_m, union)
+    said = f"repaired by caviar scene repair: {len(changes)} pieces changed"
+    write_changed(opened, done, out, {}, said)
+    table = Table("piece", "triangles", "area m²", "volume m³", "what")
+    for change in changes:
+        before, after = change.before, change.after
+        pairs = zip(astuple(before), astuple(after), strict=True)
+        table.add_row(change.piece, *(f"{a:.6g} → {b:.6g}" for a, b in pairs), ", ".join(change.what))
+    if changes:
+        console.print(table)
+    print_line(
+        console, f"{out}: {len(changes)} of {len(opened.meshes)} pieces changed; materials as they were"
+    )
+
+
+@app.command("look")
+def look_command(
+    scene: SceneArgument,
+    out: Annotated[Path | None, typer.Option(help="PNG that is written; by default none")] = None,
+) -> None:
+    """Look at a scene: extent, place on the Earth, materials with their frequencies, faults; a picture."""
+    from collections import Counter
+
+    from rich.table import Table
+
+    from caviar_scenes.checks import check
+    from caviar_scenes.look import draw, look
+    from caviar_scenes.opened import open_scene
+
+    opened, console = open_scene(scene), Console()
+    seen = look(opened)
+    for line in seen.lines:
+        print_line(console, line)
+    table = Table("material", "pieces", "triangles", "area m²", "thickness m", "ITU-R P.2040 defines it for")
+    for row in seen.materials:
+        table.add_row(*row)
+    console.print(table)
+    counts = Counter(fault.kind for fault in check(opened))
+    said = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    print_line(console, f"faults: {said or 'none'}" + "; see caviar scene check" * bool(said))
+    if out is not None:
+        draw(opened, out)
+        print_line(console, f"picture: {out}")
 
 
 @app.command("picture")

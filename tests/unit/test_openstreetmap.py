@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
 from caviar_protocol.errors import AssetError
-from caviar_space.imported_scenes import Georeference, ImportedScene
-from caviar_space.meshes import Mesh
+from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, cut_to_box
+from caviar_space.meshes import Mesh, box, joined
 from caviar_space.sources import Request, read_source
 from caviar_space.sources.openstreetmap import metres
 from caviar_space.volumes import outward
@@ -434,3 +434,85 @@ def test_damaged_heights_are_refused(name: str, tmp_path: Path) -> None:
         file.write_text("no heights")
     with pytest.raises(AssetError, match=name):
         read_heights(file)
+
+
+@pytest.mark.parametrize("source", ["overpass", "josm"])
+def test_nodes_may_come_last_and_numbers_be_negative(
+    source: str, tmp_path: Path, scene: ImportedScene
+) -> None:
+    root = town().root
+    if source == "overpass":
+        root[:] = sorted(root, key=lambda element: ("way", "relation", "node").index(element.tag))
+    else:
+        for element in root.iter():
+            for key in ("id", "ref"):
+                if key in element.attrib:
+                    element.set(key, f"-{element.get(key)}")
+    file = tmp_path / "town.osm"
+    ElementTree.ElementTree(root).write(file)
+    found = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0)))
+    assert found.pieces.keys() == scene.pieces.keys()
+    assert found.files.keys() == scene.files.keys()
+
+
+@pytest.mark.parametrize("form", ["osm", "osm.pbf", "geojson"])
+def test_maps_with_flipped_bytes_are_read_or_refused(form: str, tmp_path: Path) -> None:
+    """Twenty-five files, each with four bytes that are others, or cut: a scene, or an error by name."""
+    import osmium
+
+    made = MapFile()
+    made.block(0, 0, 20, 10, building="yes", height="9")
+    made.block(0, 30, 20, 10, building="yes", building__levels="3")
+    file = made.write(tmp_path / "whole.osm")
+    if form == "geojson":
+        square = [[24.94, 60.17], [24.941, 60.17], [24.941, 60.171], [24.94, 60.17]]
+        (tmp_path / "whole.geojson").write_bytes(feature({"type": "Polygon", "coordinates": [square]}))
+    elif form == "osm.pbf":
+        with osmium.SimpleWriter(str(tmp_path / "whole.osm.pbf")) as writer:
+            for thing in osmium.FileProcessor(str(file)):
+                writer.add(thing)
+    whole = (tmp_path / f"whole.{form}").read_bytes()
+    assert read_source(tmp_path / f"whole.{form}").pieces
+    rng = np.random.default_rng(3)
+    refused = 0
+    for number in range(25):
+        data = bytearray(whole)
+        for at in rng.integers(len(data), size=4):
+            data[at] ^= int(rng.integers(1, 256))
+        damaged = tmp_path / f"damaged.{form}"
+        damaged.write_bytes(data[: int(rng.integers(len(data)))] if number % 5 == 0 else data)
+        try:
+            found = read_source(damaged)
+        except AssetError as error:
+            refused += damaged.name in str(error)
+        else:
+            assert all(np.isfinite(piece.mesh.vertices).all() for piece in found.pieces.values())
+    assert refused > 5
+
+
+def test_any_scene_is_cut_to_a_box() -> None:
+    def piece(mesh: Mesh, kind: str) -> Piece:
+        return Piece(mesh, "concrete", kind, "town.obj", 1)
+
+    corners = [(-50.0, -50.0, 0.0), (90.0, -50.0, 0.0), (90.0, 90.0, 0.0)]
+    two = joined([box((0, 10), (0, 10), (0, 9)), box((40, 50), (0, 10), (0, 9))])  # one mesh, two buildings
+    scene = ImportedScene(name="town", pieces={
+        "ground": piece(Mesh(np.array(corners), np.array([[0, 1, 2]], np.int32)), "ground"),
+        "houses": piece(two, "building"),
+        "beyond": piece(box((60, 70), (0, 10), (0, 9)), "building"),
+        "edge": piece(box((24, 34), (0, 10), (0, 9)), "building"),  # its middle is within, its end is not
+        "wood": piece(box((-40, 60), (-40, 60), (0, 9)), "foliage"),
+    }, transmitters_m=[(0.0, 0.0, 5.0), (99.0, 0.0, 5.0)])  # fmt: skip
+    cut_to_box(scene, (-20.0, -20.0, 30.0, 30.0))
+    assert list(scene.pieces) == ["ground", "houses", "edge", "wood"]
+    assert volume(scene.pieces["houses"].mesh) == pytest.approx(900.0)
+    assert volume(scene.pieces["edge"].mesh) == pytest.approx(900.0)
+    assert volume(scene.pieces["wood"].mesh) == pytest.approx(90_000.0)  # a volume stays closed
+    ground = scene.pieces["ground"].mesh
+    inside = shapely.polygons(np.array(corners)[:, :2]) & shapely.box(-20, -20, 30, 30)
+    parts = shapely.polygons(ground.vertices[ground.faces][..., :2])
+    assert shapely.area(parts).sum() == pytest.approx(inside.area)
+    assert shapely.union_all(parts).symmetric_difference(inside).area < 1e-6
+    assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
+    with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
+        cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))

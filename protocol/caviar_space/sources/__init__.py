@@ -76,8 +76,8 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
 Of several ends that fit, the longest counts. A folder is of the first format of whose files it has some.
 """
 
-# Maps have more within the box than the triangles of it: roads.
-_CUT_THEMSELVES = ("openstreetmap",)
+# They have more within the box than triangles, roads, and no heights of the ground.
+_MAPS = ("openstreetmap",)
 
 
 def read_source(path: Path, request: Request | None = None, form: str = "") -> ImportedScene:
@@ -98,6 +98,8 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
     name = form or _format_of(path)
     if name not in READERS:
         raise AssetError(f"{path}: no format of scenes {name!r}; write --format: {', '.join(READERS)}")
+    if request.heights and name not in _MAPS:
+        raise AssetError(f"{path} has its own ground; heights are for maps: {', '.join(_MAPS)}")
     ends, reader_place = READERS[name]
     if path.is_dir() and name != "wireless-insite":
         files = sorted(file for file in path.iterdir() if file.name.lower().endswith(ends))
@@ -107,12 +109,13 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
         path = files[0]
     reader: Reader = resolve_name(reader_place)
     scene = reader(path, request)
+    scene.origin = scene.origin or request.origin
     box = request.box_m
     if request.box_deg:
         if scene.origin is None:
             raise AssetError(f"{path} has no place on the Earth; write --origin LAT,LON, or --box-m")
         box = box_in_metres(request.box_deg, scene.origin)
-    if box and name not in _CUT_THEMSELVES:
+    if box and name not in _MAPS:
         cut_to_box(scene, box)
     return scene
 

@@ -8,6 +8,7 @@ the network that SUMO's netconvert makes of the roads (`road_network`).
 from __future__ import annotations
 
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -137,8 +138,16 @@ def read_map(path: Path, request: Request) -> ImportedScene:
     read = _read_geojson if path.suffix.lower() in (".geojson", ".json") else _read_osm
     try:
         found = read(path)
+        if read is _read_osm and not found.areas and not found.roads and found.left_out.total():
+            # Overpass gives nodes after ways, and JOSM negative numbers: osmium finds no node then.
+            with tempfile.TemporaryDirectory(prefix="caviar-map-") as folder:
+                found = _read_osm(_in_order(path, Path(folder)))
     except OSError as error:
         raise AssetError(f"cannot read {path}: {error.strerror or error}") from error
+    except RuntimeError as error:
+        raise AssetError(
+            f"{path} cannot be put in order: {one_line(str(error))}; sort it by osmium"
+        ) from error
     return _Assembly(path, request, found).scene()
 
 
@@ -205,6 +214,26 @@ def _read_osm(path: Path) -> Map:
     return found
 
 
+def _in_order(path: Path, folder: Path) -> Path:
+    """A copy of a map with positive numbers, nodes before ways before relations."""
+    import osmium
+
+    with osmium.SimpleWriter(str(folder / "positive.osm.pbf")) as writer:
+        for thing in osmium.FileProcessor(str(path)):
+            if thing.is_node():
+                writer.add(thing.replace(id=abs(thing.id)))
+            elif thing.is_way():
+                writer.add(thing.replace(id=abs(thing.id), nodes=[abs(node.ref) for node in thing.nodes]))
+            else:
+                members = [(member.type, abs(member.ref), member.role) for member in thing.members]
+                writer.add(thing.replace(id=abs(thing.id), members=members))
+    merged = osmium.MergeInputReader()
+    merged.add_file(str(folder / "positive.osm.pbf"))
+    with osmium.SimpleWriter(str(folder / "ordered.osm.pbf")) as writer:
+        merged.apply(writer)
+    return folder / "ordered.osm.pbf"
+
+
 def _add_line(found: Map, number: int, tags: Mapping[str, str], nodes: Any) -> None:
     """Add a road or a row of trees, without nodes that the file has not."""
     import shapely
@@ -237,7 +266,7 @@ def _read_geojson(path: Path) -> Map:
 
     try:
         collection = msgspec.json.decode(path.read_bytes(), type=_Collection)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
         raise AssetError(
             f"{path} is no GeoJSON: {one_line(str(error))}; write a FeatureCollection"
         ) from error
