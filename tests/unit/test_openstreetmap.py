@@ -520,6 +520,7 @@ def test_any_scene_is_cut_to_a_box() -> None:
     assert shapely.area(parts).sum() == pytest.approx(inside.area)
     assert shapely.union_all(parts).symmetric_difference(inside).area < 1e-6
     assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
+    assert "1 of 5 pieces outside of the box: left out" in scene.notes
     with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
         cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))
 

@@ -269,7 +269,7 @@ def _write_roads(
 
 
 def _hits(net: ElementTree.Element, buildings: Any, solid: Any) -> Iterator[tuple[bool, Any]]:
-    """Whether a lane is one to walk on, and where it reaches into a building, for each that does [m]."""
+    """Find lanes that reach into buildings: whether each is one to walk on, and where it does [m]."""
     import shapely
 
     walked, lines, halves = list[bool](), list[Any](), list[float]()
