@@ -460,7 +460,7 @@ def test_nodes_may_come_last_and_numbers_be_negative(
     ElementTree.ElementTree(root).write(file)
     found = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0)))
     assert found.pieces.keys() == scene.pieces.keys()
-    assert found.files.keys() == scene.files.keys()
+    assert found.files == scene.files
 
 
 @pytest.mark.parametrize("form", ["osm", "osm.pbf", "geojson"])
