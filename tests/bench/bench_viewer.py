@@ -89,7 +89,7 @@ def settled_rate(url: str, process: subprocess.Popen[str]) -> float:
     while process.poll() is None:
         try:
             with urllib.request.urlopen(url.replace("/view/", "/status"), timeout=10) as answer:  # noqa: S310
-                marks.append((time.monotonic(), json.load(answer)["frame"]))
+                marks.append((time.monotonic(), json.load(answer)["frames_finished"]))
         except OSError:
             break
         time.sleep(0.5)

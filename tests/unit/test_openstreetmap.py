@@ -84,7 +84,7 @@ def town() -> MapFile:
     made.block(60, 20, 16, 8, building="house", height="10,5", roof__shape="gabled", roof__height="3",
                building__material="brick", roof__material="copper")  # fmt: skip
     made.block(60, 40, 10, 10, building="yes")
-    made.block(60, 60, 8, 8, building="roof")
+    made.block(60, 60, 8, 8, building="roof", roof__material="glass")
     made.block(-20, -60, 40, 30, natural="water")
     made.node(-5, 12, natural="tree", height="12")
     made.way((-80, 12), (-60, 12), natural="tree_row")
@@ -118,7 +118,6 @@ def volume(*meshes: Mesh) -> float:
         ("building-w1003", 10 * 10 * 9, 0.0, 9.0),  # what its part leaves
         ("building-w1004", 10 * 10 * 20, 0.0, 20.0),
         ("building-w1006", 10 * 10 * 10.5, 0.0, 10.5),  # the median of 9, 10.5 and 12
-        ("building-w1007", 8 * 8 * 0.3, 4.2, 4.5),  # a roof without walls
     ],
 )
 def test_bodies_have_the_heights_and_footprints_of_the_map(
@@ -127,6 +126,13 @@ def test_bodies_have_the_heights_and_footprints_of_the_map(
     mesh = scene.pieces[name].mesh
     assert (mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()) == pytest.approx((low, high))
     assert volume(mesh) == pytest.approx(solid_m3, rel=2e-3)  # OSM: 1e-7°
+
+
+def test_a_roof_without_walls_is_one_face(scene: ImportedScene) -> None:
+    mesh = scene.pieces["building-w1007"].mesh
+    assert scene.pieces["building-w1007"].material == "glass"
+    assert set(mesh.vertices[:, 2]) == {4.5}
+    assert len(mesh.faces) == 2
 
 
 def test_a_gable_stands_over_the_shorter_sides_and_has_its_own_material(scene: ImportedScene) -> None:
@@ -516,3 +522,17 @@ def test_any_scene_is_cut_to_a_box() -> None:
     assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
     with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
         cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))
+
+
+def test_netconvert_that_fails_is_named_with_its_last_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sumo = pytest.importorskip("sumo")
+    program = tmp_path / "bin" / "netconvert"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\necho 'Error: no edges left' >&2\nexit 1\n")
+    program.chmod(0o755)
+    (tmp_path / "data").symlink_to(Path(sumo.SUMO_HOME) / "data")
+    monkeypatch.setattr(sumo, "SUMO_HOME", str(tmp_path))
+    with pytest.raises(AssetError, match="netconvert makes no network of the roads: Error: no edges left"):
+        read_source(town().write(tmp_path / "town.osm"), Request(origin=HERE))

@@ -8,6 +8,7 @@ import random
 import re
 import shutil
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from scene_builders import SQUARE, b3dm, boxes, content, glb, surface, tile, tileset
 
-from caviar_protocol.errors import AssetError
+from caviar_protocol.errors import AssetError, SetupError
 from caviar_space.sources import READERS, read_source
 
 trimesh = pytest.importorskip("trimesh")
@@ -331,3 +332,29 @@ def test_file_that_would_do_harm_is_refused(
 def test_every_format_has_a_reader_for_its_files() -> None:
     ends = [end for ends, _ in READERS.values() for end in ends]
     assert len(ends) == len(set(ends))
+
+
+@pytest.mark.parametrize(
+    ("sample", "library"),
+    [("draco", "DracoPy"), ("dxf", "ezdxf"), ("cityjson", "shapely")],
+    indirect=["sample"],
+)
+def test_library_that_is_not_installed_is_named(
+    sample: Path, library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+
+    with pytest.raises(SetupError, match=rf"needs {library}, of the extra `scenes`; run: .*scenes"):
+        read_source(sample)
+
+
+def test_json_is_of_the_format_that_it_holds(originals: dict[str, Path], tmp_path: Path) -> None:
+    shutil.copytree(originals["3d-tiles"].parent, tmp_path / "tiles")
+    (tmp_path / "tiles" / "tileset.json").rename(tmp_path / "tiles" / "root.json")
+
+    assert read_source(tmp_path / "tiles" / "root.json").pieces
+    assert read_source(originals["3d-tiles"].parent).pieces  # the folder
+    for name in ("a", "b"):
+        shutil.copy(originals["glb"], tmp_path / f"{name}.glb")
+    with pytest.raises(AssetError, match=r"has 2 files of gltf \(a\.glb, b\.glb\); name one"):
+        read_source(tmp_path)

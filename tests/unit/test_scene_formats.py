@@ -340,6 +340,7 @@ def test_cityjson_has_the_areas_and_volumes_of_its_polygons(shared_data: Path, n
 
 
 def test_cityjson_levels_holes_semantics_and_templates(tmp_path: Path) -> None:
+    crown = [[[0, 2, 1]], [[0, 1, 8]], [[1, 2, 8]], [[2, 0, 8]]]
     whole, holed = [[0, 1, 2, 3]], [[0, 1, 2, 3], [4, 5, 6, 7]]
     kinds = {
         "surfaces": [{"type": "Window"}, {"type": "WallSurface"}, {"type": "ClosureSurface"}],
@@ -376,6 +377,8 @@ def test_cityjson_levels_holes_semantics_and_templates(tmp_path: Path) -> None:
                     }
                 ],
             },
+            "tree": {"type": "SolitaryVegetationObject", "geometry": [surface("Solid", "1", [crown])]},
+            "bush": {"type": "SolitaryVegetationObject", "geometry": [surface("Solid", "1", [crown[1:]])]},
             "way": {
                 "type": "Road",
                 "geometry": [surface("MultiSurface", "1", [whole]), surface("MultiLineString", "1", [])],
@@ -390,6 +393,8 @@ def test_cityjson_levels_holes_semantics_and_templates(tmp_path: Path) -> None:
 
     read = read_source(tmp_path / "a.city.json", Request(materials={"WallSurface": "brick"}))
 
+    tree = read.pieces.pop("foliage-tree")
+    assert (tree.kind, read.materials[tree.material].itu_material, len(tree.mesh.faces)) == ("foliage", "", 4)
     assert {key: area for key, (_, area) in measured(read).items()} == pytest.approx(
         {
             "building-house-glass": 16,
@@ -402,9 +407,23 @@ def test_cityjson_levels_holes_semantics_and_templates(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.pieces["city-furniture-bench"].mesh.vertices.max(0), [102, 52, 3])
     materials = {name: read.materials[piece.material].itu_material for name, piece in read.pieces.items()}
     assert (materials["road-way"], materials["building-part-part"]) == ("asphalt_concrete", "concrete")
-    assert {"1 ClosureSurface: left out", "1 MultiLineString: left out"} <= set(read.notes)
+    assert {"1 ClosureSurface: left out", "1 MultiLineString: left out", "1 open trees: left out"} <= set(
+        read.notes
+    )
     coarse = read_source(tmp_path / "a.city.json", Request(lod="1"))
-    assert set(coarse.pieces) == {"building-house", "building-block", "road-way"}
+    assert set(coarse.pieces) == {"building-house", "building-block", "road-way", "foliage-tree"}
+    # The same as lines of features, of which each has vertices of its own.
+    first = json.dumps(city | {"CityObjects": {}, "vertices": []})
+    features = [
+        json.dumps({"type": "CityJSONFeature", "CityObjects": {name: thing}, "vertices": SQUARE["vertices"]})
+        for name, thing in city["CityObjects"].items()
+        if name in ("house", "bench")
+    ]
+    (tmp_path / "a.city.jsonl").write_text("\n".join([first, *features]))
+    lines = read_source(tmp_path / "a.city.jsonl", Request(materials={"WallSurface": "brick"}))
+    assert {name: value for name, value in measured(read).items() if "house" in name or "bench" in name} == (
+        measured(lines)
+    )
     with pytest.raises(AssetError, match=r"has no level of detail '3'; it has: .*1, 1\.2, 2\.2"):
         read_source(tmp_path / "a.city.json", Request(lod="3"))
 

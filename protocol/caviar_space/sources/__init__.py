@@ -63,7 +63,7 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
                       f"{_SOURCES}.openstreetmap:read_map"),
     "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
-    "cityjson": ((".city.json", ".json"), f"{_SOURCES}.cityjson:read_cityjson"),
+    "cityjson": ((".city.json", ".json", ".jsonl"), f"{_SOURCES}.cityjson:read_cityjson"),
     "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
     "obj": ((".obj",), f"{_SOURCES}.mesh_files:read_obj"),
     "ply": ((".ply",), f"{_SOURCES}.mesh_files:read_ply_scene"),
@@ -128,4 +128,11 @@ def _format_of(path: Path) -> str:
         for end in ends
         if any(name.endswith(end) for name in names)
     ]
-    return max(fitting, default=(0, ""))[1]
+    found = max(fitting, default=(0, ""))[1]
+    if found == "cityjson" and path.is_file():  # .json says little
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+        for word, form in ((b'"geometricError"', "3d-tiles"), (b'"FeatureCollection"', "openstreetmap")):
+            if word in head:
+                return form
+    return found

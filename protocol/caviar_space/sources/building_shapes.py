@@ -18,7 +18,7 @@ _STRAIGHT_M = 0.3
 
 
 class Body(NamedTuple):
-    """Closed mesh of a building."""
+    """Mesh of a building, closed but for a `plate`."""
 
     mesh: Mesh
     roof: BoolArray
@@ -82,6 +82,19 @@ def prism(polygon: Polygon, low: float, high: float) -> Body:
     vertices = np.concatenate([np.column_stack([points, np.full(count, z)]) for z in (low, high)])
     faces = np.concatenate([walls, top[:, ::-1], top + count]).astype(np.int32)
     return Body(Mesh(vertices, faces), np.arange(len(faces)) >= len(faces) - len(top))
+
+
+def plate(polygon: Polygon, height: float) -> Body:
+    """Roof without walls: level faces that look up.
+
+    Args:
+        polygon: From above.
+        height: [m]
+    """
+    points, faces = triangulated(polygon)
+    return Body(
+        Mesh(np.column_stack([points, np.full(len(points), height)]), faces), np.ones(len(faces), bool)
+    )
 
 
 def roofed(polygon: Polygon, low: float, high: float, roof: Roof) -> Body | None:

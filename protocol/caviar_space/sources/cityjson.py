@@ -66,9 +66,11 @@ class _Templates(msgspec.Struct, frozen=True):
 
 
 class _City(msgspec.Struct, frozen=True):
+    """A whole file, or a line of a file of features."""
+
     type: str
-    version: str
     objects: dict[str, _Object] = msgspec.field(name="CityObjects")
+    version: str = ""
     vertices: list[_Place] = []
     transform: _Transform | None = None
     metadata: _Metadata = _Metadata()
@@ -83,40 +85,49 @@ def read_cityjson(path: Path, request: Request) -> ImportedScene:
     builder = SceneBuilder(path, request)
     data = builder.read(path)
     with reading(path, "CityJSON"):
-        city = msgspec.json.decode(data, type=_City)
+        # A file of lines has a feature in each, after one of what they have in common.
+        lines = data.splitlines() if path.suffix.lower() == ".jsonl" else [data]
+        city, *features = (msgspec.json.decode(line, type=_City) for line in lines if line.strip())
         if city.type != "CityJSON" or not city.version.startswith(("1.", "2.")):
             raise ValueError(f"it is {city.type} of version {city.version}: CityJSON 1.0 to 2.0 is read")
-        vertices = np.array(city.vertices, np.float64).reshape(-1, 3)
-        if city.transform is not None:
-            vertices = vertices * city.transform.scale + city.transform.translate
-        to_scene = _projection(builder, vertices, city.metadata.system)
-        levels = {_lod(each) for thing in city.objects.values() for each in thing.geometry}
+        objects: dict[str, _Object] = {}
+        vertices: dict[str, Float64Array] = {}
+        every: list[Float64Array] = []
+        for each in (city, *features):
+            points = np.array(each.vertices, np.float64).reshape(-1, 3)
+            if city.transform is not None:
+                points = points * city.transform.scale + city.transform.translate
+            every.append(points)
+            objects |= each.objects
+            vertices |= dict.fromkeys(each.objects, points)
+        to_scene = _projection(builder, np.concatenate(every), city.metadata.system)
+        levels = {_lod(geometry) for thing in objects.values() for geometry in thing.geometry}
         if request.lod and request.lod not in levels:
             raise AssetError(
                 f"{path} has no level of detail {request.lod!r}; it has: {', '.join(sorted(levels))}"
             )
     left_out: dict[str, int] = {}
-    for number, (name, thing) in enumerate(city.objects.items(), 1):
+    for number, (name, thing) in enumerate(objects.items(), 1):
         if number % 100 == 1:
-            request.progress(name, number / len(city.objects))
+            request.progress(name, number / len(objects))
         level = request.lod or _finest(thing)
-        parts = [_finest(city.objects[child]) for child in thing.children if child in city.objects]
+        parts = [_finest(objects[child]) for child in thing.children if child in objects]
         if not request.lod and level < max(parts, default=""):
             continue  # its parts have it in more detail
         with reading(f"{path}: object {name!r}", "CityJSON"):
             surfaces: dict[str, list[list[Float64Array]]] = {}
-            for geometry in (each for each in thing.geometry if _lod(each) == level):
+            for geometry in (g for g in thing.geometry if _lod(g) == level):
                 if geometry.type not in (*_DEPTHS, "GeometryInstance"):
                     left_out[geometry.type] = left_out.get(geometry.type, 0) + 1
                     continue
-                for rings, surface in _surfaces(city, vertices, geometry):
+                for rings, surface in _surfaces(city, vertices[name], geometry):
                     if surface == "ClosureSurface":  # closes a volume where there is no wall
                         left_out[surface] = left_out.get(surface, 0) + 1
                         continue
                     said = surface in request.materials or itu_name(surface)
                     surfaces.setdefault(builder.itu(surface if said else thing.type), []).append(rings)
-            for itu, each in surfaces.items():
-                corners, faces = joined_triangles(each)
+            for itu, outlines in surfaces.items():
+                corners, faces = joined_triangles(outlines)
                 corners, kind = to_scene(corners), slug(thing.type)
                 if thing.type in _LEAVES and _is_closed(corners, faces):
                     kind = "foliage"

@@ -24,7 +24,7 @@ from caviar_protocol.host import install_command
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, box_in_metres, source_of
 from caviar_space.meshes import Mesh, joined
 from caviar_space.mitsuba_xml import RadioMaterial
-from caviar_space.sources.building_shapes import Roof, crown, prism, roofed, triangulated
+from caviar_space.sources.building_shapes import Roof, crown, plate, prism, roofed, triangulated
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -41,8 +41,6 @@ LOW_BUILDINGS: Mapping[str, float] = dict.fromkeys(
     ("garage", "garages", "carport", "shed", "hut", "kiosk", "cabin", "service", "container", "toilets"), 3.0
 ) | {"roof": 4.5}
 """Height by the kind of a building that is not like its neighbours [m]."""
-CANOPY_M = 0.3
-"""Thickness of a roof without walls, ``building=roof`` [m]."""
 MATERIALS: Mapping[str, str] = {
     **dict.fromkeys(("brick", "clay", "roof_tiles", "tile", "tiles", "terracotta", "masonry"), "brick"),
     **dict.fromkeys(("concrete", "cement_block", "plaster", "sandstone", "eternit", "gravel"), "concrete"),
@@ -326,7 +324,7 @@ def _is_area(tags: Mapping[str, str]) -> bool:
 
 
 class _Solid(NamedTuple):
-    """Body to be: a footprint [m] between two heights over its lowest ground [m]."""
+    """Body to be: a footprint [m] between two heights over its lowest ground [m]; equal ones are a plate."""
 
     element: Element
     polygon: Polygon
@@ -554,8 +552,8 @@ class _Assembly:
         levels = metres(tags.get("building:min_level", "")) or 0.0
         low = self._height(tags, "min_height") or max(levels, 0.0) * STOREY_M
         if not low and tags.get("building") == "roof":
-            low = high - CANOPY_M
-        if not low < high:
+            low = high
+        if low > high:
             self.notes["min_height that is not below height: left out"] += 1
             low = 0.0
         return _Solid(element, polygon, low, high, self._roof(tags))
@@ -569,6 +567,8 @@ class _Assembly:
         ground = self._lowest(solid.polygon)
         low, high = ground + solid.low, ground + solid.high
         body = roofed(solid.polygon, low, high, solid.roof)
+        if solid.low == solid.high:  # a roof without walls is one face: a slab would count twice
+            body = plate(solid.polygon, high)
         if body is None:
             if solid.roof.shape != "flat":
                 self.notes[
@@ -579,8 +579,8 @@ class _Assembly:
         roofs = self._material(tags.get("roof:material", ""), walls)
         faces = body.mesh.faces
         line = int(re.sub(r"\D", "", solid.element.name) or 0)
-        if roofs == walls:
-            self._add(name, body.mesh, walls, "building", line)
+        if roofs == walls or body.roof.all():
+            self._add(name, body.mesh, roofs, "building", line)
             return
         for suffix, material, chosen in (("", walls, ~body.roof), ("-roof", roofs, body.roof)):
             used, places = np.unique(faces[chosen], return_inverse=True)
@@ -599,8 +599,10 @@ class _Assembly:
 
     def _add(self, name: str, mesh: Mesh, material: str, kind: str, line: int = 0) -> None:
         self.made.pieces[name] = Piece(mesh, material, kind, self.path.name, line)
-        thickness = THICKNESS_M.get(material, 0.2)
-        self.made.materials.setdefault(material, RadioMaterial(material, thickness_m=thickness))
+        radio = RadioMaterial(material, thickness_m=THICKNESS_M.get(material, 0.2))
+        if kind == "foliage":  # is to waves what a channel says of its volume
+            radio = RadioMaterial(colour=(0.0, 0.25, 0.0))
+        self.made.materials.setdefault(material, radio)
 
     def _lowest(self, shape: Geometry) -> float:
         """Height of the lowest ground under a shape [m]."""
@@ -657,10 +659,13 @@ class _Assembly:
             ground = self._lowest(element.shape)
             high = self._height(element.tags, least=1.0) or TREE_M[0]
             self._add(
-                f"foliage-wood-{index}", prism(element.shape, ground, ground + high).mesh, "wood", "foliage"
+                f"foliage-wood-{index}",
+                prism(element.shape, ground, ground + high).mesh,
+                "foliage",
+                "foliage",
             )
         if crowns:
-            self._add("foliage-trees", joined(list(crowns.values())), "wood", "foliage")
+            self._add("foliage-trees", joined(list(crowns.values())), "foliage", "foliage")
 
     def _add_ground(self) -> None:
         """Level ground below all pieces, and water in it."""

@@ -107,6 +107,8 @@ def contents(file: Path) -> bytes:
         AssetError: It is not there, is too large or cannot be read.
     """
     try:
+        if not file.is_file():
+            raise AssetError(f"{file} is no file that is there; name one")
         if file.stat().st_size > _MOST_BYTES:
             raise AssetError(f"{file} has more than {_MOST_BYTES >> 20} MiB; export it in parts")
         return file.read_bytes()

@@ -11,7 +11,8 @@ import math
 import re
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -123,15 +124,22 @@ class _Node:
     """From the axes of its glTF into those of the tile, Shape ``[4, 4]``."""
     volume: _Volume
 
+    def file(self, uri: str) -> Path:
+        """Find a file that its tileset names; all lie below the folder of the outermost one."""
+        return beside(self.chain[-1].parent, uri, self.chain[-1], self.chain[0].parent)
+
     def corners(self) -> Float64Array:
         """Corners around it, in the Earth's axes or those of the tileset [m], Shape ``[8, 3]``."""
         signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
         volume = self.volume
         if volume.region is not None:
             west, south, east, north, low, high = volume.region
+            east += 2 * math.pi if east < west else 0.0
             halves = np.array([east - west, north - south, high - low]) / 2
             places = np.array([west + east, south + north, low + high]) / 2 + signs * halves
-            return _to_earth(np.degrees(places[:, :2]), places[:, 2])
+            longitudes, latitudes = np.degrees(places[:, :2].T)
+            earth = _between(_WGS84, _ECEF).transform(longitudes, latitudes, places[:, 2])
+            return np.stack(earth, axis=-1)
         if volume.box is not None:
             numbers = np.array(volume.box)
             corners = numbers[:3] + signs @ numbers[3:].reshape(3, 3)
@@ -146,7 +154,6 @@ class _Node:
 class _Walk:
     """Search for the contents of one level of detail."""
 
-    path: Path
     error_m: float
     within: Callable[[_Node], bool]
     """Whether something of a tile may be in what is asked for."""
@@ -159,15 +166,15 @@ class _Walk:
         self.tiles += 1
         if self.tiles > _MOST_TILES:
             raise AssetError(
-                f"{self.path} has more than {_MOST_TILES} tiles; ask for a box or a larger geometric error"
+                f"{node.chain[0]} has more than {_MOST_TILES} tiles; ask for a box or a larger error"
             )
         if not self.within(node):
             return True
         files, outer = [], list[_Node]()
         for uri in node.uris:
-            file = beside(node.chain[-1].parent, uri, node.chain[-1], self.path.parent)
+            file = node.file(uri)
             if file.is_file() and _is_tileset(file):
-                outer.append(_root(self.path, file, node.chain, node.matrix, node.adds))
+                outer.append(_root(file, node))
             else:
                 files.append(file)
         children = outer
@@ -192,64 +199,43 @@ def _is_tileset(file: Path) -> bool:
         return file.suffix.lower() != ".gltf" and opened.read(64).lstrip()[:1] == b"{"
 
 
-def _root(top: Path, file: Path, chain: tuple[Path, ...], matrix: Float64Array, adds: bool) -> _Node:
+_ABOVE = _Node((), 0.0, False, np.eye(4), list, (), Y_UP, _Volume())
+
+
+def _root(file: Path, above: _Node) -> _Node:
     """Open a tileset."""
-    if file.resolve() in (each.resolve() for each in chain):
-        raise AssetError(f"{file} names itself, by way of {chain[-1].name}; take out the loop of tilesets")
+    if file.resolve() in (each.resolve() for each in above.chain):
+        raise AssetError(
+            f"{file} names itself, by way of {above.chain[-1].name}; take out the loop of tilesets"
+        )
     with reading(file, "a tileset of 3D Tiles"):
         tileset = msgspec.json.decode(contents(file), type=_Tileset)
         turn = {"Y": Y_UP, "Z": np.eye(4)}[tileset.asset.gltf_up_axis.upper()]
-        return _explicit(top, tileset.root, (*chain, file), matrix, adds, turn)
+        return _explicit(tileset.root, replace(above, chain=(*above.chain, file), turn=turn))
 
 
-def _explicit(
-    top: Path, tile: _Tile, chain: tuple[Path, ...], above: Float64Array, adds: bool, turn: Float64Array
-) -> _Node:
-    matrix = above
-    if tile.transform is not None:
-        matrix = above @ np.reshape(tile.transform, (4, 4)).T
-    if tile.refine:
-        adds = tile.refine.upper() == "ADD"
+def _explicit(tile: _Tile, above: _Node) -> _Node:
+    matrix = np.reshape(tile.transform, (4, 4)).T if tile.transform is not None else np.eye(4)
     found = [*tile.contents, *([tile.content] if tile.content else [])]
-    uris = tuple(each.uri or each.url for each in found)
-    if tile.implicit_tiling is not None:
-        implicit = _ImplicitTiles(
-            top,
-            tile.implicit_tiling,
-            uris,
-            tile.geometric_error,
-            chain,
-            matrix,
-            adds,
-            turn,
-            tile.bounding_volume,
-        )
-        return implicit.root()
-    return _Node(
-        uris,
-        tile.geometric_error,
-        adds,
-        matrix,
-        lambda: [_explicit(top, child, chain, matrix, adds, turn) for child in tile.children],
-        chain,
-        turn,
-        tile.bounding_volume,
+    node = replace(
+        above,
+        uris=tuple(each.uri or each.url for each in found),
+        error=tile.geometric_error,
+        adds=tile.refine.upper() == "ADD" if tile.refine else above.adds,
+        matrix=above.matrix @ matrix,
+        children=lambda: [_explicit(child, node) for child in tile.children],
+        volume=tile.bounding_volume,
     )
+    return node if tile.implicit_tiling is None else _ImplicitTiles(tile.implicit_tiling, node).root()
 
 
 @dataclass(frozen=True)
 class _ImplicitTiles:
     """Tiles of a quadtree or an octree, of which subtrees say which are there."""
 
-    top: Path
     tiling: _Implicit
-    uris: tuple[str, ...]
-    error: float
-    chain: tuple[Path, ...]
-    matrix: Float64Array
-    adds: bool
-    turn: Float64Array
-    volume: _Volume
+    above: _Node
+    """The tile that they divide, with templates of URIs."""
 
     @property
     def axes(self) -> int:
@@ -267,36 +253,34 @@ class _ImplicitTiles:
     def part(self, level: int, place: tuple[int, ...]) -> _Volume:
         """Volume of a tile."""
         parts = np.array([2.0**level] * self.axes + [1.0] * (3 - self.axes))
-        at = np.array([*place, 0.0][:3])
-        if self.volume.region is not None:
-            region = np.array(self.volume.region)
+        corner = np.array([*place, 0.0][:3])
+        whole = self.above.volume
+        if whole.region is not None:
+            region = np.array(whole.region)
             low, high = region[[0, 1, 4]], region[[2, 3, 5]]
             size = (high - low) / parts
-            (west, south, bottom), (east, north, top) = low + at * size, low + (at + 1) * size
+            (west, south, bottom), (east, north, top) = low + corner * size, low + (corner + 1) * size
             return _Volume(region=[west, south, east, north, bottom, top])
-        if self.volume.box is None:
-            return self.volume
-        numbers = np.array(self.volume.box)
+        if whole.box is None:
+            return whole
+        numbers = np.array(whole.box)
         halves = numbers[3:].reshape(3, 3)
-        centre = numbers[:3] + ((2 * at + 1) / parts - 1) @ halves
+        centre = numbers[:3] + ((2 * corner + 1) / parts - 1) @ halves
         return _Volume(box=[*centre, *(halves / parts[:, None]).reshape(-1)])
 
     def node(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> _Node:
         index = subtree.index(level, place)
         uris = tuple(
             self.name(template, level, place)
-            for template, availability in zip(self.uris, subtree.head.content_availability, strict=True)
+            for template, availability in zip(self.above.uris, subtree.head.content_availability, strict=True)
             if subtree.has(availability, index)
         )
-        return _Node(
-            uris,
-            self.error / 2**level,
-            self.adds,
-            self.matrix,
-            lambda: self.children(subtree, level, place),
-            self.chain,
-            self.turn,
-            self.part(level, place),
+        return replace(
+            self.above,
+            uris=uris,
+            error=self.above.error / 2**level,
+            children=lambda: self.children(subtree, level, place),
+            volume=self.part(level, place),
         )
 
     def children(self, subtree: _Subtree, level: int, place: tuple[int, ...]) -> list[_Node]:
@@ -307,16 +291,11 @@ class _ImplicitTiles:
             tuple(2 * at + (number >> axis & 1) for axis, at in enumerate(place))
             for number in range(2**self.axes)
         ]
-        if below - subtree.level < self.tiling.subtree_levels:
-            here = subtree.head.tile_availability
-            return [
-                self.node(subtree, below, each)
-                for each in places
-                if subtree.has(here, subtree.index(below, each))
-            ]
-        there, first = subtree.head.child_subtree_availability, subtree.first(below)
+        inner = below - subtree.level < self.tiling.subtree_levels
+        there = subtree.head.tile_availability if inner else subtree.head.child_subtree_availability
+        first = 0 if inner else subtree.first(below)
         return [
-            self.node(_Subtree(self, below, each), below, each)
+            self.node(subtree if inner else _Subtree(self, below, each), below, each)
             for each in places
             if subtree.has(there, subtree.index(below, each) - first)
         ]
@@ -328,9 +307,7 @@ class _Subtree:
     def __init__(self, tiles: _ImplicitTiles, level: int, place: tuple[int, ...]) -> None:
         self.level = level
         self._place, self._axes = place, tiles.axes
-        tileset = tiles.chain[-1]
-        name = tiles.name(tiles.tiling.subtrees.uri, level, place)
-        file = beside(tileset.parent, name, tileset, tiles.top.parent)
+        file = tiles.above.file(tiles.name(tiles.tiling.subtrees.uri, level, place))
         with reading(file, "a subtree of 3D Tiles"):
             text, binary = data = contents(file), b""
             if text[:4] == b"subt":
@@ -341,19 +318,19 @@ class _Subtree:
                         f"{len(text)} there"
                     )
                 text, binary = text[24 : 24 + first], text[24 + first : 24 + first + second]
-            self.head = msgspec.json.decode(text, type=_SubtreeHead)
+            self.head, top = msgspec.json.decode(text, type=_SubtreeHead), tiles.above.chain[0].parent
             buffers = [
-                contents(beside(file.parent, buffer.uri, file, tiles.top.parent)) if buffer.uri else binary
+                contents(beside(file.parent, buffer.uri, file, top)) if buffer.uri else binary
                 for buffer in self.head.buffers
             ]
             self._views = [
                 at(buffers, view.buffer, "buffer")[view.byte_offset : view.byte_offset + view.byte_length]
                 for view in self.head.buffer_views
             ]
-            if len(self.head.content_availability) not in (0, len(tiles.uris)):
+            if len(self.head.content_availability) not in (0, len(tiles.above.uris)):
                 raise ValueError(
                     f"contentAvailability is of {len(self.head.content_availability)} contents, the tileset "
-                    f"has {len(tiles.uris)}"
+                    f"has {len(tiles.above.uris)}"
                 )
         self._where = file
 
@@ -423,9 +400,9 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
     builder.read(path)
     left_out: dict[str, int] = {}
     with reading(path, "a tileset of 3D Tiles"):
-        root = _root(path, path, (), np.eye(4), False)
+        root = _root(path, _ABOVE)
         origin = _origin(root)
-        walk = _Walk(path, request.error_m, _within(request, origin))
+        walk = _Walk(request.error_m, _within(request, origin))
         walk.choose(root)
     builder.scene.notes += dict.fromkeys(walk.notes)
     to_scene: Callable[[Float64Array], Float64Array] | None = None
@@ -447,13 +424,11 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
     return builder.finish()
 
 
-def _to_earth(degrees: Float64Array, heights: Float64Array) -> Float64Array:
-    """Longitudes and latitudes [°], and heights [m], in the Earth's axes [m], Shape ``[N, 3]``."""
+@cache
+def _between(source: str, target: str) -> Any:
     from pyproj import Transformer
 
-    return np.stack(
-        Transformer.from_crs(_WGS84, _ECEF, always_xy=True).transform(*degrees.T, heights), axis=-1
-    )
+    return Transformer.from_crs(source, target, always_xy=True)
 
 
 def _within(request: Request, origin: Georeference | None) -> Callable[[_Node], bool]:
@@ -469,44 +444,54 @@ def _within(request: Request, origin: Georeference | None) -> Callable[[_Node], 
 
     def within(node: _Node) -> bool:
         corners = to_scene(node.corners())[:, :2]
-        return bool(((corners.min(0) <= high) & (corners.max(0) >= low)).all())
+        # A tile without a volume may be anywhere.
+        return not np.isfinite(corners).all() or bool(
+            ((corners.min(0) <= high) & (corners.max(0) >= low)).all()
+        )
 
     return within
 
 
 def _to_scene(origin: Georeference) -> Callable[[Float64Array], Float64Array]:
-    from pyproj import Transformer
-
-    to_wgs84 = Transformer.from_crs(_ECEF, _WGS84, always_xy=True)
-    return lambda points: origin.places(np.stack(to_wgs84.transform(*points.T), axis=-1))
+    return lambda points: origin.places(np.stack(_between(_ECEF, _WGS84).transform(*points.T), axis=-1))
 
 
 def _origin(root: _Node) -> Georeference | None:
     """Place at the bottom of the root's volume, in its middle; None: that is not on the Earth."""
     corners = root.corners()
-    centre = corners.mean(0)
-    if not _EARTH_M[0] < np.linalg.norm(centre) < _EARTH_M[1]:
-        return None
-    from pyproj import Transformer
-
-    longitude, latitude, _ = Transformer.from_crs(_ECEF, _WGS84, always_xy=True).transform(*centre)
-    origin = Georeference(latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7))
     if root.volume.region is not None:
-        low = root.volume.region[4]
+        west, south, east, north, low, _ = root.volume.region
+        east += 2 * math.pi if east < west else 0.0
+        longitude, latitude = math.degrees((west + east) / 2), math.degrees((south + north) / 2)
+    elif _on_earth(centre := corners.mean(0)):
+        longitude, latitude, _ = _between(_ECEF, _WGS84).transform(*centre)
+        there = Georeference(latitude_deg=latitude, longitude_deg=longitude)
+        low = float(_to_scene(there)(corners)[:, 2].min())
     else:
-        low = float(_to_scene(origin)(corners)[:, 2].min())
-    return msgspec.structs.replace(origin, altitude_m=round(low, 3) + 0.0)
+        return None
+    return Georeference(
+        latitude_deg=round(latitude, 7),
+        longitude_deg=round((longitude + 180) % 360 - 180, 7),
+        altitude_m=round(low, 3) + 0.0,
+    )
+
+
+def _on_earth(point: Float64Array) -> bool:
+    return bool(_EARTH_M[0] < np.linalg.norm(point) < _EARTH_M[1])
 
 
 def _conversion(
     builder: SceneBuilder, origin: Georeference | None, vertices: Float64Array
 ) -> Callable[[Float64Array], Float64Array]:
     """Conversion of the tileset's coordinates, such as these, into those of the scene; sets its origin."""
-    radius = np.linalg.norm(vertices, axis=1)
-    if origin is None or not len(radius) or not _EARTH_M[0] < np.median(radius) < _EARTH_M[1]:
+    middle = np.median(vertices, axis=0) if len(vertices) else np.zeros(3)
+    if not _on_earth(middle):
         builder.scene.notes.append(
             "the tileset is not on the Earth: its axes are taken as east, north and up"
         )
         return lambda points: points
+    if origin is None:  # its volume is the whole Earth's
+        longitude, latitude, _ = _between(_ECEF, _WGS84).transform(*middle)
+        origin = Georeference(latitude_deg=round(latitude, 7), longitude_deg=round(longitude, 7))
     builder.scene.origin = builder.request.origin or origin
     return _to_scene(builder.scene.origin)
