@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenario", nargs="+", default=["uav-munich", "street-canyon"])
+    parser.add_argument("--scenario", nargs="+", default=["uav-munich"])
     parser.add_argument("--error-db", nargs="+", type=float, default=[0.1, 0.5, 2.0])
     parser.add_argument("--positions", type=int, default=100)
     parser.add_argument("--markdown", type=Path, help="where the figures go as a table")
