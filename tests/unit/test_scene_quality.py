@@ -247,3 +247,12 @@ def test_a_scene_is_simplified_within_an_error_that_is_measured(tmp_path: Path) 
 def test_a_scenario_whose_channel_meets_no_scenery_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="uses scenery"):
         simplify(scenario_in(tmp_path, "free-space", ""), 0.5, tmp_path / "simple")
+
+
+@pytest.mark.channel
+def test_munich_has_holes_in_its_monuments_alone_and_nothing_that_makes_powers_wrong() -> None:
+    faults = check(open_scene("sionna:munich"))
+    monuments = ("Frauenkirche", "Heilig_Geist", "St__Peter", "Neues_Rathaus")
+    assert 1 <= len(faults) <= 30
+    assert not [fault for fault in faults if KINDS[fault.kind].wrong]
+    assert all(fault.piece.startswith(monuments) for fault in faults)
