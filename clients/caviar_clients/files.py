@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import errno
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+# A disk with less is full.
+_FULL_BYTES = 1 << 20
 
 
 @contextmanager
@@ -21,13 +25,22 @@ def writing(path: Path) -> Iterator[None]:
         path: The file.
 
     Raises:
-        RunError: The block raised `OSError`; the text has file, cause and remedy.
+        RunError: The block raised `OSError`, or another error while the disk is full; the text has file, cause
+            and remedy.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
         raise RunError(f"cannot write {path}: {reason(path, error)}") from error
+    except CaviarError:
+        raise
+    except Exception as error:
+        # Libraries that write by themselves have errors of their own for a disk that is full.
+        if shutil.disk_usage(path.parent).free > _FULL_BYTES:
+            raise
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise RunError(f"cannot write {path}: {reason(path, full)}") from error
 
 
 def make_folder_of(path: Path) -> None:
