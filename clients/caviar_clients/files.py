@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,8 +12,6 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
-# A disk with less is full.
-_FULL_BYTES = 1 << 20
 
 
 @contextmanager
@@ -25,8 +22,8 @@ def writing(path: Path) -> Iterator[None]:
         path: The file.
 
     Raises:
-        RunError: The block raised `OSError`, or another error while the disk is full; the text has file, cause
-            and remedy.
+        RunError: The block raised `OSError`, or another error of a disk that is full; the text has file,
+            cause and remedy.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,9 +34,9 @@ def writing(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         # Libraries that write by themselves have errors of their own for a disk that is full.
-        if shutil.disk_usage(path.parent).free > _FULL_BYTES:
-            raise
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if str(full.strerror) not in str(error):
+            raise
         raise RunError(f"cannot write {path}: {reason(path, full)}") from error
 
 
