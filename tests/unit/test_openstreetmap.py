@@ -17,7 +17,7 @@ from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, cut_to_box
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.sources import Request, read_source
-from caviar_space.sources.openstreetmap import metres
+from caviar_space.sources.map_files import metres
 from caviar_space.volumes import outward
 
 pytest.importorskip("osmium")
@@ -520,6 +520,7 @@ def test_any_scene_is_cut_to_a_box() -> None:
     assert shapely.area(parts).sum() == pytest.approx(inside.area)
     assert shapely.union_all(parts).symmetric_difference(inside).area < 1e-6
     assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
+    assert "1 of 5 pieces outside of the box: left out" in scene.notes
     with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
         cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))
 
