@@ -2,12 +2,12 @@
 
     python examples/street_materials.py segmentation.onnx [--streets 20] [--out materials]
 
-Needs the extras ``channel``, ``policy``, ``plot`` and ``formats``. The network is that of `train_segmentation.py`, or
-another one with its card. On streets that it was not trained on, with known materials: share of pixels and
-faces that are right, and the error of the received power at 28 GHz, against the model with true materials, of
-the labelled model, of one that is all of concrete, and of one in which walls, roofs and grounds are each of
-the material that most of them have in other streets. Four figures show a picture, its segmentation, the labels
-on the model, and the paths of rays in it.
+Needs the extras ``channel``, ``policy``, ``plot`` and ``formats``. The network is that of
+`train_segmentation.py`, or another one with its card. On streets that it was not trained on, with known
+materials: share of pixels and faces that are right, and the error of the received power at 28 GHz, against
+the model with true materials, of the labelled model, of one that is all of concrete, and of one in which
+walls, roofs and grounds are each of the material that most of them have in other streets. Four figures show a
+picture, its segmentation, the labels on the model, and the paths of rays in it.
 """
 
 import argparse
@@ -127,7 +127,11 @@ def figures(made: Street, best: list[str], segmenter: OnnxSegmenter, seed: int) 
         grey = made.eye.paint(eye, np.full((len(made.eye.names), 3), 0.5)) / 188.0
         index = np.array([MATERIALS.index(one) for one in best] + [SKY])[seen.face]
         figure, axes = plt.subplots(figsize=(9.6, 7.2))
-        axes.imshow(np.clip(COLOURS[index] * np.where(index == SKY, 1, grey.mean(-1))[..., None], 0, 255).astype(np.uint8))
+        axes.imshow(
+            np.clip(COLOURS[index] * np.where(index == SKY, 1, grey.mean(-1))[..., None], 0, 255).astype(
+                np.uint8
+            )
+        )
         if name == "fig7-rays":
             _draw_rays(axes, eye, channel, sender)
         shown = sorted(set(best), key=MATERIALS.index)
@@ -147,12 +151,16 @@ def _draw_rays(axes: object, eye: object, channel: object, sender: AntennaDevice
 
     def pixels(points: np.ndarray) -> np.ndarray:
         local = (points - place) @ turn
-        return np.stack([optics.cx - optics.fx * local[:, 1] / local[:, 0],
-                         optics.cy - optics.fy * local[:, 2] / local[:, 0]], -1)
+        return np.stack(
+            [
+                optics.cx - optics.fx * local[:, 1] / local[:, 0],
+                optics.cy - optics.fy * local[:, 2] / local[:, 0],
+            ],
+            -1,
+        )
 
     pairs = np.repeat(np.arange(len(channel.rx)), np.diff(channel.offsets))
     strong = np.abs(channel.a[0])
-    rng = np.random.default_rng(1)
     receivers = receiver_places(channel, sender)
     for path in np.flatnonzero(strong > 1e-3 * strong.max()):
         if pairs[path] % 4:
@@ -164,7 +172,6 @@ def _draw_rays(axes: object, eye: object, channel: object, sender: AntennaDevice
         axes.plot(*line.T, color=(1.0, max(0.0, -level / 60), 0.0), lw=1.0, alpha=0.8)
         axes.plot(*line[-1], "o", color="white", ms=3)
     axes.plot(*pixels(np.array([sender.position]))[0], "^", color="cyan", ms=9)
-    del rng
 
 
 def receiver_places(channel: object, sender: AntennaDevice) -> np.ndarray:

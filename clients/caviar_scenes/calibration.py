@@ -1,16 +1,17 @@
 """Calibration: constants of materials, fitted to received powers or channel responses at known places.
 
-The channel of the scenario finds the paths to all places once. Their geometry stays fixed, and their fields are
-computed anew, in float64, for other constants: products of Fresnel's coefficients of slabs along reflected and
-transmitted paths (`utd.slab`); of diffuse ones, the last of whose points scatters, the amplitude
-follows the scattering coefficient and what the surface reflects there. Paths by way of edges and moving objects
-keep their fields. Each path keeps the ratio of the channel's own amplitude to that of the same constants here,
-with which foliage, air and antennas are in it.
+The channel of the scenario finds the paths to all places once. Their geometry stays fixed, and their fields
+are computed anew, in float64, for other constants: products of Fresnel's coefficients of slabs along paths of
+reflections and transmissions (`utd.slab`); of diffuse ones, the last of whose points scatters, the amplitude
+follows the scattering coefficient and what the surface reflects there. Paths by way of edges and moving
+objects keep their fields. Each path keeps the ratio of the channel's own amplitude to that of the same
+constants here, which has foliage, air and antennas in it.
 
 The least squares of residuals over their standard deviation give permittivity, the logarithm of conductivity
-and the scattering coefficient, after a search over permittivities, since slabs reflect more and less by
-turns. Intervals are of 95 %, from the covariance (JᵀJ)⁻¹ at the optimum, with what residuals are larger than
-the noise that was given. A parameter whose interval is wider than its range is one that the data do not tell.
+(with a weak prior about the scenario's, `DECADES`) and the scattering coefficient, after a search over
+permittivities, since slabs reflect more and less by turns. Intervals are of 95 %, from the covariance (JᵀJ)⁻¹
+at the optimum, wider where residuals are larger than the noise that was given, or where other optima fit as
+well. A parameter whose interval is wider than `WIDEST` is one that the data do not tell.
 """
 
 from __future__ import annotations
@@ -40,12 +41,15 @@ PARAMETERS = ("relative_permittivity", "conductivity_s_per_m", "scattering_coeff
 """Of a material, as in the channel's setting ``materials``."""
 BOUNDS = ((1.0, 30.0), (-5.0, 2.0), (0.0, 0.95))
 """Of relative permittivity, logarithm of the conductivity [S/m], and scattering coefficient."""
-WIDEST = (10.0, 4.0, 0.8)
+WIDEST = (10.0, 1.0, 0.6)
 """Width of an interval from which on the data do not tell the parameter."""
+DECADES = 0.5
+"""Standard deviation of the logarithm of a conductivity about the scenario's: walls of little loss would be
+plates in which waves resonate, which fits noise well."""
 SEARCHED = np.concatenate([np.arange(1.4, 9.0, 0.2), np.arange(9.0, 20.0, 1.0)])
 """Permittivities from which the fit may start."""
-CONDUCTIVITIES = (-1.5, -0.5, 0.5)
-"""Logarithms of conductivities [S/m] of all materials with which the search begins anew."""
+RIPPLE = np.linspace(0.75, 1.25, 101)
+"""Parts of a permittivity at which the interval is looked at beyond the optimum."""
 FAINT = 1e-3
 """Share of the received power, summed over places, below which a material counts as unseen."""
 
@@ -83,6 +87,8 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True):
 class Calibration:
     """Result of a calibration."""
 
+    service: str
+    """Name of the channel in the scenario."""
     parameters: tuple[Fitted, ...]
     before: float
     """Root mean square of the residuals with the scenario's constants: dB, or relative for responses."""
@@ -142,7 +148,7 @@ class FixedPaths:
         carrier: Index of the carrier.
 
     Raises:
-        RunError: The scenario has no channel that traces rays, no transmitter, or its fields are not those here.
+        RunError: The scenario has no channel that traces rays, or no transmitter.
     """
 
     def __init__(
@@ -155,8 +161,14 @@ class FixedPaths:
         tx = [d for d in scene.devices if isinstance(d, AntennaDevice) and d.role != "rx"]
         if not tx:
             raise RunError(f"{scenes.origin} has no transmitter; give it a device of the role tx")
+        # Receivers have the element and the turn of the scenario's first one.
+        like = next((d for d in scene.devices if isinstance(d, AntennaDevice) and d.role == "rx"), None)
+        like = like or AntennaDevice(name="", role="rx")
+        one = msgspec.structs.replace(like.array, rows=1, columns=1)
         receivers = [
-            AntennaDevice(name=f"calibration-{n:05d}", role="rx", position=tuple(place))
+            msgspec.structs.replace(
+                like, name=f"calibration-{n:05d}", parent="", position=tuple(place), array=one
+            )
             for n, place in enumerate(position.tolist())
         ]
         tx = sorted(tx, key=lambda device: device.name)
@@ -168,7 +180,9 @@ class FixedPaths:
         self.pair = np.repeat(np.arange(len(channel.offsets) - 1), np.diff(channel.offsets))
         self.places = len(receivers)
         self.amplitude: Complex128Array = channel.a[carrier]
-        self.surfaces = _surfaces(model)
+        self.service = model.run.name
+        named = {surface.name: surface for surface in model.scene.used_surfaces().materials}
+        self.surfaces = tuple(named.values())
         frequency = scenes.carriers[carrier].frequency_hz
         self._carrier, self._frequency = carrier, frequency
         self._thickness = np.array([surface.thickness_m for surface in self.surfaces])
@@ -188,7 +202,8 @@ class FixedPaths:
         last = scattered[rows, np.maximum(count - 1, 0)] & (count > 0) if types.shape[1] else count > 0
         other = (types == Interaction.DIFFRACTION).any(1) | (scattered.sum(1) > last)
         self.anew: BoolArray = known & ~other & (count > 0)
-        self._diffuse: BoolArray = last
+        self.diffuse: BoolArray = last
+        """Which paths are scattered, at their last point."""
         if types.shape[1]:
             arrival = _unit(self._corners[rows, count] - end)
             self._prepare(
@@ -202,7 +217,7 @@ class FixedPaths:
         # Phases and spreading are in the ratio; magnitudes are to agree, of paths that are not diffuse.
         length = np.linalg.norm(np.diff(self._corners, axis=1), axis=-1).sum(-1)
         spread = SPEED_OF_LIGHT / self._frequency / (4 * np.pi * np.maximum(length, 1e-9))
-        strong = self.anew & ~self._diffuse & (np.abs(own) > 1e-2)
+        strong = self.anew & ~self.diffuse & (np.abs(own) > 1e-2)
         self.agreement = float(np.abs(np.abs(self._ratio[strong]) / spread[strong] - 1).max(initial=0.0))
 
     def constants(self) -> Float64Array:
@@ -270,9 +285,7 @@ class FixedPaths:
             return own
         of = np.maximum(self._material, 0)
         permittivity, conductivity, scattering = np.moveaxis(constants[of], -1, 0)
-        back, through = slab(
-            self._cosine, (permittivity, conductivity), self._thickness[of], self._frequency
-        )
+        back, through = slab(self._cosine, (permittivity, conductivity), self._thickness[of], self._frequency)
         back = np.moveaxis(back, 0, -1)
         specular = back * np.sqrt(1 - scattering**2)[..., None]
         passed = (self._types == Interaction.TRANSMISSION)[..., None]
@@ -280,10 +293,10 @@ class FixedPaths:
         field = self._first
         for d in range(of.shape[1]):
             last = self._count == d + 1
-            end = last & ~self._diffuse
+            end = last & ~self.diffuse
             own[end] = (self._last[end] * specular[end, d] * field[end]).sum(1)
             # What arrives at a rough point is reflected by so much of it, whichever way it is scattered.
-            end = last & self._diffuse
+            end = last & self.diffuse
             own[end] = scattering[end, d] * np.linalg.norm(back[end, d] * field[end], axis=1)
             if d + 1 < of.shape[1]:
                 field = np.einsum("pij,pj->pi", self._between[:, d], specular[:, d] * field)
@@ -293,6 +306,7 @@ class FixedPaths:
 def _model(scenes: Scenes, rough: Sequence[str]) -> SionnaChannel:
     from caviar_protocol.scenario.conversion import Place, convert_settings
     from caviar_services.channel.sionna.model import SionnaChannel
+    from caviar_services.channel.sionna.settings import SionnaSettings
     from caviar_services.registry import load
     from caviar_services.service import Preparation, RunInfo
     from caviar_space.materials import MaterialSettings
@@ -301,15 +315,13 @@ def _model(scenes: Scenes, rough: Sequence[str]) -> SionnaChannel:
         if spec.role != "channel" or not issubclass(load("channel", spec.use), SionnaChannel):
             continue
         place = Place("services").at(name).at("settings")
-        settings = convert_settings(SionnaChannel.Settings, spec.settings, place)
+        settings = convert_settings(SionnaSettings, spec.settings, place)
         given = settings.materials
-        rougher = {
-            key: msgspec.structs.replace(
-                given.get(key, MaterialSettings()),
-                scattering_coefficient=max(0.3, given.get(key, MaterialSettings()).scattering_coefficient or 0.0),
-            )
-            for key in (rough if settings.scattering else ())
-        }
+        rougher = {}
+        for key in rough if settings.scattering else ():
+            known = given.get(key, MaterialSettings())
+            some = max(0.3, known.scattering_coefficient or 0.0)
+            rougher[key] = msgspec.structs.replace(known, scattering_coefficient=some)
         settings = msgspec.structs.replace(settings, materials={**given, **rougher}, rung="siso-rt")
         run = RunInfo(
             name=name,
@@ -336,11 +348,6 @@ def _channel(
     return model.model(frame, scene, tx, receivers).channel
 
 
-def _surfaces(model: SionnaChannel) -> tuple[SurfaceMaterial, ...]:
-    found = {surface.name: surface for surface in model.scene.used_surfaces().materials}
-    return tuple(found.values())
-
-
 def _met(
     channel: Channel,
     scenes: Scenes,
@@ -348,7 +355,7 @@ def _met(
     corners: Float64Array,
     surfaces: Sequence[SurfaceMaterial],
 ) -> tuple[Int64Array, Float64Array]:
-    """Number of the surface material at each point, −1 where it is none of scenery, and unit normals there."""
+    """Number of the surface material at each point, −1 where it is none of scenery, and unit normals."""
     from caviar_space.materials import ObjectMaterials
     from caviar_space.mitsuba_xml import find_scenery, read_scenery, world_mesh
 
@@ -359,8 +366,8 @@ def _met(
     of_object = []
     for name in channel.object_names:
         shape = shapes.get(name)
-        material = own.material_for(name) or (shape.radio.name if shape and shape.radio else "")
-        of_object.append(names.index(material) if shape and material in names else -1)
+        called = own.material_for(name) or (shape.radio.name if shape and shape.radio else "")
+        of_object.append(names.index(called) if shape and called in names else -1)
     material = np.array([*of_object, -1], np.int64)[channel.objects]
     # A mirror's normal lies along the change of direction; one that lets waves through does not show.
     steps = _unit(np.diff(corners, axis=1))
@@ -418,7 +425,7 @@ def calibrate(
         SetupError: SciPy is not installed.
     """
     try:
-        from scipy.optimize import least_squares
+        from scipy.optimize import least_squares  # type: ignore[import-untyped]
     except ImportError as error:
         raise SetupError(f"calibration needs SciPy; run: {install_command('scenes')}") from error
     paths = FixedPaths(scenes, measured.position, materials, carrier)
@@ -438,8 +445,7 @@ def calibrate(
         raise AssetError(f"none of the {len(pairs)} places has a path; check their coordinates and axes")
     shares = {name: paths.share(names.index(name)) for name in materials}
     seen = [name for name in materials if shares[name] >= FAINT]
-    scatters = bool(paths._diffuse.any())  # noqa: SLF001 - the same module
-    count = 3 if scatters else 2
+    count = 3 if paths.diffuse.any() else 2
     low, high = (np.tile([bound[side] for bound in BOUNDS[:count]], len(seen)) for side in (0, 1))
 
     def constants(x: Float64Array) -> Float64Array:
@@ -456,25 +462,29 @@ def calibrate(
     if measured.response is not None:
         scale = (10 ** (noise_db / 20) - 1) * float(np.sqrt(np.mean(np.abs(measured.response) ** 2)))
 
-    def residuals(x: Float64Array) -> Float64Array:
+    def misfit(x: Float64Array) -> Float64Array:
         amplitude = paths.fields(constants(x))
-        if powers is not None:
-            found = sending + 10 * np.log10(np.maximum(paths.power(amplitude)[pairs][reached], 1e-40))
-            return (found - powers) / scale
-        assert measured.response is not None  # one of both is there
-        off = (paths.response(amplitude)[pairs] - measured.response)[reached] / scale
-        return np.concatenate([off.real, off.imag])
+        if measured.response is not None:
+            off = (paths.response(amplitude)[pairs] - measured.response)[reached] / scale
+            return np.concatenate([off.real, off.imag])
+        found = sending + 10 * np.log10(np.maximum(paths.power(amplitude)[pairs][reached], 1e-40))
+        return np.asarray((found - powers) / scale)
 
     x = np.array([v for name in seen for v in _scaled(start[names.index(name)])[:count]])
     x = np.clip(x, low + 1e-6, high - 1e-6)
-    before = float(np.sqrt(np.mean(residuals(x) ** 2)))
+    known = x[1::count].copy()
+
+    def residuals(x: Float64Array) -> Float64Array:
+        return np.concatenate([misfit(x), (x[1::count] - known) / DECADES])
+
+    before = float(np.sqrt(np.mean(misfit(x) ** 2)))
     after, deviation = before, np.zeros(0)
     if seen:
         fits = []
-        for level in (None, *CONDUCTIVITIES):
+        for more in (0.0, -DECADES, DECADES):
             begin = x.copy()
-            if level is not None:
-                begin[1::count] = level
+            begin[1::count] += more
+            begin = np.clip(begin, low + 1e-6, high - 1e-6)
             for _ in range(2):
                 for k in range(len(seen)):
                     tried = np.tile(begin, (len(SEARCHED) + 1, 1))
@@ -484,19 +494,28 @@ def calibrate(
         fit = min(fits, key=lambda one: float(one.cost))
         # Of other optima that fit as well, none can be ruled out.
         rivals = np.array([one.x for one in fits if one.cost < fit.cost + 2.0])
-        x, after = fit.x, float(np.sqrt(np.mean(fit.fun**2)))
-        free = max(1, len(fit.fun) - len(x))
+        x, left = fit.x, misfit(fit.x)
+        after = float(np.sqrt(np.mean(left**2)))
         # Noise larger than what was given widens the intervals; less of it may be chance.
-        larger = max(1.0, float((fit.fun**2).sum()) / free)
+        larger = max(1.0, float((left**2).sum()) / max(1, len(left) - len(x)))
         deviation = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac, rcond=1e-14)) * larger)
         deviation[(fit.jac**2).sum(0) < 1e-12] = math.inf
         deviation = np.maximum(deviation, np.abs(rivals - x).max(0) / 1.96)
+        # So are all permittivities within the ripple of a slab, at this conductivity or at the known one.
+        for k in range(len(seen)):
+            tried = np.tile(x, (2 * len(RIPPLE), 1))
+            tried[:, count * k] = np.clip(np.repeat(RIPPLE, 2) * x[count * k], *BOUNDS[0])
+            tried[::2, count * k + 1] = known[k]
+            near = tried[[0.5 * (residuals(one) ** 2).sum() < fit.cost + 1.92 for one in tried], count * k]
+            off = np.abs(near - x[count * k]).max(initial=0.0)
+            deviation[count * k] = max(deviation[count * k], off / 1.96)
     found = [
         fitted
         for name in materials
         for fitted in _fitted(name, seen, count, x, deviation, start[names.index(name)], shares[name])
     ]
     return Calibration(
+        service=paths.service,
         parameters=tuple(found),
         before=before * scale,
         after=after * scale,
@@ -551,12 +570,11 @@ def _fitted(
     return found
 
 
-def settings_text(found: Calibration, service: str) -> str:
-    """Write what is told as tables of a scenario.
+def settings_text(found: Calibration) -> str:
+    """Write what is told as tables of a scenario, with intervals, and what is not as remarks.
 
     Args:
         found: The result.
-        service: Name of the channel's service in the scenario.
     """
     lines: list[str] = []
     by_material: dict[str, list[Fitted]] = {}
@@ -565,7 +583,9 @@ def settings_text(found: Calibration, service: str) -> str:
     for material, parameters in by_material.items():
         told = [fitted for fitted in parameters if fitted.told]
         if told:
-            lines.append(f"[services.{service}.settings.materials.{msgspec.json.encode(material).decode()}]")
+            lines.append(
+                f"[services.{found.service}.settings.materials.{msgspec.json.encode(material).decode()}]"
+            )
         lines += [f"{one.parameter} = {one.value:.6g}  # {one.low:.4g} to {one.high:.4g}" for one in told]
         lines += [f"# {material}: {one.parameter} is not told: {one.why}" for one in parameters if one.why]
         lines.append("")
