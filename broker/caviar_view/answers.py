@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, NamedTuple, cast
+from zipfile import BadZipFile
 
 import msgspec
 import numpy as np
@@ -264,10 +265,10 @@ class Answers:
                 "there is no radio map beside the recording; make one with: caviar plot map RUN"
             )
         try:
-            with np.load(file, allow_pickle=False) as found:
+            with file.open("rb") as opened, np.load(opened, allow_pickle=False) as found:
                 x, y, z = (found[name].astype(float) for name in ("x", "y", "z"))
                 gain = np.where(np.isnan(found["gain"]), -np.inf, found["gain"]).max(0).astype(float)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
             raise RecordingError(f"{file} is no radio map: {error}") from error
         step = math.ceil(math.sqrt(gain.size / CELLS)) or 1
         x, y, z, gain = x[::step], y[::step], z[::step, ::step], gain[::step, ::step]

@@ -1,4 +1,4 @@
-"""``caviar scene``: scenes of other programs are imported, and looked at with their traffic."""
+"""``caviar scene``: scenes are imported, checked, repaired, simplified, and looked at with their traffic."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 import shlex
 import sys
+from dataclasses import astuple
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -34,7 +35,7 @@ TEMPLATE = "new/imported.toml"
 
 @app.callback()
 def scenes() -> None:
-    """Scenes: import, picture."""
+    """Scenes: import, look, check, repair, simplify, picture."""
 
 
 @app.command("import")
@@ -47,6 +48,38 @@ def import_command(
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder of the scene, which is made")],
+    box: Annotated[
+        str, typer.Option(help="W,S,E,N of what is taken, longitudes and latitudes [°]; by default all")
+    ] = "",
+    box_m: Annotated[
+        str, typer.Option("--box-m", help="X0,Y0,X1,Y1 of what is taken, in the scene [m]; by default all")
+    ] = "",
+    form: Annotated[
+        str, typer.Option("--format", help="format of the source; by default by the names of files")
+    ] = "",
+    material: Annotated[
+        str, typer.Option(help="material of ITU-R P.2040 of what the source gives none")
+    ] = "concrete",
+    materials: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=MATERIAL: that of ITU-R P.2040 for a name of the source; several times"),
+    ] = None,
+    up: Annotated[
+        str, typer.Option(help="y or z: axis that points up in meshes that do not say; by default z")
+    ] = "z",
+    lod: Annotated[
+        str, typer.Option(help="level of detail, where there are several; by default the finest")
+    ] = "",
+    error_m: Annotated[
+        float, typer.Option("--error-m", min=0.0, help="largest geometric error of tiles [m]; 0: the finest")
+    ] = 0.0,
+    heights: Annotated[
+        Path | None,
+        typer.Option(help="heights of the ground, GeoTIFF or DTED; by default the ground of a map is level"),
+    ] = None,
+    origin: Annotated[
+        str, typer.Option(help="LAT,LON of the scene's origin [°]; by default the source's, or its middle")
+    ] = "",
     sumo: Annotated[
         Path | None,
         typer.Option(help="SUMO configuration, .sumocfg; by default the one in the project's folder"),
@@ -56,18 +89,36 @@ def import_command(
         typer.Option(help="X0,Y0,X1,Y1 of the grid of LIDARs beside the receivers [m]; by default no LIDAR"),
     ] = "",
 ) -> None:
-    """Import a scene: meshes, materials, and scenarios with the project's transmitters and traffic."""
-    from caviar_space.imported_scenes import write_scene
+    """Import a scene: meshes, materials, roads of a map, or scenarios with a project's transmitters."""
+    from rich.progress import TimeRemainingColumn
+
+    from caviar_space.imported_scenes import Georeference, write_scene
     from caviar_space.sources import Request, read_source
+    from caviar_space.sources.road_network import NET
 
     console = Console()
-    with progress_bar(Console(stderr=True), transient=True) as bar:
+    with progress_bar(Console(stderr=True), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task(path.name, total=1.0)
-        scene = read_source(
-            path,
-            Request(progress=lambda name, share: bar.update(task, description=name, completed=share)),
+        latitude, longitude = _numbers("--origin", origin, 2, "LAT,LON [°]: 60.17,24.94") or (0.0, 0.0)
+        request = Request(
+            box_deg=_box("--box", box, "W,S,E,N [°]: 24.93,60.16,24.95,60.18"),
+            box_m=_box("--box-m", box_m, "X0,Y0,X1,Y1 [m]: -300,-300,300,300"),
+            origin=Georeference(latitude_deg=latitude, longitude_deg=longitude) if origin else None,
+            heights=heights,
+            material=material,
+            materials=_named_materials(materials or [], material),
+            up="y" if up == "y" else "z",
+            lod=lod,
+            error_m=error_m,
+            progress=lambda name, share: bar.update(task, description=name, completed=share),
         )
-    more = _scenarios(scene, path, sumo, lidar)
+        if up not in ("y", "z"):
+            raise AssetError(f"--up {up}: write y or z")
+        if box and box_m:
+            raise AssetError("--box and --box-m both say what is taken; write one of them")
+        scene = read_source(path, request, form)
+    of_project = scene.transmitters_m or scene.receivers_m or scene.frequencies_hz or sumo
+    more = _scenarios(scene, path, sumo, lidar) if of_project else {}
     write_scene(scene, out, more)
     for note in scene.notes:
         print_line(console, f"note: {note}")
@@ -79,6 +130,165 @@ def import_command(
             print_line(
                 console, f"{out / name} is a scenario; run it with: caviar run {shlex.quote(str(out / name))}"
             )
+    if NET in scene.files:
+        print_line(
+            console,
+            f"{out / NET} has its roads; a scenario on them: caviar new NAME --scene {shlex.quote(str(out))}",
+        )
+
+
+def _numbers(option: str, text: str, count: int, example: str) -> tuple[float, ...]:
+    """Numbers of an option with commas between them; none: it is empty."""
+    if not text:
+        return ()
+    try:
+        found = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise AssetError(f"{option} {text}: write {example}")
+    return found
+
+
+def _box(option: str, text: str, example: str) -> tuple[float, float, float, float] | None:
+    if not text:
+        return None
+    x0, y0, x1, y1 = _numbers(option, text, 4, example)
+    if not (x0 < x1 and y0 < y1):
+        raise AssetError(f"{option} {text}: the lower corner comes first; write {example}")
+    return x0, y0, x1, y1
+
+
+def _named_materials(given: list[str], default: str) -> dict[str, str]:
+    """Materials of ITU-R P.2040 by the source's names for them; each is looked up, and the default."""
+    from caviar_protocol.errors import suggestion
+    from caviar_space.mitsuba_xml import ITU_MATERIALS
+
+    pairs = [text.partition("=") for text in given]
+    for name, sign, value in [("", "=", default), *pairs]:
+        if not sign or value not in ITU_MATERIALS:
+            raise AssetError(
+                f"{f'--materials {name}{sign}' if name else '--material '}{value}: ITU-R P.2040 has no "
+                f"material {value!r}; write NAME=MATERIAL; {suggestion(value, ITU_MATERIALS)}"
+            )
+    return {name: value for name, _, value in pairs}
+
+
+SceneArgument = Annotated[
+    str,
+    typer.Argument(help="folder of an imported scene, XML, sionna:NAME, or scenario", show_default=False),
+]
+
+
+@app.command("check")
+def check_command(
+    scene: SceneArgument,
+    thin_m: Annotated[
+        float, typer.Option("--thin-m", min=0.0, help="closed bodies up to this thickness are walls [m]")
+    ] = 0.5,
+    as_json: Annotated[bool, typer.Option("--json", help="print all faults, each with its place")] = False,
+) -> None:
+    """Check a scene for faults that rays meet; status 1 where received powers are wrong by one."""
+    from collections import Counter
+
+    from rich.table import Table
+
+    from caviar_scenes.checks import KINDS, check
+    from caviar_scenes.opened import open_scene
+
+    opened = open_scene(scene)
+    faults = check(opened, thin_m)
+    counts = Counter(fault.kind for fault in faults)
+    wrong = [kind for kind in counts if KINDS[kind].wrong]
+    if as_json:
+        sys.stdout.write(
+            msgspec.json.encode({"scene": opened.name, "wrong": wrong, "faults": faults}).decode()
+        )
+        sys.stdout.write("\n")
+        raise typer.Exit(bool(wrong))
+    console = Console()
+    table = Table("fault", "count", "where (first three) [m]", "effect on rays", "remedy")
+    for kind, count in counts.items():
+        where = [
+            f"{fault.piece} {fault.place}{f': {fault.note}' if fault.note else ''}"
+            for fault in [fault for fault in faults if fault.kind == kind][:3]
+        ]
+        table.add_row(kind, str(count), "\n".join(where), KINDS[kind].effect, KINDS[kind].remedy)
+    triangles = sum(len(mesh.faces) for mesh in opened.meshes.values())
+    print_line(console, f"{opened.name}: {len(opened.meshes)} pieces, {triangles} triangles")
+    if counts:
+        console.print(table)
+    print_line(
+        console,
+        f"received powers are wrong by: {', '.join(wrong)}"
+        if wrong
+        else f"{len(faults)} faults, none of which makes received powers wrong",
+    )
+    raise typer.Exit(bool(wrong))
+
+
+@app.command("repair")
+def repair_command(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="folder of the repaired scene, which is made")],
+    thin_m: Annotated[
+        float,
+        typer.Option("--thin-m", min=0.0, help="closed plates up to this become sheets [m]; 0: none"),
+    ] = 0.5,
+    union: Annotated[
+        bool, typer.Option("--union", help="unite closed bodies of one material that overlap")
+    ] = False,
+) -> None:
+    """Repair a scene: weld, drop slivers and duplicates, turn bodies, fold walls; print what changed."""
+    from rich.table import Table
+
+    from caviar_scenes.opened import open_scene, write_changed
+    from caviar_scenes.repairs import repair
+
+    opened, console = open_scene(scene), Console()
+    done, changes = repair(opened, thin_m, union)
+    said = f"repaired by caviar scene repair: {len(changes)} pieces changed"
+    write_changed(opened, done, out, {}, said)
+    table = Table("piece", "triangles", "area m²", "volume m³", "what")
+    for change in changes:
+        before, after = change.before, change.after
+        pairs = zip(astuple(before), astuple(after), strict=True)
+        table.add_row(change.piece, *(f"{a:.6g} → {b:.6g}" for a, b in pairs), ", ".join(change.what))
+    if changes:
+        console.print(table)
+    print_line(
+        console, f"{out}: {len(changes)} of {len(opened.meshes)} pieces changed; materials as they were"
+    )
+
+
+@app.command("look")
+def look_command(
+    scene: SceneArgument,
+    out: Annotated[Path | None, typer.Option(help="PNG that is written; by default none")] = None,
+) -> None:
+    """Look at a scene: extent, place on the Earth, materials with their frequencies, faults; a picture."""
+    from collections import Counter
+
+    from rich.table import Table
+
+    from caviar_scenes.checks import check
+    from caviar_scenes.look import draw, look
+    from caviar_scenes.opened import open_scene
+
+    opened, console = open_scene(scene), Console()
+    seen = look(opened)
+    for line in seen.lines:
+        print_line(console, line)
+    table = Table("material", "pieces", "triangles", "area m²", "thickness m", "ITU-R P.2040 defines it for")
+    for row in seen.materials:
+        table.add_row(*row)
+    console.print(table)
+    counts = Counter(fault.kind for fault in check(opened))
+    said = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    print_line(console, f"faults: {said or 'none'}" + "; see caviar scene check" * bool(said))
+    if out is not None:
+        draw(opened, out)
+        print_line(console, f"picture: {out}")
 
 
 @app.command("picture")
@@ -263,14 +473,10 @@ def _toml(value: object) -> str:
 
 def _grid(lidar: str) -> str:
     """Service of LIDARs with a grid of 20 by 200 by 10 cells, the longer axis with more; empty: none."""
-    if not lidar:
+    area = _box("--lidar", lidar, "X0,Y0,X1,Y1 [m], the lower corner first: 744,429,767,679")
+    if area is None:
         return ""
-    try:
-        x0, y0, x1, y1 = (float(word) for word in lidar.split(","))
-    except ValueError:
-        x0 = y0 = x1 = y1 = 0.0
-    if not (x0 < x1 and y0 < y1):
-        raise AssetError(f"--lidar {lidar}: write X0,Y0,X1,Y1 [m], the lower corner first: 744,429,767,679")
+    x0, y0, x1, y1 = area
     cells = [20, 200, 10] if x1 - x0 < y1 - y0 else [200, 20, 10]
     grid = f"{{ minimum_m = [{x0}, {y0}, 0.0], maximum_m = [{x1}, {y1}, 10.0], cells = {cells} }}"
     return (

@@ -9,15 +9,18 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
+from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.digest import file_digest
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
+from caviar_space.ground import are_ground
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
 from caviar_space.volumes import outward
@@ -52,6 +55,17 @@ class Georeference(msgspec.Struct, frozen=True, kw_only=True):
         """
         longitude, latitude, altitude = self._transformer().transform(x, y, z, direction="INVERSE")
         return latitude, longitude, altitude
+
+    def places(self, degrees: Float64Array) -> Float64Array:
+        """Convert places on WGS84 to x, y, z in the scene [m], Shape ``[N, 3]``.
+
+        Args:
+            degrees: Longitude [°], latitude [°] and altitude [m], Shape ``[N, 3]``.
+
+        Raises:
+            SetupError: See `to_scene`.
+        """
+        return np.stack(self._transformer().transform(*degrees.T), axis=-1)
 
     def _transformer(self) -> Any:
         try:
@@ -103,6 +117,8 @@ class ImportedScene:
     """Whether the source says that foliage takes nothing from waves."""
     sources: list[dict[str, str | int]] = field(default_factory=list)
     """File, bytes and SHA-256 of each file that was read."""
+    files: dict[str, bytes] = field(default_factory=dict)
+    """Content of other files of its folder, by path: the network of its roads, ``sumo/net.net.xml``."""
     notes: list[str] = field(default_factory=list)
     """Differences between the source and what the scene holds."""
 
@@ -114,6 +130,107 @@ def source_of(file: Path) -> dict[str, str | int]:
         file: A file that was read.
     """
     return {"file": file.name, "bytes": file.stat().st_size, "sha256": file_digest(file)}
+
+
+Box = tuple[float, float, float, float]
+
+
+def box_in_metres(box_deg: Box, origin: Georeference) -> Box:
+    """Lowest x and y, highest x and y [m] of a box on the Earth.
+
+    Args:
+        box_deg: West, south, east, north on WGS84 [°].
+        origin: Of the scene.
+
+    Raises:
+        SetupError: See `Georeference.to_scene`.
+    """
+    west, south, east, north = box_deg
+    corners = [origin.to_scene(lat, lon, origin.altitude_m) for lat in (south, north) for lon in (west, east)]
+    (x0, y0, _), (x1, y1, _) = np.min(corners, axis=0).tolist(), np.max(corners, axis=0).tolist()
+    return x0, y0, x1, y1
+
+
+def cut_to_box(scene: ImportedScene, box: Box) -> None:
+    """Cut a scene to a box.
+
+    What is connected and no larger than the box stays whole where its middle is within, and goes otherwise:
+    a building, a tree. What is larger ends at the border: the ground, or a town that is one surface.
+
+    Args:
+        scene: The scene, which is changed.
+        box: Lowest x and y, highest x and y [m].
+
+    Raises:
+        AssetError: Nothing of the scene is within.
+    """
+    low, high = np.array(box[:2]), np.array(box[2:])
+    names = list(scene.pieces)
+    level = dict(zip(names, are_ground([scene.pieces[name].mesh for name in names]), strict=True))
+    count = len(names)
+    for name in names:
+        piece = scene.pieces.pop(name)
+        triangles = piece.mesh.vertices[piece.mesh.faces]
+        part = np.zeros(len(triangles), np.int64) if level[name] else _connected(piece.mesh)
+        parts = int(part.max(initial=-1)) + 1
+        ends = np.full((2, parts, 2), np.inf)
+        np.minimum.at(ends[0], part, triangles[..., :2].min(axis=1))
+        np.minimum.at(ends[1], part, -triangles[..., :2].max(axis=1))
+        first, last = ends[0], -ends[1]
+        middle = ((first + last) / 2 >= low) & ((first + last) / 2 <= high)
+        large = ((last - first) > high - low).any(axis=1) | level[name]
+        # A volume that is cut is open: it stays whole.
+        cut = large & (piece.kind != "foliage")
+        kept = [triangles[(middle.all(axis=1) & ~cut)[part]], _clipped(triangles[cut[part]], low, high)]
+        corners = np.concatenate(kept).reshape(-1, 3)
+        if len(corners):
+            vertices, places = np.unique(corners, axis=0, return_inverse=True)
+            mesh = Mesh(vertices, places.reshape(-1, 3).astype(np.int32))
+            scene.pieces[name] = replace(piece, mesh=mesh)
+    if not scene.pieces:
+        raise AssetError(f"nothing of the {count} pieces of {scene.name} is within the box; name another one")
+    for antennas in (scene.transmitters_m, scene.receivers_m):
+        inside = [place for place in antennas if (low <= place[:2]).all() and (high >= place[:2]).all()]
+        if len(inside) < len(antennas):
+            scene.notes.append(f"{len(antennas) - len(inside)} antennas outside of the box: left out")
+        antennas[:] = inside
+
+
+def _connected(mesh: Mesh) -> Int64Array:
+    """Number of the connected part of each triangle, by corners at one place, Shape ``[F]``."""
+    from scipy.sparse import coo_array  # type: ignore[import-untyped]
+    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+
+    _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    a, b, c = place.reshape(-1)[mesh.faces].T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    graph = coo_array((np.ones(2 * len(a)), ends), shape=(len(mesh.vertices),) * 2)
+    _, found = np.unique(connected_components(graph, directed=False)[1][a], return_inverse=True)
+    return found.reshape(-1)
+
+
+def _clipped(triangles: Float64Array, low: Float64Array, high: Float64Array) -> Float64Array:
+    """Parts of triangles within a box, as triangles, Shape ``[F, 3, 3]`` to ``[G, 3, 3]``."""
+    for axis, sign, limit in ((0, 1, low[0]), (1, 1, low[1]), (0, -1, -high[0]), (1, -1, -high[1])):
+        distance = sign * triangles[..., axis] - limit
+        inside = distance >= 0
+        made = [triangles[inside.all(axis=1)]]
+        for alone in (True, False):  # whether the corner that differs from both others is within
+            chosen = inside.sum(axis=1) == (1 if alone else 2)
+            turn = (inside[chosen] == alone).argmax(axis=1)[:, None] + np.arange(3)
+            rows = np.arange(len(turn))[:, None]
+            corner, d = triangles[chosen][rows, turn % 3], distance[chosen][rows, turn % 3]
+            share = d[:, :1] / (d[:, :1] - d[:, 1:])
+            first, second = np.moveaxis(
+                corner[:, :1] + share[..., None] * (corner[:, 1:] - corner[:, :1]), 1, 0
+            )
+            if alone:
+                made.append(np.stack([corner[:, 0], first, second], axis=1))
+            else:
+                made.append(np.stack([first, corner[:, 1], corner[:, 2]], axis=1))
+                made.append(np.stack([first, corner[:, 2], second], axis=1))
+        triangles = np.concatenate(made)
+    return triangles
 
 
 def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | None = None) -> None:
@@ -168,7 +285,7 @@ def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | Non
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
             made = Path(temporary) / "scene"
-            for path, content in {**files, **(more or {})}.items():
+            for path, content in {**files, **scene.files, **(more or {})}.items():
                 (made / path).parent.mkdir(parents=True, exist_ok=True)
                 (made / path).write_bytes(content)
             shutil.move(made, out)

@@ -13,6 +13,7 @@ from fnmatch import fnmatchcase
 from typing import Annotated, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import ScenarioError, suggestion
@@ -172,6 +173,24 @@ OBJECT_MATERIAL = "caviar-object-"
 BODY_THICKNESS = 0.1
 """[m]; of the walls of bodies, where a scenario does not say."""
 
+
+def of_thickness(name: str, thickness_m: float) -> str:
+    """Name a material of the walls of one thickness [m].
+
+    Example:
+        >>> of_thickness("itu_concrete", 0.2), without_thickness("itu_concrete, solid 0.2 m")
+        ('itu_concrete, solid 0.2 m', 'itu_concrete')
+    """
+    return f"{name}{_SOLID}{thickness_m:g} m"
+
+
+def without_thickness(name: str) -> str:
+    """Name of the material that one for a solid wall (`of_thickness`) is of."""
+    return name.partition(_SOLID)[0]
+
+
+_SOLID = ", solid "
+
 OutsideRange = Literal["error", "nearest", "extrapolate"]
 """Where a carrier lies in none of the ranges that ITU-R P.2040 defines a material in: refuse it; take the
 constants of the nearest end of a range; or follow the power law of that range beyond its end."""
@@ -235,12 +254,14 @@ class MaterialPolicy:
     """Of the settings in the scenario, for messages."""
 
     def changes_of(self, name: str) -> MaterialSettings:
-        """Changes of a material.
+        """Changes of a material; of one for a solid wall (`of_thickness`) those of the other, but thickness.
 
         Args:
             name: Of the material.
         """
-        return self.changes.get(name, MaterialSettings())
+        base = without_thickness(name)
+        found = self.changes.get(name) or self.changes.get(base, MaterialSettings())
+        return found if base == name else replace(found, thickness_m=None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -60,6 +60,8 @@ class SceneryShape:
     """Where it stands, for messages: file, line and name."""
     radio: RadioBsdf | None = None
     """Its material for radio waves; None where it has no constants."""
+    kind: str = "ply"
+    """Type of the shape; ``rectangle`` and ``cube`` have the description in place of a mesh."""
 
 
 @dataclass(frozen=True)
@@ -220,15 +222,16 @@ def asset_name(description: Path | None) -> str:
     return f"scenery/{description.name}" if description else "the empty scene"
 
 
-def read_scenery(file: Path, called: str = "") -> Scenery:
+def read_scenery(file: Path, called: str = "", kinds: Sequence[str] = ("ply",)) -> Scenery:
     """Read a scene description; every mesh it names lies in its folder or below.
 
     Args:
         file: The description.
         called: What errors call the file, where its path would mean nothing to the user: a copy.
+        kinds: Types of shapes that are read.
 
     Raises:
-        AssetError: The XML is broken, a shape is of another type than ``ply``, a mesh is missing, an id
+        AssetError: The XML is broken, a shape is of another type, a mesh is missing, an id
             occurs twice, a name is that of two different materials, or ITU-R P.2040 has no such material;
             names file, line, shape or material, and the remedy.
     """
@@ -243,7 +246,7 @@ def read_scenery(file: Path, called: str = "") -> Scenery:
     for element in root.findall("shape"):
         given = element.get("id") or element.get("name") or ""
         where = f"{called}:{lines[element]}: shape {given!r}"
-        shape = _shape(where, file.parent, element, materials, radio)
+        shape = _shape(where, file, element, materials, radio, kinds)
         if shape.name in shapes:
             raise AssetError(
                 f"{where}: another shape is named {shape.name!r}, too; give each an id of its own"
@@ -391,18 +394,22 @@ def _radio_xml(bsdf: ElementTree.Element, itu: str, version: str) -> str:
 
 def _shape(
     where: str,
-    folder: Path,
+    file: Path,
     element: ElementTree.Element,
     materials: Mapping[str, ElementTree.Element],
     radio: Mapping[ElementTree.Element, RadioBsdf],
+    kinds: Sequence[str],
 ) -> SceneryShape:
-    given = element.get("id") or element.get("name") or ""
-    if element.get("type") != "ply":
-        raise AssetError(f"{where} is of type {element.get('type')!r}; export it as a PLY mesh, type='ply'")
+    given, kind = element.get("id") or element.get("name") or "", element.get("type", "")
+    if kind not in kinds:
+        raise AssetError(f"{where} is of type {kind!r}; export it as a PLY mesh, type='ply'")
     filename = element.find("string[@name='filename']")
-    if filename is None or not filename.get("value"):
+    if kind in ("rectangle", "cube"):
+        mesh = file
+    elif filename is None or not filename.get("value"):
         raise AssetError(f"{where} names no file; give it <string name='filename' value='meshes/….ply'/>")
-    mesh = folder / PurePosixPath(filename.get("value", ""))
+    else:
+        mesh = file.parent / PurePosixPath(filename.get("value", ""))
     if not mesh.is_file():
         raise AssetError(f"{where}: mesh {mesh} is missing; put it there, or remove the shape")
     transform = element.find("transform[@name='to_world']")
@@ -418,6 +425,7 @@ def _shape(
         place=where,
         colour=None if material is None else _colour(where, material),
         radio=None if material is None else radio.get(material),
+        kind=kind,
     )
 
 

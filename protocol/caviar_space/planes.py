@@ -321,6 +321,8 @@ class PlaneTable:
         self.low = np.zeros((count, 3))
         """Box around the triangles of each plane [m]."""
         self.high = np.zeros((count, 3))
+        # Of triangles, over the axes: planes of thousands are searched, the ground with all floors on it.
+        self._lows, self._highs = np.zeros((2, 3, len(numbers)))
         self._joined: Sequence[Int64Array] = ()
 
     def update(self, corners: Float64Array, planes: Int64Array | None = None) -> None:
@@ -348,8 +350,10 @@ class PlaneTable:
         self.origin[planes] = a[chosen]
         length = np.sqrt(largest)[:, None]
         self.normal[planes] = normal[chosen] / np.where(length > 0, length, 1.0)
-        self.low[planes] = np.minimum.reduceat(np.minimum(np.minimum(a, b), c), begin)
-        self.high[planes] = np.maximum.reduceat(np.maximum(np.maximum(a, b), c), begin)
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        self._lows[:, order], self._highs[:, order] = low.T, high.T
+        self.low[planes] = np.minimum.reduceat(low, begin)
+        self.high[planes] = np.maximum.reduceat(high, begin)
 
     def join(self, groups: Sequence[Int64Array]) -> None:
         """Take planes for one surface, until `update` is called for the first of each group: the box of the
@@ -381,6 +385,27 @@ class PlaneTable:
         sizes = self._sizes[planes]
         return self._order[ranges(self._begin[planes], sizes)[1]], sizes
 
+    def touching(
+        self, planes: Int64Array, low: Float64Array, high: Float64Array
+    ) -> tuple[Int64Array, Int64Array]:
+        """Triangles of planes whose box touches another one.
+
+        Args:
+            planes: Numbers, Shape ``[N]``.
+            low, high: Of a box for each plane [m], Shape ``[N, 3]`` each.
+
+        Returns:
+            Row of the plane, and the triangle, in ascending order of both, Shape ``[M]`` each.
+        """
+        row, place = ranges(self._begin[planes], self._sizes[planes])
+        triangle = self._order[place]
+        for axis in range(3):
+            kept = (self._lows[axis, triangle] <= high[row, axis]) & (
+                low[row, axis] <= self._highs[axis, triangle]
+            )
+            row, triangle = row[kept], triangle[kept]
+        return row, triangle
+
     def first_holding(self, triangles: Int64Array, points: Float64Array) -> Int64Array:
         """Find the first triangle of the same surface that holds a point too.
 
@@ -394,8 +419,8 @@ class PlaneTable:
         if not len(triangles):
             return triangles
         plane = self._numbers[triangles]
-        hit, place = ranges(self._begin[plane], self._sizes[plane])
-        candidate = self._order[place]
+        # At an acute corner a rim reaches farther than its width.
+        hit, candidate = self.touching(plane, points - 100 * _RIM, points + 100 * _RIM)
         held = _holds(self._corners[self._faces[candidate]], points[hit])
         first = triangles.copy()
         # Within a plane triangles are in ascending order.
@@ -629,16 +654,10 @@ class CoplanarFaces:
 
     def _touched(self, body: Int64Array, still: Int64Array) -> Int64Array:
         """First triangle of scenery, for pairs of planes, whose box the body's face touches; −1: none."""
-        triangles, sizes = self._table.triangles_of(still)
-        own = np.repeat(np.arange(len(still)), sizes)
-        corners = self._table.corners_of(triangles)
-        plane = body[own]
-        touch = (corners.min(1) <= self._table.high[plane] + _TOUCHING) & (
-            self._table.low[plane] <= corners.max(1) + _TOUCHING
-        )
-        hits = touch.all(1)
+        low, high = self._table.low[body] - _TOUCHING, self._table.high[body] + _TOUCHING
+        own, triangles = self._table.touching(still, low, high)
         found = np.full(len(body), np.iinfo(np.int64).max)
-        np.minimum.at(found, own[hits], triangles[hits])
+        np.minimum.at(found, own, triangles)
         return np.where(found < np.iinfo(np.int64).max, found, -1)
 
     def _coplanar(self, one: Int64Array, other: Int64Array) -> BoolArray:

@@ -24,6 +24,7 @@ PACKAGES = (
     "caviar_clients",
     "caviar_formats",
     "caviar_labs",
+    "caviar_scenes",
     "caviar",
 )
 HEAVY = (

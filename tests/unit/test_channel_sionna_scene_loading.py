@@ -99,8 +99,22 @@ DIFFUSE = '<bsdf type="diffuse" id="{}"/>\n'
             ["itu_concrete"] * 2,
         ),
         (CONCRETE.format("wall", ""), ["wall"] * 2, ["wall"] * 2),
+        (
+            '<bsdf type="twosided" id="mat-itu_concrete"><bsdf type="principled" id="inner"/></bsdf>\n',
+            ["mat-itu_concrete"] * 2,
+            ["itu_concrete"] * 2,
+        ),
     ],
-    ids=["plain", "numbered", "two names", "copy", "another thickness", "parameter", "a shape's name"],
+    ids=[
+        "plain",
+        "numbered",
+        "two names",
+        "copy",
+        "another thickness",
+        "parameter",
+        "a shape's name",
+        "two sides",
+    ],
 )
 def test_materials_of_exported_scenes_have_the_constants_that_they_say(
     tmp_path: Path, materials: str, used: Sequence[str], names: Sequence[str]

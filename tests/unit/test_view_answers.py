@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -289,3 +290,26 @@ def test_a_run_that_goes_on_holds_its_newest_frames(tmp_path: Path, monkeypatch:
         frames.add_answers({"link": {"first": first, "rows": rows}})
     assert frames.known_answers() == {"link": 3}
     assert frames.answers() == {"link": {(0, 0): (5, 0, 2), (0, 1): (9, 1, 4), (0, 2): (12, 0, 1)}}
+
+
+def test_a_radio_map_beside_the_recording_is_shown(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mapped"
+    shutil.copytree(run, folder)
+
+    def answers_of() -> Answers:
+        return Answers(RecordedFrames(Recording(folder)))
+
+    assert asked(answers_of(), "about")["radio_map"] is False
+    with pytest.raises(NotThereError):
+        asked(answers_of(), "radio-map")
+    gain = np.array([[[-90.0, np.nan], [-np.inf, -70.0]], [[-80.0, np.nan], [-100.0, -75.0]]])
+    np.savez(folder / "radio-map.npz", x=[1.0, 3.0], y=[5.0, 7.0], z=[[0.5, 0.5], [np.nan, 1.5]], gain=gain)
+    found = answers_of()
+    assert asked(found, "about")["radio_map"] is True
+    shown = asked(found, "radio-map")
+    assert (shown["x"], shown["y"], shown["every"]) == ([1.0, 3.0], [5.0, 7.0], 1)
+    assert shown["gain_db"] == [[-80.0, None], [None, -70.0]]  # the strongest; no signal, no height: none
+    assert (shown["z"][0][0], shown["z"][1][1]) == (0.5, 1.5)
+    (folder / "radio-map.npz").write_bytes(b"PK\x03\x04 damaged")
+    with pytest.raises(RecordingError, match="radio-map"):
+        asked(answers_of(), "radio-map")

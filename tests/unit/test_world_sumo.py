@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.space.coordinates import euler_from_quaternion, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.service import Frame, Preparation, RunInfo
+from caviar_services.world.carriages import carriages
 from caviar_services.world.sumo import SumoSettings, SumoWorld
 from caviar_services.world.sumo_conventions import PLACED, step_length_ms
 from caviar_services.world.sumo_process import load_libsumo
@@ -63,6 +65,7 @@ print(digest.hexdigest())
 INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path
+from xml.etree import ElementTree
 from caviar_protocol.codec import encode_payload
 from caviar_services.service import Frame, Preparation, RunInfo
 from caviar_services.world.sumo_conventions import PLACED
@@ -183,6 +186,84 @@ def test_pose_and_velocity_on_a_slope_by_hand(make: Make, ramp: tuple[Path, np.n
         assert np.linalg.norm(bumper - begin - places[-1] * forward) < 0.01
         assert scene.velocity[0] == pytest.approx(12.0 * forward, abs=1e-3)
     assert np.diff(places) == pytest.approx(1.2, abs=1e-3)
+
+
+TRACK_NODES = """<nodes><node id="a" x="-300" y="0" z="0"/><node id="b" x="0" y="0" z="3" radius="{radius}"/>
+  <node id="c" x="0" y="300" z="9" radius="{radius}"/><node id="d" x="300" y="300" z="9"/></nodes>"""
+TRACK_EDGES = """<edges><edge id="ab" from="a" to="b" {lane}/><edge id="bc" from="b" to="c" {lane}/>
+  <edge id="cd" from="c" to="d" {lane}/></edges>"""
+TRAIN = """<routes><vType id="ice" vClass="{vclass}" length="{length}"/>
+  <vehicle id="T" type="ice" depart="0" departPos="{length}" departSpeed="15">
+    <route edges="ab bc cd"/></vehicle>
+</routes>"""
+
+
+def track_distance(folder: Path, points: np.ndarray) -> float:
+    """Largest distance of points from the lanes of SUMO's network [m]."""
+    root = ElementTree.parse(folder / "r.net.xml").getroot()  # noqa: S314
+    shapes = [lane.get("shape", "").split() for lane in root.iter("lane")]
+    lanes = [np.array([[*map(float, p.split(",")), 0.0][:3] for p in shape]) for shape in shapes]
+    a = np.concatenate([lane[:-1] for lane in lanes])
+    along = np.concatenate([lane[1:] - lane[:-1] for lane in lanes])
+    off = points[:, None] - a
+    share = np.clip((off * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12), 0, 1)
+    return float(np.linalg.norm(off - share[..., None] * along, axis=-1).min(axis=1).max())
+
+
+@pytest.mark.parametrize(
+    ("vclass", "length", "radius", "count", "chosen"),
+    [("rail", 200.0, 1.5, 8, {}), ("tram", 32.0, 12.0, 4, {}), ("trailer", 16.5, 6.0, 2, {}),
+     ("truck", 20.0, 6.0, 4, {"ice": 5.0})],
+)  # fmt: skip
+def test_carriages_stay_on_the_track_through_right_angles(
+    make: Make,
+    tmp_path: Path,
+    vclass: str,
+    length: float,
+    radius: float,
+    count: int,
+    chosen: dict[str, float],
+) -> None:
+    (tmp_path / "r.nod.xml").write_text(TRACK_NODES.format(radius=radius))
+    lane = f'numLanes="1" speed="15" spreadType="center" allow="{vclass}"'
+    (tmp_path / "r.edg.xml").write_text(TRACK_EDGES.format(lane=lane))
+    (tmp_path / "r.rou.xml").write_text(TRAIN.format(vclass=vclass, length=length))
+    converted(tmp_path)
+    files = {"net": str(tmp_path / "r.net.xml"), "routes": str(tmp_path / "r.rou.xml")}
+    world = make(**files, carriages=chosen, begin_s=1.0)
+    heads: list[np.ndarray] = []
+    for scene in scenes(world, 1, 700):
+        if not scene.names:
+            break
+        assert scene.names == ("traffic.T", *(f"traffic.T/{k}" for k in range(1, count)))
+        axes = np.array([rotation_matrix(q) for q in scene.orientation.tolist()])
+        half = scene.dimensions[:, :1] / 2
+        assert scene.dimensions[:, 0] == pytest.approx(length / count)
+        floor = scene.position - scene.dimensions[:, 2:] / 2 * axes[:, :, 2]
+        front, rear = floor + half * axes[:, :, 0], floor - half * axes[:, :, 0]
+        assert np.linalg.norm(front[1:] - rear[:-1], axis=1).max(initial=0) < 1e-6  # coupled
+        assert track_distance(tmp_path, np.concatenate([front, rear])) < 0.01
+        heads.append(front[0])
+    assert len(heads) > 200
+    assert min(head[0] for head in heads) < -80
+    assert max(head[1] for head in heads) > 100
+
+
+def test_carriages_move_as_rigid_bodies() -> None:
+    """Velocities and yaw rates are those by which ends move when the front goes on along the way."""
+    angles = np.linspace(0, np.pi, 400)
+    bend = [(40 * math.sin(a), 40 - 40 * math.cos(a), 0.02 * a) for a in angles]
+    way = [*reversed(bend), (-300.0, 0.0, 0.0)]
+    speed, step = 14.0, 1e-5
+    start, end = np.array(way[1]), np.array(way[0])
+    forward = (end - start) / np.linalg.norm(end - start)
+    later = [tuple(end + speed * step * forward), *way[1:]]
+    before, after = (carriages(points, 150.0, 6, speed) for points in (way, later))
+    for one, two in zip(before, after, strict=True):
+        middles = [(np.array(c.front) + c.rear) / 2 for c in (one, two)]
+        assert (middles[1] - middles[0]) / step == pytest.approx(one.velocity, abs=1e-3)
+        yaws = [math.atan2(c.front[1] - c.rear[1], c.front[0] - c.rear[0]) for c in (one, two)]
+        assert (yaws[1] - yaws[0]) / step == pytest.approx(one.yaw_rate, abs=1e-4)
 
 
 def test_a_placed_network_moves_everything_with_it(make: Make) -> None:
@@ -679,6 +760,25 @@ def test_an_episode_of_one_traffic_begins_where_a_run_comes_that_long_after_the_
     assert (first.names, first.position.tolist()) == (then.names, then.position.tolist())
     # Who came first carries the receivers: the order of departure is that of the run.
     assert [device.name for device in first.devices] == [device.name for device in then.devices]
+
+
+def test_people_walk_on_in_an_episode_of_one_traffic(
+    make: Make, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = repository / "deploy" / "caviar_scenarios" / "crossing"
+    files = {key: str(folder / name) for key, name in CROSSING.items()}
+    found = []
+    for settings, episode in (({"begin_s": 30.0, "between_episodes_s": 30.0}, 1), ({"begin_s": 60.0}, 0)):
+        world = make(**files, **settings)
+        world.reset(episode, 3, 0)
+        scene = scene_at(world, 0)
+        found.append(dict(zip(scene.names, scene.position.tolist(), strict=True)))
+        assert list(scene.classes).count("pedestrian") > 10
+    shared, passed = found
+    assert shared.keys() == passed.keys()
+    for name, place in shared.items():
+        assert place == pytest.approx(passed[name], abs=1e-3), name
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, 0.25, math.inf])

@@ -35,8 +35,10 @@ PERIOD_S = 0.04
 """[s] from one frame that is shown to the next at least: more than a screen needs."""
 AGAIN_S = 1.0
 """[s] after which a broker that has disconnected the observer is asked again."""
+NEWS_S = 0.1
+"""[s] between news of a run at least."""
 QUIET_S = 0.5
-"""[s] between news of a run that makes no frames."""
+"""[s] between news of a run that makes no frames, and between questions to the broker."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -95,6 +97,9 @@ class LiveView:
         self._ask, self._record = ask, RunDirectory(directory).record
         self._observed = endpoint, PAGE, EVERYTHING, credentials
         self._starting = asyncio.Lock()
+        self._asking = asyncio.Lock()
+        self._told: Mapping[str, Any] = {}
+        self._why_at = 0.0
         self._answers: Answers | None = None
         self._frames: LiveFrames | None = None
         # Why there is no observer now, and why the run is over; empty while there is none.
@@ -154,23 +159,28 @@ class LiveView:
 
     async def news(self) -> AsyncIterator[bytes]:
         """Server-sent events about new frames, and what the run does; without any, one in `QUIET_S`."""
-        answers = await self.answers("news")
-        frames, told, said_at = answers.frames, -1, 0.0
+        frames, told, said_at = (await self.answers("news")).frames, -1, 0.0
         while not self._ended:
-            now = time.monotonic()
-            if frames.end != told or now - said_at > QUIET_S:
-                try:
-                    why = (await self._ask(do="why"))["why"]
-                except RunError:  # a broker that is busy, or that has ended, as the observer finds out
-                    await asyncio.sleep(QUIET_S)
-                    continue
-                added = answers.blocks(told)
-                told, said_at = frames.end, now
+            if frames.end != told or time.monotonic() - said_at > QUIET_S:
+                why = await self._why()
+                added = self._answers.blocks(told) if self._answers else []
+                told, said_at = frames.end, time.monotonic()
                 event = {key: why.get(key) for key in ("state", "paused", "waits")}
                 event |= {"first": frames.first, "frames": told, "added": added}
                 yield f"data: {json.dumps(event)}\n\n".encode()
-            await asyncio.sleep(PERIOD_S)
+            await asyncio.sleep(NEWS_S)
         yield f"data: {json.dumps({'ended': self._ended})}\n\n".encode()
+
+    async def _why(self) -> Mapping[str, Any]:
+        """What the run waits for, as the broker said at most `QUIET_S` ago, for all pages."""
+        async with self._asking:
+            if time.monotonic() - self._why_at > QUIET_S:
+                try:
+                    self._told = (await self._ask(do="why"))["why"]
+                except RunError:  # a broker that is busy, or that has ended, as the observer finds out
+                    await asyncio.sleep(QUIET_S)
+                self._why_at = time.monotonic()
+            return self._told
 
 
 Views = Mapping[str, Callable[[str], Awaitable[Answers]]]

@@ -191,11 +191,15 @@ def scenarios() -> None:
 @app.command(rich_help_panel=RUN)
 def new(
     name: Annotated[str, typer.Argument(help="name of the scenario, or path of its file")],
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="folder of an imported scene: traffic, people, base stations and a UAV in it"),
+    ] = None,
 ) -> None:
     """Write a scenario of your own to edit, with comments; it runs as it is, on the base install."""
     from caviar_clients.cli.scenarios import new_scenario
 
-    path = new_scenario(name)
+    path = new_scenario(name, scene)
     typer.echo(f"{path} is a scenario to edit; run it with: caviar run {path}")
 
 

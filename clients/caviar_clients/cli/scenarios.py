@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from importlib import resources
 from pathlib import Path
+from pkgutil import resolve_name
 
+import typer
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
@@ -20,6 +22,8 @@ from caviar_services.registry import load
 
 TEMPLATE = "new/scenario.toml"
 """The scenario that `caviar new` writes, in the package of scenarios."""
+# Of a package above this one, which knows the scenes that are imported.
+_TOWN = "caviar_scenes.town:new_town"
 _TEMPLATE_NAME = 'name = "my-scenario"'
 # A name of a run becomes part of a directory's name and of ids on the wire.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -86,11 +90,12 @@ def _needs(extras: tuple[str, ...]) -> Text:
     return text
 
 
-def new_scenario(name: str) -> Path:
+def new_scenario(name: str, scene: Path | None = None) -> Path:
     """Write a commented scenario to edit.
 
     Args:
         name: Of the scenario, for ``NAME.toml`` in this folder, or the path of a file ``….toml``.
+        scene: Folder of an imported scene, on whose streets it is; None: it has boxes alone.
 
     Returns:
         The file.
@@ -98,6 +103,8 @@ def new_scenario(name: str) -> Path:
     Raises:
         RunError: The file exists or cannot be written, or the name is none of a run or that of another kind
             of file.
+        AssetError: The folder is no scene, or its network is damaged.
+        SetupError: SUMO is not installed.
     """
     path = Path(name if name.endswith(".toml") else f"{name}.toml")
     suffix = Path(name).suffix
@@ -105,6 +112,9 @@ def new_scenario(name: str) -> Path:
         raise RunError(f"a scenario is a TOML file, not {suffix}: write {Path(name).with_suffix('.toml')}")
     if _NAME.fullmatch(path.stem) is None:
         raise RunError(f"{path.stem!r} is no name of a scenario: use letters, digits, '_', '.' and '-'")
+    if scene is not None:
+        resolve_name(_TOWN)(path, scene, say=typer.echo)
+        return path
     text = (resources.files("caviar_scenarios") / TEMPLATE).read_text()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -271,8 +271,9 @@ def covered_objects(scene: Scene, roofs: Iterable[Footprints]) -> Iterator[tuple
         pose = object_pose(scene, i)
         corners = (unit * scene.dimensions[i]) @ rotation_matrix(pose.orientation).T + np.array(pose.position)
         count = 0
+        around = (low <= corners[:, :2].max(axis=0)) & (high >= corners[:, :2].min(axis=0))
+        near = np.flatnonzero(around.all(axis=1))
         for x, y in corners[:, :2]:
-            near = ((low <= (x, y)) & (high >= (x, y))).all(axis=1)
             to = np.array((x, y)) - a[near]
             side = edges[near, :, 0] * to[..., 1] - edges[near, :, 1] * to[..., 0]
             count += bool(((side >= 0).all(axis=1) | (side <= 0).all(axis=1)).any())

@@ -4,6 +4,7 @@ import { el, fixed } from "./dom";
 import { first, type Want } from "./frames";
 import { type KeyAction, listenToKeys } from "./keys";
 import { Live } from "./live";
+import { Pace } from "./pace";
 import { Banner } from "./panels/banner";
 import { Dock } from "./panels/dock";
 import { Header, toggleTheme } from "./panels/header";
@@ -19,7 +20,7 @@ import type { Pose } from "./scene/pose";
 import { isSoftware, Stage } from "./scene/stage";
 import { DARK, LIGHT } from "./scene/theme";
 import type { Hit } from "./scene/view";
-import { isSaved, replaceFragment, type Source, takeToken } from "./source";
+import { isOnThisMachine, isSaved, replaceFragment, type Source, takeToken } from "./source";
 import { type Changed, fromFragment, type Mode, SPEEDS, type Store, toFragment, type ViewState } from "./state";
 import type { Timeline } from "./timeline";
 import type { About, News, User, Vector } from "./types";
@@ -48,6 +49,7 @@ export class App {
   private readonly origin: Vector;
   private loading: AbortController | null = null;
   private writing = 0;
+  private readonly pace: Pace;
   private different = { objects: new Set<string>(), receivers: new Set<string>() };
 
   constructor(
@@ -62,7 +64,10 @@ export class App {
     this.n = this.placeOf(store.state);
     this.player = new Player(this.timeline, store, (n) => this.go(n), () => this.updateTransport());
     const { quality } = store.state;
-    const isFine = quality === "fine" || (quality === "auto" && !isSoftware());
+    const software = isSoftware();
+    const isFine = quality === "fine" || (quality === "auto" && !software);
+    this.pace = new Pace(software && isOnThisMachine());
+    for (const { view } of this.runs) view.beams.isFine = isFine;
     this.stage = new Stage(this.origin, isFine, () => this.keepCamera(), (hit) => this.pick(hit));
     this.stage.canvas.addEventListener("webglcontextlost", () => this.report("The browser gave up the picture: reload the page."));
     this.layers = new LayersPanel(store, about);
@@ -72,7 +77,10 @@ export class App {
       ? new Live(
           runs[0].source,
           (news) => void this.hear(news),
-          (reason) => this.banner.show(`The run has ended. ${reason}`),
+          (reason) => {
+            this.pace.setBusy(false);
+            this.banner.show(`The run has ended. ${reason}`);
+          },
           (text) => this.report(text),
         )
       : null;
@@ -84,7 +92,7 @@ export class App {
       follow: () => this.follow(),
     });
     const actions = this.keyActions();
-    const header = new Header(store, runs.map((run) => run.about), isSaved(), () => this.goHome(), () => showHelp(actions));
+    const header = new Header(store, runs.map((run) => run.about), isSaved(), this.pace.rests, () => this.goHome(), () => showHelp(actions));
     const overlays = [this.layers, this.inspector, this.pictures, this.banner].map(({ element }) => element);
     document.body.append(
       el(
@@ -207,7 +215,8 @@ export class App {
     else this.placeCamera();
     this.stage.refresh();
     this.announce();
-    if (!this.player.playing) setTimeout(() => void this.loadTrails(n, signal), IDLE_MS);
+    // A run that is followed fills the trails by itself.
+    if (!this.player.playing && !this.following) setTimeout(() => void this.loadTrails(n, signal), IDLE_MS);
   }
 
   /** Ask again which frames there are, where a live run began another episode. */
@@ -302,7 +311,7 @@ export class App {
 
   private updateTransport(): void {
     const { state } = this.store;
-    this.transport.update(this.n, this.player.playing, this.about.live && state.n === null, state);
+    this.transport.update(this.n, this.player.playing, this.following, state);
   }
 
   /** Follow the selection with the camera, or look from it. */
@@ -347,16 +356,29 @@ export class App {
   private async hear(news: News): Promise<void> {
     this.timeline.grow(news.first, news.added);
     this.dock.setNews(news);
+    this.pace.setBusy(!news.paused);
     // What is looked at is forgotten: the oldest frame that is held stands for it.
     if (this.n < this.timeline.first && this.store.state.n !== null) this.store.set({ n: this.timeline.first });
     if (this.catchingUp) return;
     // One frame after the other: each newer one would break off the one before, and none would be shown.
     this.catchingUp = true;
-    while (this.store.state.n === null && this.n !== this.timeline.last) await this.show(this.timeline.last);
+    while (this.following && this.n !== this.timeline.last) {
+      const begin = performance.now();
+      await this.show(this.timeline.last);
+      if (!this.pace.rests) continue;
+      this.stage.finish();
+      await this.pace.rest(performance.now() - begin);
+    }
     this.catchingUp = false;
-    this.redraw();
+    void this.dock.update(this.n, this.users().user);
+    this.updateTransport();
   }
   private catchingUp = false;
+
+  /** Whether the newest frame of a live run is shown. */
+  private get following(): boolean {
+    return this.about.live && this.store.state.n === null;
+  }
 
   /** Report an error where the reader sees it. */
   report(text: string): void {
@@ -460,7 +482,7 @@ export class App {
       frame: instant?.frame ?? null,
       t_s: instant?.t_s ?? null,
       playing: this.player.playing,
-      live: this.about.live && state.n === null,
+      live: this.following,
       frames: this.timeline.count,
       news: this.live?.news ?? null,
       selected: state.sel,

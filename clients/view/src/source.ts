@@ -54,6 +54,11 @@ function store(value: string): void {
   }
 }
 
+/** Whether the answers come from the machine that the browser runs on. */
+export function isOnThisMachine(): boolean {
+  return /^(localhost|127\.[\d.]+|\[::1\])$/.test(location.hostname);
+}
+
 function readSaved(): Record<string, string> | null {
   const element = document.getElementById("saved");
   return element?.textContent ? (JSON.parse(element.textContent) as Record<string, string>) : null;

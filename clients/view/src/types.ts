@@ -131,7 +131,7 @@ export interface News {
   first: number;
   state: string;
   paused: boolean;
-  waits: { service: string; what: string; elapsed_s: number }[];
+  waits: { service: string; frame: number; elapsed_s: number; limit_s: number }[];
   /** Frames that came since the news before. */
   added: Block[];
   /** Why there are no more. */

@@ -161,6 +161,8 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["format", name, _]:
                 order = _BYTE_ORDERS[name]
             case ["element", name, count]:
+                if int(count) < 0:
+                    raise ValueError(f"{count} of element {name}")
                 elements.append(_Element(name, int(count)))
             case ["property", "list", length, item, name]:
                 elements[-1].properties.append((name, _TYPES[length], _TYPES[item]))

@@ -11,12 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Protocol
+from typing import Literal, Protocol
 
 from caviar_protocol.errors import AssetError
-from caviar_space.imported_scenes import Georeference, ImportedScene
-
-Box = tuple[float, float, float, float]
+from caviar_space.imported_scenes import Box, Georeference, ImportedScene, box_in_metres, cut_to_box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +33,8 @@ class Request:
     """Material in ITU-R P.2040 of what the source gives none."""
     materials: Mapping[str, str] = field(default_factory=dict)
     """Material in ITU-R P.2040 by the name that the source gives."""
+    up: Literal["y", "z"] = "z"
+    """Axis that points up in sources of meshes that do not say: OBJ, PLY, STL, Mitsuba."""
     lod: str = ""
     """Level of detail to take, where the source has several; empty: the finest."""
     error_m: float = 0.0
@@ -60,11 +60,24 @@ READERS: Mapping[str, tuple[tuple[str, ...], str]] = {
     "wireless-insite": (
         (".study.xml", ".city", ".ter", ".object", ".veg"), f"{_SOURCES}.wireless_insite:read_project",
     ),
+    "openstreetmap": ((".osm", ".osm.pbf", ".osm.bz2", ".osm.gz", ".geojson"),
+                      f"{_SOURCES}.openstreetmap:read_map"),
+    "3d-tiles": (("tileset.json",), f"{_SOURCES}.tiles3d:read_tileset"),
+    "cityjson": ((".city.json", ".json", ".jsonl"), f"{_SOURCES}.cityjson:read_cityjson"),
+    "gltf": ((".glb", ".gltf"), f"{_SOURCES}.gltf:read_gltf"),
+    "obj": ((".obj",), f"{_SOURCES}.mesh_files:read_obj"),
+    "ply": ((".ply",), f"{_SOURCES}.mesh_files:read_ply_scene"),
+    "stl": ((".stl",), f"{_SOURCES}.mesh_files:read_stl"),
+    "dxf": ((".dxf",), f"{_SOURCES}.dxf:read_dxf"),
+    "mitsuba": ((".xml",), f"{_SOURCES}.mitsuba:read_mitsuba"),
 }  # fmt: skip
 """Ends of the names of files, and the place of the reader, by the name of the format.
 
 Of several ends that fit, the longest counts. A folder is of the first format of whose files it has some.
 """
+
+# They have more within the box than triangles, roads, and no heights of the ground.
+_MAPS = ("openstreetmap",)
 
 
 def read_source(path: Path, request: Request | None = None, form: str = "") -> ImportedScene:
@@ -85,8 +98,26 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
     name = form or _format_of(path)
     if name not in READERS:
         raise AssetError(f"{path}: no format of scenes {name!r}; write --format: {', '.join(READERS)}")
-    reader: Reader = resolve_name(READERS[name][1])
-    return reader(path, request)
+    if request.heights and name not in _MAPS:
+        raise AssetError(f"{path} has its own ground; heights are for maps: {', '.join(_MAPS)}")
+    ends, reader_place = READERS[name]
+    if path.is_dir() and name != "wireless-insite":
+        files = sorted(file for file in path.iterdir() if file.name.lower().endswith(ends))
+        if len(files) != 1:
+            said = ", ".join(file.name for file in files[:5]) or "none"
+            raise AssetError(f"{path} has {len(files)} files of {name} ({said}); name one")
+        path = files[0]
+    reader: Reader = resolve_name(reader_place)
+    scene = reader(path, request)
+    scene.origin = scene.origin or request.origin
+    box = request.box_m
+    if request.box_deg:
+        if scene.origin is None:
+            raise AssetError(f"{path} has no place on the Earth; write --origin LAT,LON, or --box-m")
+        box = box_in_metres(request.box_deg, scene.origin)
+    if box and name not in _MAPS:
+        cut_to_box(scene, box)
+    return scene
 
 
 def _format_of(path: Path) -> str:
@@ -97,4 +128,11 @@ def _format_of(path: Path) -> str:
         for end in ends
         if any(name.endswith(end) for name in names)
     ]
-    return max(fitting, default=(0, ""))[1]
+    found = max(fitting, default=(0, ""))[1]
+    if found == "cityjson" and path.is_file():  # .json says little
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+        for word, form in ((b'"geometricError"', "3d-tiles"), (b'"FeatureCollection"', "openstreetmap")):
+            if word in head:
+                return form
+    return found

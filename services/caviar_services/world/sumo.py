@@ -27,6 +27,7 @@ from caviar_protocol.topics.scene import BESIDE_ROAD_PREFIX, SIMULATOR_SAYS_PREF
 from caviar_services.checkpoint import restored, saved
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 from caviar_services.world.base import ObjectState, World, WorldSettings, turning
+from caviar_services.world.carriages import LENGTHS_M, Ways, carriage_count, carriages
 from caviar_services.world.sumo_commands import Commanded, carry_out, traffic_commands
 from caviar_services.world.sumo_conventions import (
     Heading,
@@ -36,6 +37,7 @@ from caviar_services.world.sumo_conventions import (
     check_spacing,
     distance_to_line,
     heading,
+    in_scene,
     object_class,
     step_length_ms,
 )
@@ -85,6 +87,14 @@ class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     """Class of an object by the id of its vehicle type, or by vClass: ``{ Lorry = "truck" }``."""
     meshes: tuple[str, ...] = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "truck")
     """Classes that have a mesh of their own; objects of others are boxes."""
+    carriages: Annotated[
+        dict[str, float],
+        quantity(
+            "m",
+            "length of the carriages of long vehicles by vehicle type or vClass, 0: one rigid body; trains, "
+            "trams and lorries with trailers have carriages unless it says otherwise",
+        ),
+    ] = msgspec.field(default_factory=dict)
     options: tuple[str, ...] = ()
     """More of SUMO's command line: ``["--lanechange.duration", "2"]``."""
 
@@ -94,6 +104,8 @@ class _Kind(NamedTuple):
 
     class_: str
     dimensions: Vector
+    carriages: int = 1
+    """Of each this many, end to end."""
 
 
 class _State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -227,6 +239,7 @@ class SumoWorld(World[SumoSettings]):
     def _begin_here(self, simulation: Simulation) -> None:
         """Count steps from here on; nothing turns, and people are where SUMO has them."""
         self._steps, self._angles, self._trails = 0, {}, {}
+        self._ways = Ways(simulation.api)
         self._commanded = []
         self._people.clear()
         self._walk(simulation)
@@ -367,7 +380,11 @@ class SumoWorld(World[SumoSettings]):
 
     def _kind(self, domain: Any, name: str) -> _Kind:
         class_ = object_class(domain.getTypeID(name), domain.getVehicleClass(name), self.settings.classes)
-        return _Kind(class_, (domain.getLength(name), domain.getWidth(name), domain.getHeight(name)))
+        length, width, height = domain.getLength(name), domain.getWidth(name), domain.getHeight(name)
+        base_type, vehicle_class = domain.getTypeID(name).partition("@")[0], domain.getVehicleClass(name)
+        chosen = {**LENGTHS_M, **self.settings.carriages}
+        count = carriage_count(length, chosen.get(base_type, chosen.get(vehicle_class, 0.0)))
+        return _Kind(class_, (length / count, width, height), count)
 
     def _walk(self, simulation: Simulation) -> None:
         """Let people walk after the places where SUMO has them now."""
@@ -386,9 +403,12 @@ class SumoWorld(World[SumoSettings]):
         present = _present(self._vehicles, domain.getIDList())
         for name in self._trails.keys() - self._vehicles.keys():
             del self._trails[name]
-        for name, (class_, dimensions) in present:
+        for name, (class_, dimensions, count) in present:
             bumper = domain.getPosition3D(name)
             if bumper[0] == api.INVALID_DOUBLE_VALUE:  # on its way elsewhere, by no road
+                continue
+            if count > 1:
+                yield from self._carriages(name, class_, dimensions, count)
                 continue
             angle = domain.getAngle(name)
             towards = heading(angle, domain.getSlope(name), self._placement)
@@ -417,10 +437,28 @@ class SumoWorld(World[SumoSettings]):
                 angular_velocity=(0.0, 0.0, self._yaw_rate(name, angle)),
             )
 
+    def _carriages(self, name: str, class_: str, dimensions: Vector, count: int) -> Iterator[ObjectState]:
+        domain, (length, _, height) = self._started().api.vehicle, dimensions
+        way = self._ways.behind(name, count * length)
+        placed = [in_scene(point, self._placement) for point in way]
+        for number, body in enumerate(carriages(placed, count * length, count, domain.getSpeed(name))):
+            dx, dy, dz = (a - b for a, b in zip(body.front, body.rear, strict=True))
+            towards = Heading(math.atan2(dy, dx), math.atan2(dz, math.hypot(dx, dy)))
+            pose = body_pose(body.front, towards, length, height, Placement())
+            yield ObjectState(
+                name=f"{self._prefix}{name}{f'/{number}' if number else ''}",
+                class_="container" if number and class_ == "truck" else class_,  # a trailer has no cab
+                position=pose.position,
+                orientation=pose.orientation,
+                velocity=body.velocity,
+                dimensions=dimensions,
+                angular_velocity=(0.0, 0.0, turning(body.yaw_rate)),
+            )
+
     def _person_states(self, domain: Any) -> Iterator[ObjectState]:
         turn = self._placement.yaw
         c, s = math.cos(turn), math.sin(turn)
-        for name, (class_, dimensions) in _present(self._persons, domain.getIDList()):
+        for name, (class_, dimensions, _) in _present(self._persons, domain.getIDList()):
             if name not in self._people:  # rides in a vehicle
                 continue
             body = self._people.body(name)

@@ -141,6 +141,23 @@ def heading(angle_deg: float, slope_deg: float, placement: Placement) -> Heading
     return Heading(math.radians(90.0 - angle_deg) + placement.yaw, math.radians(slope_deg))
 
 
+def in_scene(point: Vector, placement: Placement) -> Vector:
+    """Convert a place of SUMO to one of the scene [m].
+
+    Args:
+        point: In SUMO's coordinates [m].
+        placement: How the network lies in the scene.
+
+    Example:
+        >>> in_scene((1.0, 2.0, 0.0), Placement((10.0, 0.0, 0.0)))
+        (11.0, 2.0, 0.0)
+    """
+    c, s = math.cos(placement.yaw), math.sin(placement.yaw)
+    x, y, z = point
+    dx, dy, dz = placement.offset
+    return (c * x - s * y + dx, s * x + c * y + dy, z + dz)
+
+
 def body_pose(bumper: Vector, towards: Heading, length: float, height: float, placement: Placement) -> Pose:
     """Pose of the bounding box of a body, which SUMO places by its front bumper.
 
@@ -155,10 +172,7 @@ def body_pose(bumper: Vector, towards: Heading, length: float, height: float, pl
         >>> body_pose((10.0, 0.0, 0.0), Heading(0.0, 0.0), 4.0, 1.5, Placement()).position
         (8.0, 0.0, 0.75)
     """
-    c, s = math.cos(placement.yaw), math.sin(placement.yaw)
-    x, y, z = bumper
-    dx, dy, dz = placement.offset
-    front = (c * x - s * y + dx, s * x + c * y + dy, z + dz)
+    front = in_scene(bumper, placement)
     fx, fy, fz = towards.forward
     ux, uy, uz = towards.up
     back, rise = length / 2, height / 2

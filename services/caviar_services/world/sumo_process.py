@@ -153,8 +153,8 @@ def _caught_stderr(lines: list[str]) -> Iterator[None]:
 _REPORT_EVERY = 1000
 """Steps between two reports of progress."""
 
-SAVING = ("--save-state.rng", "--save-state.precision", "20")
-"""Options of SUMO with which a saved state has the random numbers and every digit."""
+SAVING = ("--save-state.rng", "--save-state.transportables", "--save-state.precision", "20")
+"""Options of SUMO with which a saved state has the random numbers, the people, and every digit."""
 
 
 class TrafficStates:
@@ -189,7 +189,7 @@ class TrafficStates:
         self._files, self._options = files, options
         self._begin_s, self._spacing_s = begin_s, spacing_s
         content = {option: [file_digest(Path(file)) for file in names] for option, names in files.items()}
-        key = json.dumps([content, list(options), version, begin_s, spacing_s])
+        key = json.dumps([content, [*options, *SAVING], version, begin_s, spacing_s])
         self.digest = hashlib.sha256(key.encode()).hexdigest()
         """Of what the states follow from."""
         self._folder = (cache or default_folder()) / "traffic" / self.digest

@@ -61,7 +61,9 @@ export class ClockPanel {
     this.pause.setAttribute("aria-label", `${label} the run`);
     this.pause.title = `${label} the run`;
     this.pause.lastChild!.textContent = label;
-    const waits = news.waits.map(({ service, what, elapsed_s }) => `${service}: ${what}, ${fixed(elapsed_s, 1)} s`).join("; ");
+    const waits = news.waits
+      .map(({ service, frame, elapsed_s, limit_s }) => `${service}${frame < 0 ? "" : ` in frame ${frame}`}, ${fixed(elapsed_s, 2)} of ${fixed(limit_s, 2)} s`)
+      .join("; ");
     this.waits.textContent = `${news.state}${news.paused ? ", paused" : ""}${waits ? ` · waits for ${waits}` : ""}`;
     if (news.events?.length) {
       const texts = news.events.map((event) => (typeof event === "string" ? event : event.text));

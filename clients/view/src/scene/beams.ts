@@ -10,10 +10,13 @@ import { inverse, type Pose, rotate } from "./pose";
 
 /** Below this gain, 18 dB under the strongest direction, no surface is drawn. */
 const LEAST = 0.016;
+/** Directions of a surface that a processor draws, along each of its two angles. */
+const COARSE = 64;
 /** Surfaces that the graphics card keeps. */
 const MOST_SURFACES = 32;
-/** Directions of a slice. */
+/** Directions of a slice, and the least distance of its points, of the greatest radius. */
 const AROUND = 1440;
+const APART = 0.008;
 
 export interface ShownBeam {
   lobe: Lobe;
@@ -28,8 +31,12 @@ export interface ShownBeam {
 export class Beams {
   readonly group = new Group();
   shown: ShownBeam[] = [];
+  /** Whether surfaces have all directions that there are. */
+  isFine = true;
   /** Surfaces of radius 1: lobes come again, at other distances. */
   private readonly surfaces = new Map<Lobe, BufferGeometry>();
+  /** Kept from frame to frame: with the last material of its kind a program goes, and is compiled anew. */
+  private readonly materials = { best: beamMaterials(BEST), chosen: beamMaterials(CHOSEN) };
 
   constructor(private readonly origin: Vector) {}
 
@@ -38,7 +45,6 @@ export class Beams {
     this.group.traverse((child) => {
       if (!(child instanceof Mesh)) return;
       if (!child.userData.kept) child.geometry.dispose();
-      child.material.dispose();
     });
     this.group.clear();
     for (const beam of beams) this.add(beam);
@@ -51,31 +57,36 @@ export class Beams {
   }
 
   private add({ lobe, pose, towards, radius, best }: ShownBeam): void {
-    const color = best ? BEST : CHOSEN;
+    const materials = this.materials[best ? "best" : "chosen"];
     const at = pose.position.map((value, i) => value - this.origin[i]) as Vector;
     const order = best ? 14 : 17;
-    const shared = { color, transparent: true, side: DoubleSide, depthWrite: false };
     let geometry = this.surfaces.get(lobe);
-    if (!geometry) this.surfaces.set(lobe, (geometry = surfaceGeometry(lobe)));
-    const surface = new Mesh(
-      geometry,
-      new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.14 }),
-    );
+    if (!geometry) this.surfaces.set(lobe, (geometry = surfaceGeometry(this.isFine ? lobe : thinned(lobe))));
+    const surface = new Mesh(geometry, materials.surface);
     const [w, x, y, z] = pose.orientation;
     surface.quaternion.set(x, y, z, w);
     surface.scale.setScalar(radius);
     surface.userData.kept = true;
     const outline = slice(lobe, pose, towards, radius);
-    const area = new Mesh(fan(outline), new MeshBasicMaterial({ ...shared, opacity: 0.45 }));
+    const area = new Mesh(fan(outline), materials.area);
     const lines = new LineSegmentsGeometry();
     lines.setPositions(outline.flatMap((point, i) => [...point, ...outline[(i + 1) % outline.length]]));
-    const line = new LineSegments2(lines, new LineMaterial({ color, linewidth: 2, transparent: true, depthWrite: false }));
+    const line = new LineSegments2(lines, materials.line);
     [surface, area, line].forEach((object, i) => {
       object.position.set(...at);
       object.renderOrder = order + i;
       this.group.add(object);
     });
   }
+}
+
+function beamMaterials(color: string) {
+  const shared = { color, transparent: true, side: DoubleSide, depthWrite: false, forceSinglePass: true };
+  return {
+    surface: new MeshLambertMaterial({ ...shared, emissive: color, emissiveIntensity: 0.4, opacity: 0.14 }),
+    area: new MeshBasicMaterial({ ...shared, opacity: 0.45 }),
+    line: new LineMaterial({ color, linewidth: 2, transparent: true, depthWrite: false }),
+  };
 }
 
 /** Places of a lobe's surface in the device's axes [m], Shape [elevations · azimuths, 3], and its triangles. */
@@ -121,12 +132,17 @@ function slice(lobe: Lobe, pose: Pose, towards: Vector, radius: number): Vector[
   const sine = way[2] / length;
   const cosine = Math.sqrt(Math.max(0, 1 - sine * sine));
   const turn = inverse(pose.orientation);
-  return Array.from({ length: AROUND }, (_, k) => {
+  const outline: Vector[] = [];
+  for (let k = 0; k < AROUND; k++) {
     const azimuth = (2 * Math.PI * k) / AROUND;
     const direction: Vector = [cosine * Math.cos(azimuth), cosine * Math.sin(azimuth), sine];
     const r = radius * gainTowards(lobe, rotate(turn, direction)) ** 2;
-    return direction.map((value) => r * value) as Vector;
-  });
+    const point = direction.map((value) => r * value) as Vector;
+    const last = outline.at(-1);
+    // Most directions have next to no gain, and the same point.
+    if (!last || Math.hypot(...point.map((value, i) => value - last[i])) > APART * radius) outline.push(point);
+  }
+  return outline;
 }
 
 /** Triangles from the array to its outline. */
@@ -135,6 +151,28 @@ function fan(outline: Vector[]): BufferGeometry {
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
   return geometry;
+}
+
+/** A lobe at fewer directions: of those that fall together the strongest counts, so that no beam is lost. */
+function thinned(lobe: Lobe): Lobe {
+  const strides = [lobe.elevations, lobe.azimuths].map(({ length }) => Math.max(1, Math.ceil((length - 1) / COARSE)));
+  const places = [lobe.elevations, lobe.azimuths].map((values, k) =>
+    // The last one closes the surface.
+    values.map((_, i) => i).filter((i) => i % strides[k] === 0 || i === values.length - 1),
+  );
+  const around = (i: number, stride: number, length: number) => {
+    const half = stride >> 1;
+    return [Math.max(0, i - half), Math.min(length, i + half + 1)];
+  };
+  const gain = places[0].map((i) => {
+    const rows = lobe.gain.slice(...around(i, strides[0], lobe.gain.length));
+    return places[1].map((j) => {
+      const [low, high] = around(j, strides[1], lobe.azimuths.length);
+      return Math.max(...rows.flatMap((row) => row.slice(low, high)));
+    });
+  });
+  const [elevations, azimuths] = [lobe.elevations, lobe.azimuths].map((values, k) => places[k].map((i) => values[i]));
+  return { ...lobe, elevations, azimuths, gain };
 }
 
 function surfaceGeometry(lobe: Lobe): BufferGeometry {

@@ -191,6 +191,13 @@ export class Stage {
     this.drawn++;
   }
 
+  /** Draw what was asked for, and wait until it is there. */
+  finish(): void {
+    if (this.asked) this.draw();
+    const context = this.renderer.getContext();
+    context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
   /** Middle of the picture: right of panels that cover so much of its left [px]. */
   setCovered(left: number): void {
     this.covered = left;

@@ -188,6 +188,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 materials=MaterialPolicy(changes=s.materials, outside=s.outside_itu_range, key=place.key),
                 edges=s.diffraction,
                 free_edges=s.free_edges,
+                solid_walls_m=s.solid_walls_m,
                 detail=s.detail,
                 objects=self._keys["object_materials"],
                 foliage=foliage,

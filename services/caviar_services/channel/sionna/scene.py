@@ -101,6 +101,8 @@ class SceneSettings:
     """Whether the rims of open surfaces are edges too."""
     detail: DetailSettings = field(default_factory=DetailSettings)
     """What of the scenery is left out."""
+    solid_walls_m: float | None = None
+    """Closed plates up to this thickness are one slab of it; None: a slab for each of their faces."""
     objects: ObjectMaterials = field(default_factory=ObjectMaterials)
     """Of what objects and pieces of scenery are made that differ from the others."""
     foliage: ObjectMaterials = field(default_factory=ObjectMaterials)
@@ -134,7 +136,9 @@ class SionnaScene(NumberedTriangles):
         own = own_materials(assets)
         skins = self._skins = self._skin_materials(pool, settings, own)
         description = find_scenery(assets)
-        pieces, self.notes = file_pieces(description, settings.foliage)
+        pieces, self.notes = file_pieces(
+            description, settings.foliage, settings.solid_walls_m, settings.objects
+        )
         """Warnings for the user about the scenery."""
         self._scene = new_scene(piece.material for piece in pieces.values() if piece.material is not None)
         self._objects, self._foliage = settings.objects, settings.foliage

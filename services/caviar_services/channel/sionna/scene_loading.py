@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -38,6 +39,8 @@ from caviar_space.materials import (
     ObjectMaterials,
     body_kind,
     itu_material,
+    of_thickness,
+    without_thickness,
 )
 from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
 from caviar_space.meshes import (
@@ -50,6 +53,7 @@ from caviar_space.meshes import (
     shown_asset,
 )
 from caviar_space.mitsuba_xml import SceneryShape, asset_name, read_scenery, world_mesh
+from caviar_space.walls import solid_walls
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,36 +79,67 @@ class Piece:
 
 
 def file_pieces(
-    description: Path | None, foliage: ObjectMaterials | None = None
+    description: Path | None,
+    foliage: ObjectMaterials | None = None,
+    solid_walls_m: float | None = None,
+    others: ObjectMaterials | None = None,
 ) -> tuple[dict[str, Piece], tuple[str, ...]]:
     """Read the pieces of scenery, by name, in the order of the description.
 
     Args:
         description: The scene description; None: there is none.
         foliage: Pieces that need no radio material, since waves pass through them.
+        solid_walls_m: Closed plates up to this thickness [m] become sheets of that thickness
+            (`caviar_space.walls`); None: none.
+        others: Materials of pieces that are given another one, whose thickness counts.
 
     Returns:
-        The pieces, and a warning where meshes without triangles are left out.
+        The pieces, a note on walls that became sheets, and a warning where meshes without triangles are left
+        out.
 
     Raises:
         AssetError: Names what is wrong with the description, a material or a mesh.
     """
     if description is None:
         return {}, ()
-    pieces, empty = {}, []
+    pieces, empty, walls = {}, [], list[float]()
     materials: dict[str, Any] = {}
     for shape in read_scenery(description, asset_name(description)).shapes:
         leaves = shape.radio is None and foliage is not None and foliage.material_for(shape.name)
         material = None if leaves else _radio_material(shape, materials)
         mesh = world_mesh(shape)
-        if len(mesh.faces):
-            pieces[shape.name] = Piece(mesh, material, shape.place)
-        else:
+        if not len(mesh.faces):
             empty.append(f"{shape.place}, mesh {shape.file.name}")
-    if not empty:
-        return pieces, ()
-    more = f", and {len(empty) - 1} more" if len(empty) > 1 else ""
-    return pieces, (f"{WARNING}{empty[0]}, has no triangles{more}: left out",)
+            continue
+        made: list[tuple[Mesh, float | None]] = [(mesh, None)]
+        kept = [keys for keys in (foliage, others) if keys and keys.material_for(shape.name)]
+        if solid_walls_m and material is not None and not kept:
+            made = solid_walls(mesh, solid_walls_m)
+        for number, (part, thickness) in enumerate(made):
+            own = material if thickness is None else _radio_material(_as_thick(shape, thickness), materials)
+            pieces[f"{shape.name}, part {number}" if number else shape.name] = Piece(part, own, shape.place)
+        walls += [thickness for _, thickness in made if thickness is not None]
+    notes: tuple[str, ...] = ()
+    if walls:
+        sizes = f"{min(walls):g} to {max(walls):g}" if len(set(walls)) > 1 else f"{walls[0]:g}"
+        what = f"closed walls of {sizes} m in {len(walls)} pieces"
+        notes += (f"{WARNING}solid_walls_m: {what} are one slab each, in the middle, where they reflect",)
+    if empty:
+        more = f", and {len(empty) - 1} more" if len(empty) > 1 else ""
+        notes += (f"{WARNING}{empty[0]}, has no triangles{more}: left out",)
+    return pieces, notes
+
+
+def _as_thick(shape: SceneryShape, thickness_m: float) -> SceneryShape:
+    """The same shape of a material of another thickness."""
+    if shape.radio is None:
+        return shape
+    root = ElementTree.fromstring(shape.radio.xml)  # noqa: S314 - made by read_scenery
+    for old in root.findall("float[@name='thickness']"):
+        root.remove(old)
+    ElementTree.SubElement(root, "float", name="thickness", value=f"{thickness_m:.9g}")
+    name = of_thickness(shape.radio.name, thickness_m)
+    return replace(shape, radio=shape.radio._replace(name=name, xml=ElementTree.tostring(root, "unicode")))
 
 
 def _radio_material(shape: SceneryShape, made: dict[str, Any]) -> Any:
@@ -263,9 +298,10 @@ def set_materials(
         ScenarioError: The scenario names an unknown material, or gives one a bad value.
     """
     materials = scene.radio_materials
-    unknown = sorted(policy.changes.keys() - materials.keys() - set(others))
+    named = {*materials, *map(without_thickness, materials)}
+    unknown = sorted(policy.changes.keys() - named - set(others))
     if unknown:
-        known = sorted(name for name in materials if not name.startswith("caviar-"))
+        known = sorted(name for name in named if not name.startswith("caviar-"))
         raise ScenarioError(
             f"the scenery has no material {unknown[0]!r}; it has: {', '.join(known)}",
             key=f"{policy.key}.materials.{unknown[0]}",

@@ -103,7 +103,13 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     """Whether specular reflections count."""
     refraction: bool = False
     """Whether waves pass through walls: each face is a slab of its material's thickness, so that a wall is to
-    be one face, not a closed box."""
+    be one face, not a closed box; see ``solid_walls_m``."""
+    solid_walls_m: (
+        Annotated[float, quantity("m", "thickness of closed walls that are one slab, at most", gt=0, le=10)]
+        | None
+    ) = None
+    """A closed body of one thickness up to this counts as one slab of that thickness, in its middle. Absent:
+    each of its faces is a slab."""
     diffraction: bool = False
     """Whether edges diffract."""
     free_edges: bool = False
