@@ -30,6 +30,8 @@ from caviar_space.imported_scenes import ImportedScene, Piece, write_scene
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.mitsuba_xml import RadioMaterial
 
+pytestmark = pytest.mark.slow
+
 COLOURS = {"brick": (200, 60, 40), "glass": (40, 80, 220), "sky": (250, 250, 250)}
 
 

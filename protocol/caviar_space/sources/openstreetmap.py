@@ -18,7 +18,14 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
-from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, box_in_metres, source_of
+from caviar_space.imported_scenes import (
+    Georeference,
+    ImportedScene,
+    Piece,
+    box_in_metres,
+    source_of,
+    wall_material,
+)
 from caviar_space.meshes import Mesh, joined
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources.building_shapes import Roof, crown, plate, prism, roofed, triangulated
@@ -68,8 +75,6 @@ BEYOND_M = 500.0
 """Distance from the box of an extract within which buildings are taken, where none is asked for [m]."""
 ROW_M = 8.0
 """Distance between the trees of a row [m]."""
-THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
-"""Of walls and roofs, where it is not 0.2 [m]."""
 # Distance from the border of a map to the last node of a coast, at most [m].
 _CUT_M = 100.0
 _COMPASS = (
@@ -342,7 +347,7 @@ class _Assembly:
 
     def _add(self, name: str, mesh: Mesh, material: str, kind: str, line: int = 0) -> None:
         self.made.pieces[name] = Piece(mesh, material, kind, self.path.name, line)
-        radio = RadioMaterial(material, thickness_m=THICKNESS_M.get(material, 0.2))
+        radio = wall_material(material)
         if kind == "foliage":  # is to waves what a channel says of its volume
             radio = RadioMaterial(colour=(0.0, 0.25, 0.0))
         self.made.materials.setdefault(material, radio)
