@@ -91,13 +91,13 @@ def _read_geotiff(path: Path) -> HeightGrid:
     try:
         with Image.open(path, formats=["TIFF"]) as image:
             tags: Any = image.tag_v2  # type: ignore[attr-defined]
-            heights = np.asarray(image, np.float64)
+            heights, mode = np.asarray(image, np.float64), image.mode
             scale, tie, found = tags.get(_SCALE), tags.get(_TIE), tags.get(_KEYS)
             unknown = str(tags.get(_UNKNOWN, "nan")).strip("\0 ")
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from error
-    if heights.ndim != 2:
-        raise ValueError(f"it has {heights.shape[-1]} bands, and heights are one")
+    if mode not in ("F", "I", "I;16", "I;16B", "I;16S"):
+        raise ValueError(f"its values are of the kind {mode}, and heights are one number of 16 or 32 bits")
     if not (scale and tie and found):
         raise ValueError("it has no scale, tie point or keys, so that its place is not known")
     rows = np.reshape(found, (-1, 4))[1:]
