@@ -155,6 +155,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "quadrotor.md",
         {"quadrotor-frames": ""},
     ),
+    "simplify": Measurement(
+        "python tests/bench/bench_simplify.py --positions 40 --markdown {out}/simplify.md",
+        "python tests/bench/bench_simplify.py --markdown {out}/simplify.md",
+        "simplify.md",
+        {"simplify": ""},
+    ),
     "stability": Measurement(
         "caviar measure stability --markdown {out}/stability.md",
         "caviar measure stability --markdown {out}/stability.md",

@@ -32,7 +32,7 @@ GAP_M = 0.5
 _BOTTOM_M = 0.1
 _SHEET = 0.6
 _WALLS = 0.02
-_AT_ONCE = 4_000_000
+_CELL_M = 40.0
 
 
 @dataclass(frozen=True)
@@ -281,10 +281,14 @@ def _off_ground(parts: Parts, low: Float64Array, high: Float64Array) -> dict[str
     known = body & np.isfinite(ground)
     floating = known & (low[:, 2] > ground + GAP_M)
     # What stands on a roof, or hangs at a wall, touches another part's box.
+    others = np.flatnonzero(body)
+    others = others[np.argsort(low[others, 0], kind="stable")]
+    starts, widest = low[others, 0], float((high - low)[others, 0].max(initial=0.0))
     for part in np.flatnonzero(floating).tolist():
-        touch = (low <= high[part] + GAP_M).all(1) & (high >= low[part] - GAP_M).all(1)
-        touch[part] = False
-        floating[part] = not (touch & body).any()
+        ends = low[part, 0] - GAP_M - widest, high[part, 0] + GAP_M
+        near = others[slice(*np.searchsorted(starts, ends))]
+        touch = (low[near] <= high[part] + GAP_M).all(1) & (high[near] >= low[part] - GAP_M).all(1)
+        floating[part] = not (touch & (near != part)).any()
     return {"floating": floating, "sunken": known & (high[:, 2] < ground - 1e-3)}
 
 
@@ -293,14 +297,20 @@ def _heights(ground: Float64Array, places: Float64Array) -> Float64Array:
     a, b, c = np.moveaxis(ground, 1, 0)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     lying = np.abs(area) > 1e-12
-    a, b, c, area = a[lying], b[lying], c[lying], area[lying]
-    found = np.full(len(places), -np.inf)
-    step = max(1, _AT_ONCE // max(len(a), 1))
-    for begin in range(0, len(places), step):
-        p = places[begin : begin + step, None]
-        u = ((p[..., 0] - a[:, 0]) * (c - a)[:, 1] - (p[..., 1] - a[:, 1]) * (c - a)[:, 0]) / area
-        v = ((b - a)[:, 0] * (p[..., 1] - a[:, 1]) - (b - a)[:, 1] * (p[..., 0] - a[:, 0])) / area
+    ground, area = ground[lying], area[lying]
+    low, high = ground[..., :2].min(1), ground[..., :2].max(1)
+    found = np.full(len(places), np.nan)
+    # Cell by cell, since most triangles are in few of them.
+    cell = np.floor(places / _CELL_M).astype(np.int64)
+    order = np.lexsort(cell.T)
+    begins = np.flatnonzero((np.diff(cell[order], axis=0, prepend=np.nan) != 0).any(1))
+    for rows in np.split(order, begins[1:]):
+        p = places[rows, None]
+        near = ((low <= p.max((0, 1))) & (high >= p.min((0, 1)))).all(1)
+        a, b, c = np.moveaxis(ground[near], 1, 0)
+        u = ((p[..., 0] - a[:, 0]) * (c - a)[:, 1] - (p[..., 1] - a[:, 1]) * (c - a)[:, 0]) / area[near]
+        v = ((b - a)[:, 0] * (p[..., 1] - a[:, 1]) - (b - a)[:, 1] * (p[..., 0] - a[:, 0])) / area[near]
         within = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9)
         z = np.where(within, a[:, 2] + u * (b - a)[:, 2] + v * (c - a)[:, 2], -np.inf)
-        found[begin : begin + step] = z.max(1, initial=-np.inf)
+        found[rows] = z.max(1, initial=-np.inf)
     return np.where(np.isfinite(found), found, np.nan)

@@ -261,6 +261,46 @@ def repair_command(
     )
 
 
+@app.command("simplify")
+def simplify_command(
+    scenario: Annotated[
+        str, typer.Argument(help="scenario with a ray-traced channel, by name or file", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="folder of the simplified scene, which is made")],
+    error_db: Annotated[
+        float,
+        typer.Option("--error-db", min=0.0, help="error of received power at 9 of 10 positions [dB]"),
+    ] = 0.5,
+    positions: Annotated[
+        int, typer.Option(min=4, help="frames at which devices are looked at; half choose, half are held out")
+    ] = 100,
+) -> None:
+    """Simplify a scenario's scenery: fewer triangles, at a stated error of the power its devices receive."""
+    from rich.progress import TimeRemainingColumn
+
+    from caviar_scenes.simplification import simplify
+
+    console = Console()
+    with progress_bar(Console(stderr=True), TimeRemainingColumn(), transient=True) as bar:
+        task = bar.add_task("world", total=1.0)
+        found = simplify(
+            scenario,
+            error_db,
+            out,
+            positions,
+            lambda name, share: bar.update(task, description=name, completed=share),
+        )
+    error, left = found.held_out, found.reduction
+    (triangles, fewer), (pieces, kept), (ms, faster) = found.triangles, found.pieces, found.frame_ms
+    print_line(console, f"triangles: {triangles} → {fewer}, pieces: {pieces} → {kept}")
+    print_line(console, f"left out: what only detours above {left.detour_m:.0f} m meet, parts below "
+               f"{left.smallest_m:g} m; triangles merged within {left.tolerance_m:g} m")  # fmt: skip
+    print_line(console, f"error at {error.users} users of {found.positions[1]} frames held out: median "
+               f"{error.median_db:.3f}, 90 % {error.p90_db:.3f}, most {error.max_db:.3f} dB")  # fmt: skip
+    print_line(console, f"frame of the channel: {ms:.0f} → {faster:.0f} ms")
+    print_line(console, f'{out}: simplified.json, and a scene to use: scenery = "file:{out}/scene.xml"')
+
+
 @app.command("look")
 def look_command(
     scene: SceneArgument,

@@ -202,6 +202,8 @@ def cut_to_box(scene: ImportedScene, box: Box) -> None:
             scene.pieces[name] = replace(piece, mesh=mesh)
     if not scene.pieces:
         raise AssetError(f"nothing of the {count} pieces of {scene.name} is within the box; name another one")
+    if len(scene.pieces) < count:
+        scene.notes.append(f"{count - len(scene.pieces)} of {count} pieces outside of the box: left out")
     for antennas in (scene.transmitters_m, scene.receivers_m):
         inside = [place for place in antennas if (low <= place[:2]).all() and (high >= place[:2]).all()]
         if len(inside) < len(antennas):

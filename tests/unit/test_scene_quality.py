@@ -10,12 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from caviar_protocol.errors import AssetError
+from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_scenes.checks import KINDS, check
 from caviar_scenes.cli import app
 from caviar_scenes.look import look
 from caviar_scenes.opened import open_scene
 from caviar_scenes.repairs import repair
+from caviar_scenes.simplification import simplify
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, write_scene
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.mitsuba_xml import RadioMaterial
@@ -157,3 +158,101 @@ def test_a_damaged_scene_is_refused_by_name(damage: str, said: str, tmp_path: Pa
         folder = tmp_path
     with pytest.raises(AssetError, match=said):
         check(open_scene(str(folder)))
+
+
+SCENARIO = """
+[run]
+name = "drive"
+frames = 8
+sampling_period_ns = 1_000_000_000
+
+[[carriers]]
+name = "c"
+frequency_hz = 3.5e9
+bandwidth_hz = 100e6
+
+[services.world]
+role = "world"
+use = "trajectory"
+budget_ms = 500
+
+[services.world.settings]
+scenery = "file:town/scene.xml"
+
+[[services.world.settings.objects]]
+name = "car"
+kind = "car"
+dimensions_m = [4.5, 1.8, 1.5]
+waypoints = [[0.0, -20.0, -5.0, 0.75], [8.0, 30.0, -5.0, 0.75]]
+
+[services.channel]
+role = "channel"
+use = "USE"
+budget_ms = 5000
+SETTINGS
+
+[services.agent]
+role = "agent"
+use = "los-beam"
+budget_ms = 500
+
+[services.link]
+role = "link"
+use = "beams"
+budget_ms = 500
+
+[[devices]]
+name = "bs"
+kind = "antenna"
+role = "tx"
+position_m = [10.0, -20.0, 10.0]
+
+[[devices]]
+name = "rx"
+kind = "antenna"
+role = "rx"
+on = "car"
+position_m = [0.0, 0.0, 1.0]
+"""
+
+
+def scenario_in(folder: Path, use: str, settings: str) -> str:
+    far = {f"far-{n}": (moved(500, HOUSE.faces, n), "wood") for n in range(5)}
+    bricks = {f"brick-{n}": (box((n, n + 0.2), (20, 20.2), (0, 0.2)), "brick") for n in range(5)}
+    town(folder, {**far, **bricks})
+    file = folder / "drive.toml"
+    file.write_text(SCENARIO.replace("USE", use).replace("SETTINGS", settings))
+    return str(file)
+
+
+@pytest.mark.channel
+def test_a_scene_is_simplified_within_an_error_that_is_measured(tmp_path: Path) -> None:
+    settings = '[services.channel.settings]\nmax_depth = 2\nsamples = 20_000\ncandidates = "launched"'
+    scenario = scenario_in(tmp_path, "sionna-rt", settings)
+    said: list[float] = []
+    found = simplify(scenario, 0.02, tmp_path / "simple", 8, lambda _, share: said.append(share))
+    # The far houses and the bricks go; the ground and the houses, between which waves are reflected, stay.
+    assert found.triangles == (14 * 12 - 12 + 2, found.triangles[1])
+    assert found.triangles[1] <= 3 * 12 + 2
+    assert (found.positions, found.held_out.users) == ((4, 4), 4)
+    assert found.held_out.p90_db <= 1.2 * 0.02
+    assert said == sorted(said)
+    left = open_scene(str(tmp_path / "simple"))
+    assert sum(len(mesh.faces) for mesh in left.meshes.values()) == found.triangles[1]
+    assert {"ground", "house"} <= left.meshes.keys()
+    report = json.loads((tmp_path / "simple" / "simplified.json").read_bytes())
+    assert report["held_out"]["p90_db"] == pytest.approx(found.held_out.p90_db)
+
+
+def test_a_scenario_whose_channel_meets_no_scenery_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="uses scenery"):
+        simplify(scenario_in(tmp_path, "free-space", ""), 0.5, tmp_path / "simple")
+
+
+@pytest.mark.channel
+def test_munich_has_holes_in_its_monuments_alone_and_nothing_that_makes_powers_wrong() -> None:
+    faults = check(open_scene("sionna:munich"))
+    monuments = ("Frauenkirche", "Heilig_Geist", "St__Peter", "Neues_Rathaus")
+    assert 1 <= len(faults) <= 30
+    assert not [fault for fault in faults if KINDS[fault.kind].wrong]
+    assert all(fault.piece.startswith(monuments) for fault in faults)
