@@ -37,10 +37,9 @@ def views_command(
 ) -> None:
     """Draw a scene from its streets and from above: pictures, their table, and faces and depths of pixels."""
     import numpy as np
-    from PIL import Image
 
     from caviar_scenes.materials import read_scene
-    from caviar_scenes.views import TABLE, Eye, camera, pictures_table, viewpoints
+    from caviar_scenes.views import TABLE, Eye, camera, pictures_table, save_picture, viewpoints
     from caviar_services.sensors.shading import MATERIALS, OTHER, linear
 
     found = read_scene(scene)
@@ -65,7 +64,7 @@ def views_command(
     _make(out)
     for device in cameras:
         seen = eye.look(device)
-        Image.fromarray(eye.paint(device, np.array(colours))).save(out / f"{device.name}.png")
+        save_picture(out / f"{device.name}.png", eye.paint(device, np.array(colours)))
         np.savez_compressed(
             out / f"{device.name}.npz",
             face=seen.face.astype(np.int32),
