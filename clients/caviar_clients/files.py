@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from caviar_protocol.errors import RunError
+from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -21,13 +22,22 @@ def writing(path: Path) -> Iterator[None]:
         path: The file.
 
     Raises:
-        RunError: The block raised `OSError`; the text has file, cause and remedy.
+        RunError: The block raised `OSError`, or another error of a disk that is full; the text has file,
+            cause and remedy.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
         raise RunError(f"cannot write {path}: {reason(path, error)}") from error
+    except CaviarError:
+        raise
+    except Exception as error:
+        # Libraries that write by themselves have errors of their own for a disk that is full.
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if str(full.strerror) not in str(error):
+            raise
+        raise RunError(f"cannot write {path}: {reason(path, full)}") from error
 
 
 def make_folder_of(path: Path) -> None:

@@ -20,6 +20,7 @@ from rich.console import Console
 from caviar_clients.cli.shared import print_line, progress_bar
 from caviar_protocol.errors import AssetError
 from caviar_scenes.materials_cli import app as materials_app
+from caviar_scenes.materials_cli import calibrate_command
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import ImportedScene
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 app.add_typer(materials_app, name="materials")
+app.command("calibrate")(calibrate_command)
 TEMPLATE = "new/imported.toml"
 """The scenarios of an imported scene, in the package of scenarios."""
 

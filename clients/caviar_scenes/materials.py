@@ -20,18 +20,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.assets import ITU_MATERIALS
 from caviar_protocol.errors import AssetError, suggestion
+from caviar_scenes.opened import open_scene
 from caviar_scenes.segmentation import Segmenter, material_matrix
 from caviar_scenes.views import Eye, Picture, read_table
-from caviar_space.imported_scenes import Georeference, ImportedScene, Piece
+from caviar_space.imported_scenes import ImportedScene, Piece
 from caviar_space.meshes import Mesh
-from caviar_space.mitsuba_xml import RadioMaterial, SceneryShape, read_scenery, world_mesh
-from caviar_space.scenery import scenery_file
+from caviar_space.mitsuba_xml import RadioMaterial, SceneryShape
 
 NAME = "materials.csv"
 """Name of the table in the folder of a scene."""
@@ -66,48 +65,35 @@ class Labels:
         return [self.materials[k] for k in self.share.argmax(1)]
 
 
-def read_scene(source: str) -> ImportedScene:
-    """Read a scene that a folder, a Mitsuba XML, or ``sionna:NAME`` holds.
+def read_scene(given: str) -> ImportedScene:
+    """Read a scene that may get other materials, with the other files of its folder.
 
     Args:
-        source: Folder with a ``scene.xml``, path of an XML, or ``sionna:NAME``.
+        given: Folder of a scene, Mitsuba XML, ``sionna:NAME``, or a scenario.
 
     Raises:
         AssetError: There is no such scene, or it is wrong.
+        ScenarioError: The scenario is wrong.
     """
-    path = Path(source)
-    if path.is_dir():
-        path = path / "scene.xml"
-    file = scenery_file(source if source.startswith("sionna:") else str(path.resolve()))
-    scene = ImportedScene(name=file.parent.name)
-    about = file.with_suffix(".json")
-    kinds: dict[str, str] = {}
-    if about.is_file():
-        try:
-            known = msgspec.json.decode(about.read_bytes(), type=_About)
-        except (msgspec.DecodeError, msgspec.ValidationError) as error:
-            raise AssetError(f"{about}: {error}; import the scene again") from error
-        scene = ImportedScene(**{field: getattr(known, field) for field in known.__struct_fields__[1:]})
-        kinds = {name: str(piece.get("kind", "")) for name, piece in known.pieces.items()}
-    for shape in read_scenery(file).shapes:
-        mesh = world_mesh(shape)
-        name = re.sub(r"[^\w.-]", "_", shape.name)
-        scene.pieces[name] = Piece(
-            mesh, shape.material or "none", kinds.get(shape.name, "building"), file.name, 1
-        )
-        scene.materials[shape.material or "none"] = _radio_material(shape)
+    found = open_scene(given)
+    file, about = found.scenery.file, found.about
+    scene = ImportedScene(name=found.name, origin=found.origin)
+    for key in ("transmitters_m", "receivers_m", "frequencies_hz", "notes", "sources"):
+        setattr(scene, key, list(about.get(key, ())))
+    if about and file.stem == "scene":  # roads and scenarios of an imported scene
+        others = [p for p in sorted(file.parent.rglob("*")) if p.is_file() and p.suffix != ".ply"]
+        own = ("scene.xml", "scene.json", NAME, f"applied-{NAME}")
+        names = {str(path.relative_to(file.parent)): path for path in others}
+        scene.files = {name: path.read_bytes() for name, path in names.items() if name not in own}
+    for name, shape in found.shapes.items():
+        material = shape.material or "none"
+        known = about.get("pieces", {}).get(name, {})
+        kind = "foliage" if name in found.foliage else str(known.get("kind", "object"))
+        where, _, line = str(known.get("source", f"{file.name}:1")).rpartition(":")
+        number = int(line) if line.isdigit() else 1
+        scene.pieces[name] = Piece(found.meshes[name], material, kind, where, number)
+        scene.materials[material] = _radio_material(shape)
     return scene
-
-
-class _About(msgspec.Struct, kw_only=True):
-    pieces: dict[str, dict[str, object]] = {}
-    name: str = "scene"
-    origin: Georeference | None = None
-    transmitters_m: list[tuple[float, float, float]] = []
-    receivers_m: list[tuple[float, float, float]] = []
-    frequencies_hz: list[float] = []
-    notes: list[str] = []
-    sources: list[dict[str, str | int]] = []
 
 
 def _radio_material(shape: SceneryShape) -> RadioMaterial:
@@ -238,9 +224,16 @@ def chosen_materials(
     """
     sure = labels.reached & (labels.share.max(1) >= threshold)
     kept = max(prior, key=lambda key: prior[key]) if prior else ""
+    pieces = scene.pieces.values()
+    # Crowns of trees are volumes, whatever pictures show.
+    sure &= np.repeat([piece.kind != "foliage" for piece in pieces], [len(p.mesh.faces) for p in pieces])
     of_all = [one if good else kept for one, good in zip(labels.best, sure.tolist(), strict=True)]
     ends = np.cumsum([0, *(len(piece.mesh.faces) for piece in scene.pieces.values())]).tolist()
-    return {name: of_all[a:b] for name, a, b in zip(scene.pieces, ends, ends[1:], strict=False)}, sure
+    found = {name: of_all[a:b] for name, a, b in zip(scene.pieces, ends, ends[1:], strict=False)}
+    for name, piece in scene.pieces.items():
+        if piece.kind == "foliage":
+            found[name] = [""] * len(found[name])
+    return found, sure
 
 
 def table_of(scene: ImportedScene, parts: Mapping[str, Int64Array], labels: Labels, sure: BoolArray) -> str:

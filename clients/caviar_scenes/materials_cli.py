@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from caviar_clients.cli.shared import print_line, progress_bar
+from caviar_clients.cli.shared import print_line, progress_bar, require_known
 from caviar_protocol.errors import AssetError
 
 if TYPE_CHECKING:
@@ -37,10 +37,9 @@ def views_command(
 ) -> None:
     """Draw a scene from its streets and from above: pictures, their table, and faces and depths of pixels."""
     import numpy as np
-    from PIL import Image
 
     from caviar_scenes.materials import read_scene
-    from caviar_scenes.views import TABLE, Eye, camera, pictures_table, viewpoints
+    from caviar_scenes.views import TABLE, Eye, camera, pictures_table, save_picture, viewpoints
     from caviar_services.sensors.shading import MATERIALS, OTHER, linear
 
     found = read_scene(scene)
@@ -65,7 +64,7 @@ def views_command(
     _make(out)
     for device in cameras:
         seen = eye.look(device)
-        Image.fromarray(eye.paint(device, np.array(colours))).save(out / f"{device.name}.png")
+        save_picture(out / f"{device.name}.png", eye.paint(device, np.array(colours)))
         np.savez_compressed(
             out / f"{device.name}.npz",
             face=seen.face.astype(np.int32),
@@ -150,6 +149,49 @@ def apply_command(
     made.sources = [*made.sources, source_of(materials)]
     write_scene(made, out, {f"applied-{NAME}": materials.read_bytes()})
     _say(out, made, "")
+
+
+def calibrate_command(
+    scenario: Annotated[Path, typer.Argument(help="scenario whose channel traces rays, by name or file")],
+    measurements: Annotated[
+        Path, typer.Argument(help="CSV: x_m,y_m,z_m, and power_dbm, or re,im of the response; transmitter")
+    ],
+    materials: Annotated[str, typer.Option(help="names of the materials that are fitted: brick,glass")],
+    noise_db: Annotated[
+        float, typer.Option(min=0.001, help="standard deviation of a measurement [dB]")
+    ] = 1.0,
+    carrier: Annotated[str, typer.Option(help="name of the carrier; by default the first")] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="TOML with the settings of the materials, for the scenario")
+    ] = None,
+) -> None:
+    """Fit permittivity, conductivity and scattering of materials to measurements at known places."""
+    from caviar_clients.files import write_file
+    from caviar_clients.session.scenes import scene_at
+    from caviar_scenes.calibration import calibrate, read_measurements, settings_text
+
+    measured = read_measurements(measurements)
+    if out:
+        write_file(out)
+    scenes = scene_at(scenario)
+    names = [one.name for one in scenes.carriers]
+    if carrier:
+        require_known("--carrier", carrier, names)
+    wanted = [name.strip() for name in materials.split(",")]
+    found = calibrate(scenes, measured, wanted, noise_db, names.index(carrier) if carrier else 0)
+    console = Console()
+    unit = "dB" if measured.response is None else "of amplitude"
+    print_line(
+        console,
+        f"{found.places} places, {found.without} without a path; residuals {found.before:.3g} before, "
+        f"{found.after:.3g} after [{unit}]; fields agree with the channel's to {found.agreement:.1e}",
+    )
+    for one in found.parameters:
+        told = f"{one.value:.4g} ({one.low:.4g} to {one.high:.4g})" if one.told else f"not told: {one.why}"
+        print_line(console, f"{one.material}: {one.parameter} {told}")
+    if out:
+        write_file(out, settings_text(found))
+        print_line(console, out)
 
 
 def _say(out: Path, made: ImportedScene, first: str) -> None:

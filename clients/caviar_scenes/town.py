@@ -142,23 +142,32 @@ def new_town(path: Path, scene: Path, seed: int = 1, say: Callable[[str], None] 
     def named(file: Path) -> str:
         return f'"file:{Path(os.path.relpath(file.resolve(), here)).as_posix()}"'
 
-    routes: list[list[str]] = []
+    trips = ElementTree.Element("routes")
     if streets is None:
         say(f"{scene} has no network of roads: base stations and a UAV alone")
         scenery = f"scenery = {named(description)}\n"
     else:
-        files[path.with_suffix(".rou.xml")], routes, counts = _traffic(streets, seed)
+        trips, counts = _traffic(streets, seed)
         say(f"{counts[0]} vehicles and {counts[1]} people at {BEGIN_S:g} s")
         scenery = ""
         values.update(_traffic_tables(streets, counts, named(description), named(streets.file),
                                       f'"file:{path.stem}.rou.xml"'))  # fmt: skip
     what = "traffic, people, " if streets else ""
-    targets = _targets(skyline, streets, routes)
+    ways = [(trip, trip.find("route").get("edges").split()) for trip in trips.iter("vehicle")]  # type: ignore[union-attr]
+    targets = _targets(skyline, streets, [way for _, way in ways])
     stations, seen = _stations(skyline, solids, targets, streets)
     lit = Counter(road for road, one in zip(targets.roads, seen.tolist(), strict=True) if one)
-    # The UAV takes the way that is most in sight.
-    route = max(routes, key=lambda roads: sum(lit[road] for road in set(roads)), default=[])
-    waypoints, how = _flight(skyline, streets, route)
+    every = Counter(targets.roads)
+    # The UAV takes the way with most places in sight, and users are those with the largest share of them.
+    longest = max((way for _, way in ways), key=lambda way: sum(lit[road] for road in set(way)), default=[])
+    ways.sort(key=lambda pair: -sum(lit[road] for road in pair[1]) / sum(every[road] for road in pair[1]))
+    for number, (trip, _) in enumerate(ways[: len(ways) // 4 + 1]):
+        trip.set("id", f"user-{number}")
+    if streets is not None:
+        files[path.with_suffix(".rou.xml")] = ElementTree.tostring(
+            trips, encoding="utf-8", xml_declaration=True
+        )
+    waypoints, how = _flight(skyline, streets, longest)
     values |= {
         "title": f"Scene {scene.resolve().name} with {what}base stations and a UAV",
         "command": " ".join(["caviar", *sys.argv[1:]]),
@@ -363,9 +372,8 @@ def _flight(
     return [(t, x, y, high) for t, (x, y) in rows], how
 
 
-def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[list[str]], tuple[int, int]]:
-    """Trips of vehicles and people: SUMO's file, the roads of each vehicle, and how many of both are there
-    at the beginning of a run."""
+def _traffic(streets: Streets, seed: int) -> tuple[ElementTree.Element, tuple[int, int]]:
+    """Trips of vehicles and people, and how many of both are there at the beginning of a run."""
     try:
         from sumo import SUMO_HOME
     except ImportError as error:
@@ -406,8 +414,7 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[list[str]], tuple
                 continue
             root.append(trip)
         ElementTree.indent(root)
-        routes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-        Path(folder, "all.rou.xml").write_bytes(routes)
+        ElementTree.ElementTree(root).write(Path(folder, "all.rou.xml"))
         _run([str(home / "bin" / "sumo"), "-n", str(streets.file.resolve()), "-r", "all.rou.xml",
               "--step-length", "0.5", "--begin", "0", "--end", f"{BEGIN_S:g}", "--seed", str(seed),
               "--no-step-log", "--no-warnings", "--summary-output", "cars.xml",
@@ -416,8 +423,7 @@ def _traffic(streets: Streets, seed: int) -> tuple[bytes, list[list[str]], tuple
         for name, key in (("cars.xml", "running"), ("people.xml", "walking")):
             steps = ElementTree.parse(Path(folder, name)).getroot().findall("step")  # noqa: S314 - SUMO wrote it
             counts.append(int(steps[-1].get(key, 0)) if steps else 0)
-    routed = [route.get("edges", "").split() for route in root.iter("route")]
-    return routes, routed, (counts[0], counts[1])
+    return root, (counts[0], counts[1])
 
 
 def _run(command: Sequence[str], folder: str) -> None:
@@ -457,13 +463,14 @@ meshes = ["car", "pedestrian", "truck"]
 pool = {{ {held} }}  # bodies held ready for those who come
 """,
         "receivers": """
-# On the roofs of the first vehicles that come; each keeps its receiver until it leaves.
+# On the roofs of eight vehicles whose ways are more in sight of the base stations than those of others.
+# Each keeps its receiver until it leaves. "traffic.*" are all vehicles and people.
 [[devices]]
 name = "rx"
 kind = "antenna"
 role = "rx"
 world = "traffic"
-on = "traffic.car-*"
+on = "traffic.user-*"
 count = 8
 mount = "roof"
 position_m = [0.0, 0.0, 0.1]

@@ -10,7 +10,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,7 +53,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What the pixels of a camera see, Shape ``[H, W]`` each."""
+    """Surfaces that the pixels of a camera see, Shape ``[H, W]`` each."""
 
     face: Int64Array
     """Number among the faces of all meshes, from 0; −1 where nothing is."""
@@ -78,17 +79,35 @@ def read_picture(file: Path) -> UInt8Array:
         AssetError: The file is missing or no picture.
         SetupError: Pillow is not installed.
     """
+    with _opened(file) as image:
+        return np.array(image.convert("RGB"))
+
+
+def save_picture(file: Path, rgb: UInt8Array) -> None:
+    """Write a picture, sRGB of Shape ``[H, W, 3]``; in the format of the file's ending.
+
+    Raises:
+        SetupError: Pillow is not installed.
+    """
+    _pillow().fromarray(rgb).save(file)
+
+
+def _pillow() -> Any:
     try:
-        from PIL import Image, UnidentifiedImageError
+        from PIL import Image
     except ImportError as error:
         raise SetupError(f"pictures need Pillow; run: {install_command('formats')}") from error
+    return Image
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    pillow = _pillow()
     try:
-        with Image.open(file) as image:
-            return np.array(image.convert("RGB"))
-    except UnidentifiedImageError as error:
-        raise AssetError(f"{file} is no picture that can be read; give a PNG or JPEG") from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise AssetError(f"cannot read picture {file}: {error}") from error
+        with pillow.open(file) as image:
+            yield image
+    except (OSError, ValueError, SyntaxError, pillow.DecompressionBombError) as error:
+        raise AssetError(f"picture {str(file)!r} cannot be read: {error}; give a PNG or JPEG") from error
 
 
 def read_pictures(table: Path) -> list[Picture]:
@@ -100,8 +119,6 @@ def read_pictures(table: Path) -> list[Picture]:
     Raises:
         AssetError: A line is wrong, or a picture is missing or none; names table, line and value.
     """
-    from PIL import Image
-
     found = []
     for line, row in _rows(table):
         place = f"{table}:{line}"
@@ -120,10 +137,10 @@ def read_pictures(table: Path) -> list[Picture]:
         name = row.get("file") or ""
         file = table.parent / str(name)
         try:
-            with Image.open(file) as image:
+            with _opened(file) as image:
                 width, height = image.size
-        except (OSError, ValueError, SyntaxError) as error:
-            raise AssetError(f"{place}: picture {str(file)!r} cannot be read: {error}") from error
+        except AssetError as error:
+            raise AssetError(f"{place}: {error}") from error
         found.append(Picture(file, camera(str(name), (x, y, z), (yaw, pitch, roll), fov, (width, height))))
     if not found:
         raise AssetError(f"{table} names no picture; write one a line: {','.join(COLUMNS)}")

@@ -27,6 +27,9 @@ from caviar_space.volumes import outward
 
 Place = tuple[float, float, float]
 
+# Of walls and roofs whose source says none, where it is not 0.2 m.
+_THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
+
 
 class Georeference(msgspec.Struct, frozen=True, kw_only=True):
     """Origin of a scene on the ellipsoid of WGS84; x is east, y north, z up [m]."""
@@ -123,6 +126,16 @@ class ImportedScene:
     """Differences between the source and what the scene holds."""
 
 
+def wall_material(itu_material: str, colour: tuple[float, float, float] | None = None) -> RadioMaterial:
+    """Material of walls and roofs of which a source says no thickness.
+
+    Args:
+        itu_material: Its name in ITU-R P.2040.
+        colour: Linear sRGB, 0…1; None: as the material looks.
+    """
+    return RadioMaterial(itu_material, _THICKNESS_M.get(itu_material, 0.2), colour)
+
+
 def source_of(file: Path) -> dict[str, str | int]:
     """Name, size and SHA-256 of a file, for the provenance.
 
@@ -189,6 +202,8 @@ def cut_to_box(scene: ImportedScene, box: Box) -> None:
             scene.pieces[name] = replace(piece, mesh=mesh)
     if not scene.pieces:
         raise AssetError(f"nothing of the {count} pieces of {scene.name} is within the box; name another one")
+    if len(scene.pieces) < count:
+        scene.notes.append(f"{count - len(scene.pieces)} of {count} pieces outside of the box: left out")
     for antennas in (scene.transmitters_m, scene.receivers_m):
         inside = [place for place in antennas if (low <= place[:2]).all() and (high >= place[:2]).all()]
         if len(inside) < len(antennas):

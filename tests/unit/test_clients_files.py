@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
-from caviar_clients.files import write_file
+from caviar_clients.files import write_file, writing
 from caviar_protocol.errors import RunError
 
 
@@ -43,3 +45,10 @@ def test_a_full_disk_leaves_the_file_as_it_was(tmp_path: Path, small_disk: Path)
     (tmp_path / "full.json").symlink_to("/dev/full")
     with pytest.raises(RunError, match=r"full\.json: No space left"):
         write_file(tmp_path / "full.json", "text")
+
+
+def test_errors_of_libraries_on_a_full_disk_name_it(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"out: No space left"), writing(tmp_path / "out"):
+        raise ValueError(f"IO Error: {os.strerror(errno.ENOSPC)}, errno 28")
+    with pytest.raises(ValueError, match="another"), writing(tmp_path / "out"):
+        raise ValueError("another")

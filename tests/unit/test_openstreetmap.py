@@ -17,7 +17,7 @@ from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, cut_to_box
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.sources import Request, read_source
-from caviar_space.sources.openstreetmap import metres
+from caviar_space.sources.map_files import metres
 from caviar_space.volumes import outward
 
 pytest.importorskip("osmium")
@@ -429,13 +429,15 @@ def test_buildings_and_roads_stand_on_the_ground(tmp_path: Path) -> None:
     assert np.abs(at[:, 2] - slope * (at[:, 0] + 90.0)).max() < 0.6  # junctions are level
 
 
-@pytest.mark.parametrize("name", ["text.tif", "cut.dt1", "none.dt2", "grid.asc"])
+@pytest.mark.parametrize("name", ["text.tif", "grey.tif", "cut.dt1", "none.dt2", "grid.asc"])
 def test_damaged_heights_are_refused(name: str, tmp_path: Path) -> None:
     from caviar_space.sources.height_grids import read_heights
 
     file = tmp_path / name
     if name == "cut.dt1":
         file.write_bytes(dted(file, np.zeros((5, 5))).read_bytes()[:-9])
+    elif name == "grey.tif":
+        pytest.importorskip("PIL.Image").new("L", (4, 4)).save(file)
     elif name != "none.dt2":
         file.write_text("no heights")
     with pytest.raises(AssetError, match=name):
@@ -458,7 +460,7 @@ def test_nodes_may_come_last_and_numbers_be_negative(
     ElementTree.ElementTree(root).write(file)
     found = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0)))
     assert found.pieces.keys() == scene.pieces.keys()
-    assert found.files.keys() == scene.files.keys()
+    assert found.files == scene.files
 
 
 @pytest.mark.parametrize("form", ["osm", "osm.pbf", "geojson"])
@@ -520,6 +522,7 @@ def test_any_scene_is_cut_to_a_box() -> None:
     assert shapely.area(parts).sum() == pytest.approx(inside.area)
     assert shapely.union_all(parts).symmetric_difference(inside).area < 1e-6
     assert scene.transmitters_m == [(0.0, 0.0, 5.0)]
+    assert "1 of 5 pieces outside of the box: left out" in scene.notes
     with pytest.raises(AssetError, match="nothing of the 4 pieces of town"):
         cut_to_box(scene, (500.0, 500.0, 510.0, 510.0))
 

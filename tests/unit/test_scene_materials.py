@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from caviar_scenes.views import Eye, Picture, camera, pictures_table, read_pictu
 from caviar_space.imported_scenes import ImportedScene, Piece, write_scene
 from caviar_space.meshes import Mesh, box, joined
 from caviar_space.mitsuba_xml import RadioMaterial
+
+pytestmark = pytest.mark.slow
 
 COLOURS = {"brick": (200, 60, 40), "glass": (40, 80, 220), "sky": (250, 250, 250)}
 
@@ -328,6 +331,29 @@ def test_an_empty_picture_and_an_empty_scene_are_refused(tmp_path: Path) -> None
         OnnxSegmenter(onnx_model(tmp_path)).segment(np.zeros((0, 4, 3), np.uint8))
     with pytest.raises(AssetError, match="has no faces"):
         viewpoints(Eye({}), 2)
+
+
+def test_a_broken_picture_and_a_broken_segmenter_are_named(tmp_path: Path) -> None:
+    picture = photograph(tmp_path)
+
+    class Broken(Colours):
+        def segment(self, rgb: UInt8Array) -> Float32Array:
+            return super().segment(rgb) * np.float32(math.nan)
+
+    with pytest.raises(AssetError, match=r"p\.png: the segmenter gives .* values that are no number"):
+        label_faces(eye_of(model_scene()), [picture], Broken(), TABLE)
+    picture.file.write_bytes(picture.file.read_bytes()[:-40])
+    with pytest.raises(AssetError, match=r"p\.png' cannot be read"):
+        label_faces(eye_of(model_scene()), [picture], Colours(), TABLE)
+
+
+def test_trees_keep_what_they_are(tmp_path: Path) -> None:
+    scene = model_scene()
+    scene.pieces["front"] = replace(scene.pieces["front"], kind="foliage")
+    labels = label_faces(eye_of(scene), [photograph(tmp_path)], Colours(), TABLE)
+    of_faces, sure = chosen_materials(scene, labels, 0.5, {"wood": 1.0})
+    assert of_faces == {"front": [""] * 4, "back": ["wood"] * 2}
+    assert not sure.any()
 
 
 @pytest.mark.parametrize(

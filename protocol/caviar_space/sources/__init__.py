@@ -97,7 +97,8 @@ def read_source(path: Path, request: Request | None = None, form: str = "") -> I
         raise AssetError(f"{path} is not there; name a file or folder of: {', '.join(READERS)}")
     name = form or _format_of(path)
     if name not in READERS:
-        raise AssetError(f"{path}: no format of scenes {name!r}; write --format: {', '.join(READERS)}")
+        said = f"no format of scenes {name!r}" if name else "its name is that of no format of scenes"
+        raise AssetError(f"{path}: {said}; write --format: {', '.join(READERS)}")
     if request.heights and name not in _MAPS:
         raise AssetError(f"{path} has its own ground; heights are for maps: {', '.join(_MAPS)}")
     ends, reader_place = READERS[name]

@@ -20,7 +20,8 @@ from caviar_space.imported_scenes import ImportedScene
 from caviar_space.sources import Request
 from caviar_space.sources.pieces import Y_UP, Colour, SceneBuilder, at, beside, contents, moved, reading
 
-_Index = Annotated[int, msgspec.Meta(ge=0)]
+Index = Annotated[int, msgspec.Meta(ge=0)]
+"""Of an item in a list of the document."""
 _Numbers3 = tuple[float, float, float]
 _Numbers4 = tuple[float, float, float, float]
 # That change where triangles are, or are for cameras alone; required others are refused.
@@ -33,14 +34,14 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
-class _Part(msgspec.Struct, frozen=True, rename="camel"):
+class Part(msgspec.Struct, frozen=True, rename="camel"):
     """A part of a document; what scenes do not need is not read."""
 
 
-class _Node(_Part, frozen=True):
+class _Node(Part, frozen=True):
     name: str = ""
-    mesh: _Index | None = None
-    children: list[_Index] = []
+    mesh: Index | None = None
+    children: list[Index] = []
     matrix: list[float] | None = None
     translation: _Numbers3 = (0.0, 0.0, 0.0)
     rotation: _Numbers4 = (0.0, 0.0, 0.0, 1.0)
@@ -48,76 +49,80 @@ class _Node(_Part, frozen=True):
     extensions: dict[str, Any] = {}
 
 
-class _Primitive(_Part, frozen=True):
-    attributes: dict[str, _Index] = {}
-    indices: _Index | None = None
-    material: _Index | None = None
+class _Primitive(Part, frozen=True):
+    attributes: dict[str, Index] = {}
+    indices: Index | None = None
+    material: Index | None = None
     mode: int = 4
     extensions: dict[str, Any] = {}
 
 
-class _Mesh(_Part, frozen=True):
+class _Mesh(Part, frozen=True):
     primitives: list[_Primitive] = []
     name: str = ""
 
 
-class _Surface(_Part, frozen=True):
+class _Surface(Part, frozen=True):
     base_color_factor: _Numbers4 = (1.0, 1.0, 1.0, 1.0)
 
 
-class _Material(_Part, frozen=True):
+class _Material(Part, frozen=True):
     name: str = ""
     pbr_metallic_roughness: _Surface | None = None
 
 
-class _Accessor(_Part, frozen=True):
+class _Accessor(Part, frozen=True):
     component_type: int
-    count: _Index
+    count: Index
     type: str
-    buffer_view: _Index | None = None
-    byte_offset: _Index = 0
+    buffer_view: Index | None = None
+    byte_offset: Index = 0
     normalized: bool = False
     sparse: dict[str, Any] | None = None
 
 
-class _View(_Part, frozen=True):
-    buffer: _Index
-    byte_length: _Index
-    byte_offset: _Index = 0
-    byte_stride: _Index | None = None
+class View(Part, frozen=True):
+    """Bytes of a buffer."""
+
+    buffer: Index
+    byte_length: Index
+    byte_offset: Index = 0
+    byte_stride: Index | None = None
 
 
-class _Buffer(_Part, frozen=True):
-    byte_length: _Index
+class Buffer(Part, frozen=True):
+    """Bytes of a file, or of what is appended to the document."""
+
+    byte_length: Index
     uri: str | None = None
 
 
-class _Scene(_Part, frozen=True):
-    nodes: list[_Index] = []
+class _Scene(Part, frozen=True):
+    nodes: list[Index] = []
 
 
-class _Asset(_Part, frozen=True):
+class _Asset(Part, frozen=True):
     version: str
 
 
-class _Rtc(_Part, frozen=True):
+class _Rtc(Part, frozen=True):
     center: _Numbers3
 
 
-class _Extensions(_Part, frozen=True):
+class _Extensions(Part, frozen=True):
     rtc: _Rtc | None = msgspec.field(default=None, name="CESIUM_RTC")
 
 
-class _Document(_Part, frozen=True):
+class _Document(Part, frozen=True):
     asset: _Asset
-    scene: _Index = 0
+    scene: Index = 0
     scenes: list[_Scene] = []
     nodes: list[_Node] = []
     meshes: list[_Mesh] = []
     materials: list[_Material] = []
     accessors: list[_Accessor] = []
-    buffer_views: list[_View] = []
-    buffers: list[_Buffer] = []
+    buffer_views: list[View] = []
+    buffers: list[Buffer] = []
     extensions_required: list[str] = []
     extensions: _Extensions = _Extensions()
 
@@ -268,7 +273,7 @@ class Gltf:
 
     def _view(self, index: int) -> tuple[bytes, int | None]:
         """Bytes of a buffer view, and its stride."""
-        view: _View = at(self._document.buffer_views, index, "buffer view")
+        view: View = at(self._document.buffer_views, index, "buffer view")
         if view.buffer not in self._buffers:
             buffer = at(self._document.buffers, view.buffer, "buffer")
             self._buffers[view.buffer] = data = self._buffer(buffer)
@@ -280,7 +285,7 @@ class Gltf:
             raise ValueError(f"buffer view {index} ends at byte {end}, its buffer at {len(data)}")
         return data[view.byte_offset : end], view.byte_stride
 
-    def _buffer(self, buffer: _Buffer) -> bytes:
+    def _buffer(self, buffer: Buffer) -> bytes:
         if buffer.uri is None:
             return self._binary
         if buffer.uri.startswith("data:"):

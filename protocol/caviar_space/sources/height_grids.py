@@ -12,8 +12,11 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError, one_line
 from caviar_protocol.host import install_command
+from caviar_space.meshes import Mesh
 
 WGS84 = "EPSG:4326"
+STEP_M = 20.0
+"""Side of the squares of ground that is not level [m]."""
 # Tags of GeoTIFF 1.1 (OGC 19-008r4) and of GDAL: scale, tie point, keys, and the value of what is not known.
 _SCALE, _TIE, _KEYS, _UNKNOWN = 33550, 33922, 34735, 42113
 # Keys: whether a value is that of an area, system of projected and of geographic coordinates.
@@ -88,13 +91,13 @@ def _read_geotiff(path: Path) -> HeightGrid:
     try:
         with Image.open(path, formats=["TIFF"]) as image:
             tags: Any = image.tag_v2  # type: ignore[attr-defined]
-            heights = np.asarray(image, np.float64)
+            heights, mode = np.asarray(image, np.float64), image.mode
             scale, tie, found = tags.get(_SCALE), tags.get(_TIE), tags.get(_KEYS)
             unknown = str(tags.get(_UNKNOWN, "nan")).strip("\0 ")
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from error
-    if heights.ndim != 2:
-        raise ValueError(f"it has {heights.shape[-1]} bands, and heights are one")
+    if mode not in ("F", "I", "I;16", "I;16B", "I;16S"):
+        raise ValueError(f"its values are of the kind {mode}, and heights are one number of 16 or 32 bits")
     if not (scale and tie and found):
         raise ValueError("it has no scale, tie point or keys, so that its place is not known")
     rows = np.reshape(found, (-1, 4))[1:]
@@ -129,3 +132,37 @@ def _read_dted(data: bytes) -> HeightGrid:
     heights = np.where(values & 0x8000, -(values & 0x7FFF), values).astype(np.float64)  # sign and magnitude
     heights[heights == -32767] = np.nan
     return HeightGrid(heights.T[::-1], (west, south + (rows - 1) * step[1]), step)
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """Ground that is not level: heights at the nodes of squares, each of two triangles."""
+
+    corner: tuple[float, float]
+    """With the lowest x and y [m]."""
+    heights: Float64Array
+    """[m], over x and y, Shape ``[X, Y]``."""
+
+    def at(self, places: Float64Array) -> Float64Array:
+        """Heights of the triangles at x and y [m], Shape ``[N, 2]`` to ``[N]``."""
+        cells = np.clip((places - self.corner) / STEP_M, 0, np.array(self.heights.shape) - 1.000001)
+        (i, j), (u, v) = cells.astype(int).T, (cells % 1).T
+        low, high = self.heights[i, j], self.heights[i + 1, j + 1]
+        beside, beyond = self.heights[i + 1, j], self.heights[i, j + 1]
+        found: Float64Array = np.where(
+            u >= v,
+            low + u * (beside - low) + v * (high - beside),
+            low + v * (beyond - low) + u * (high - beyond),
+        )
+        return found
+
+    def mesh(self) -> Mesh:
+        """The triangles."""
+        x, y = self.heights.shape
+        nodes = np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1).reshape(-1, 2)
+        number = np.arange(x * y, dtype=np.int32).reshape(x, y)
+        a, b, c, d = (
+            part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+        )
+        faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+        return Mesh(np.column_stack([nodes * STEP_M + self.corner, self.heights.ravel()]), faces)

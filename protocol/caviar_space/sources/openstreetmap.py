@@ -1,17 +1,14 @@
 """Maps of OpenStreetMap as scenes: buildings with parts and roofs, trees, water, ground, and a road network.
 
-``.osm`` and ``.osm.pbf`` are read by osmium, which puts multipolygons together; GeoJSON has the same tags as
-properties. All of it is drawn in transverse Mercator about the origin (`Georeference.projection`), and so is
-the network that SUMO's netconvert makes of the roads (`road_network`).
+All that a file of a map has (`map_files`) is drawn in transverse Mercator about the origin
+(`Georeference.projection`), and so is the network that SUMO's netconvert makes of the roads (`road_network`).
 """
 
 from __future__ import annotations
 
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -19,12 +16,28 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array
-from caviar_protocol.errors import AssetError, SetupError, one_line
+from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
-from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, box_in_metres, source_of
+from caviar_space.imported_scenes import (
+    Georeference,
+    ImportedScene,
+    Piece,
+    box_in_metres,
+    source_of,
+    wall_material,
+)
 from caviar_space.meshes import Mesh, joined
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources.building_shapes import Roof, crown, plate, prism, roofed, triangulated
+from caviar_space.sources.height_grids import STEP_M, Terrain
+from caviar_space.sources.map_files import (
+    Element,
+    Map,
+    building_kind,
+    is_water,
+    metres,
+    read_map_file,
+)
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -60,57 +73,13 @@ TREE_M = (10.0, 5.0)
 """Height of a tree and diameter of its crown that are not tagged [m]; the crown begins at 0.3 of it."""
 BEYOND_M = 500.0
 """Distance from the box of an extract within which buildings are taken, where none is asked for [m]."""
-STEP_M = 20.0
-"""Side of the squares of ground that is not level [m]."""
 ROW_M = 8.0
 """Distance between the trees of a row [m]."""
-THICKNESS_M = {"glass": 0.01, "metal": 0.01, "wood": 0.05}
-"""Of walls and roofs, where it is not 0.2 [m]."""
-_KEYS = ("building", "building:part", "highway", "natural", "landuse", "waterway", "type")
 # Distance from the border of a map to the last node of a coast, at most [m].
 _CUT_M = 100.0
 _COMPASS = (
     "N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW"
 )  # fmt: skip
-# Nodes of a road that netconvert makes use of.
-_SIGNS = ("traffic_signals", "crossing", "stop", "give_way", "mini_roundabout")
-
-
-class Element(NamedTuple):
-    """Element of a map."""
-
-    name: str
-    """``w``, ``r`` or ``n``, and the number of the way, relation or node."""
-    tags: Mapping[str, str]
-    shape: Any
-    """Shapely's geometry."""
-
-
-class Way(NamedTuple):
-    """Road of a map."""
-
-    number: int
-    tags: Mapping[str, str]
-    nodes: tuple[int, ...]
-    places: Float64Array
-    """Of its nodes: first longitude and latitude [°], then x and y [m], Shape ``[N, 2]``."""
-
-
-@dataclass(eq=False)
-class Map:
-    """Content of a map, in longitude and latitude [°]."""
-
-    areas: list[Element] = field(default_factory=list)
-    trees: list[Element] = field(default_factory=list)
-    coast: list[Element] = field(default_factory=list)
-    """Lines with the land to their left."""
-    roads: list[Way] = field(default_factory=list)
-    signs: dict[int, Mapping[str, str]] = field(default_factory=dict)
-    """Tags of nodes of roads that stand for traffic signals and the like."""
-    bounds: tuple[float, float, float, float] | None = None
-    """West, south, east, north."""
-    left_out: Counter[str] = field(default_factory=Counter)
-    """What of the map the scene does not hold, and how often."""
 
 
 def read_map(path: Path, request: Request) -> ImportedScene:
@@ -133,194 +102,7 @@ def read_map(path: Path, request: Request) -> ImportedScene:
             f"maps need {error.name}, of the extra `scenes`; run: {install_command('scenes')}"
         ) from error
     request.progress("read the map", 0.0)
-    read = _read_geojson if path.suffix.lower() in (".geojson", ".json") else _read_osm
-    try:
-        found = read(path)
-        if read is _read_osm and not found.areas and not found.roads and found.left_out.total():
-            # Overpass gives nodes after ways, and JOSM negative numbers: osmium finds no node then.
-            with tempfile.TemporaryDirectory(prefix="caviar-map-") as folder:
-                found = _read_osm(_in_order(path, Path(folder)))
-    except OSError as error:
-        raise AssetError(f"cannot read {path}: {error.strerror or error}") from error
-    except RuntimeError as error:
-        raise AssetError(
-            f"{path} cannot be put in order: {one_line(str(error))}; sort it by osmium"
-        ) from error
-    return _Assembly(path, request, found).scene()
-
-
-def metres(text: str) -> float | None:
-    """Length of a tag [m]: ``12``, ``10,5``, ``10 m``, ``33 ft``, ``33'6"``; None where it is none.
-
-    Example:
-        >>> metres("10,5"), metres("12.13 m"), metres("100 ft"), metres("NaN")
-        (10.5, 12.13, 30.48, None)
-    """
-    found = re.fullmatch(
-        r"""\s*(?P<number>[+-]?\d{1,9}([.,]\d+)?)\s*(?P<unit>m|metres?|meters?|ft|feet|')?"""
-        r"""\s*((?P<inches>\d{1,2})\s*(in|"|''))?\s*""",
-        text.lower(),
-    )
-    if found is None:
-        return None
-    value = float(found["number"].replace(",", "."))
-    if found["unit"] in ("ft", "feet", "'"):
-        return (value + float(found["inches"] or 0) / 12) * 0.3048
-    return None if found["inches"] else value
-
-
-def _read_osm(path: Path) -> Map:
-    import osmium
-    import shapely
-
-    found, seen = Map(), set[str]()
-    wkb = osmium.geom.WKBFactory()
-    rings: dict[str, Mapping[str, str]] = {}
-    try:
-        with osmium.io.Reader(str(path)) as reader:
-            box = reader.header().box()
-            if box.valid():
-                low, high = box.bottom_left, box.top_right
-                found.bounds = (low.lon, low.lat, high.lon, high.lat)
-        keys = osmium.filter.KeyFilter(*_KEYS)
-        for thing in osmium.FileProcessor(str(path)).with_areas(keys).with_filter(keys):
-            tags = dict(thing.tags)
-            if thing.is_area():
-                name = f"{'w' if thing.from_way() else 'r'}{thing.orig_id()}"
-                # An outline that crosses itself is an area without rings.
-                if _is_area(tags) and thing.num_rings()[0]:
-                    seen.add(name)
-                    found.areas.append(Element(name, tags, shapely.from_wkb(wkb.create_multipolygon(thing))))
-            elif thing.is_way():
-                if _is_area(tags) and "highway" not in tags:
-                    rings[f"w{thing.id}"] = tags
-                elif "highway" in tags or tags.get("natural") in ("tree_row", "coastline"):
-                    _add_line(found, thing.id, tags, thing.nodes)
-            elif thing.is_relation():
-                if _is_area(tags) and tags.get("type") == "multipolygon":
-                    rings[f"r{thing.id}"] = tags
-            elif tags.get("natural") == "tree":
-                place = shapely.Point(thing.location.lon, thing.location.lat)
-                found.trees.append(Element(f"n{thing.id}", tags, place))
-            elif tags.get("highway") in _SIGNS:
-                found.signs[thing.id] = tags
-    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
-        raise AssetError(f"{path} cannot be read: {one_line(str(error))}; get the extract again") from error
-    for name in rings.keys() - seen:
-        what = "building" if _building(rings[name]) else "area"
-        found.left_out[f"{what} without a closed outline: cut at the border, or crossing itself"] += 1
-    return found
-
-
-def _in_order(path: Path, folder: Path) -> Path:
-    """A copy of a map with positive numbers, nodes before ways before relations."""
-    import osmium
-
-    with osmium.SimpleWriter(str(folder / "positive.osm.pbf")) as writer:
-        for thing in osmium.FileProcessor(str(path)):
-            if thing.is_node():
-                writer.add(thing.replace(id=abs(thing.id)))
-            elif thing.is_way():
-                writer.add(thing.replace(id=abs(thing.id), nodes=[abs(node.ref) for node in thing.nodes]))
-            else:
-                members = [(member.type, abs(member.ref), member.role) for member in thing.members]
-                writer.add(thing.replace(id=abs(thing.id), members=members))
-    merged = osmium.MergeInputReader()
-    merged.add_file(str(folder / "positive.osm.pbf"))
-    with osmium.SimpleWriter(str(folder / "ordered.osm.pbf")) as writer:
-        merged.apply(writer)
-    return folder / "ordered.osm.pbf"
-
-
-def _add_line(found: Map, number: int, tags: Mapping[str, str], nodes: Any) -> None:
-    """Add a road or a row of trees, without nodes that the file has not."""
-    import shapely
-
-    there = [node for node in nodes if node.location.valid()]
-    found.left_out["node of a road that is not in the file"] += len(nodes) - len(there)
-    places = np.array([(node.location.lon, node.location.lat) for node in there]).reshape(-1, 2)
-    if len(there) < 2:
-        return
-    if "highway" in tags:
-        found.roads.append(Way(number, tags, tuple(node.ref for node in there), places))
-    else:
-        lines = found.coast if tags["natural"] == "coastline" else found.trees
-        lines.append(Element(f"w{number}", tags, shapely.LineString(places)))
-
-
-class _Feature(msgspec.Struct):
-    properties: dict[str, Any] | None = None
-    geometry: dict[str, Any] | None = None
-    id: Any = None
-
-
-class _Collection(msgspec.Struct):
-    type: str
-    features: list[_Feature]
-
-
-def _read_geojson(path: Path) -> Map:
-    import shapely
-
-    try:
-        collection = msgspec.json.decode(path.read_bytes(), type=_Collection)
-    except (msgspec.MsgspecError, RecursionError, UnicodeError) as error:
-        raise AssetError(
-            f"{path} is no GeoJSON: {one_line(str(error))}; write a FeatureCollection"
-        ) from error
-    found, numbers = Map(), dict[tuple[float, float], int]()
-    for index, feature in enumerate(collection.features):
-        where = f"{path}: feature {index}"
-        given = feature.properties or {}
-        given = given | given["tags"] if isinstance(given.get("tags"), dict) else given
-        tags = {key: str(value) for key, value in given.items() if value is not None}
-        name = re.sub(r"\W+", "-", str(feature.id or given.get("@id") or index)).strip("-")
-        if not feature.geometry:
-            found.left_out["feature without a geometry"] += 1
-            continue
-        try:
-            shape = shapely.geometry.shape(feature.geometry)
-        except Exception as error:  # of whatever kind the values are wrong
-            raise AssetError(f"{where}: its geometry is none: {one_line(str(error))}; mend it") from error
-        places = shapely.get_coordinates(shape)
-        if not (np.isfinite(places).all() and (np.abs(places) <= (180, 90)).all()):
-            raise AssetError(
-                f"{where}: coordinates beyond 180 and 90; GeoJSON has longitude and latitude [°]"
-            )
-        for part in shapely.get_parts(shape):
-            if part.geom_type == "Polygon" and _is_area(tags):
-                found.areas.append(Element(f"f{name}", tags, part))
-            elif part.geom_type == "LineString" and "highway" in tags:
-                at = shapely.get_coordinates(part)
-                refs = tuple(numbers.setdefault(tuple(p), len(numbers) + 1) for p in np.round(at, 7).tolist())
-                found.roads.append(Way(index + 1, tags, refs, at))
-            elif part.geom_type in ("Point", "LineString") and tags.get("natural") in ("tree", "tree_row"):
-                found.trees.append(Element(f"f{name}", tags, part))
-            elif part.geom_type == "Point" and tags.get("highway") in _SIGNS:
-                at = tuple(np.round(shapely.get_coordinates(part)[0], 7).tolist())
-                found.signs[numbers.setdefault(at, len(numbers) + 1)] = tags
-    return found
-
-
-def _building(tags: Mapping[str, str]) -> str:
-    """Kind of building, ``part``, or empty."""
-    if tags.get("building:part", "no") != "no":
-        return "part"
-    kind = tags.get("building", "no")
-    underground = tags.get("location") == "underground" or (metres(tags.get("layer", "0")) or 0) < 0
-    return "" if kind == "no" or underground else kind
-
-
-def _is_water(tags: Mapping[str, str]) -> bool:
-    return tags.get("natural") == "water" or tags.get("waterway") == "riverbank"
-
-
-def _is_wood(tags: Mapping[str, str]) -> bool:
-    return tags.get("natural") == "wood" or tags.get("landuse") == "forest"
-
-
-def _is_area(tags: Mapping[str, str]) -> bool:
-    return bool(_building(tags)) or _is_water(tags) or _is_wood(tags)
+    return _Assembly(path, request, read_map_file(path)).scene()
 
 
 class _Solid(NamedTuple):
@@ -331,40 +113,6 @@ class _Solid(NamedTuple):
     low: float
     high: float
     roof: Roof
-
-
-@dataclass(frozen=True, eq=False)
-class _Terrain:
-    """Ground that is not level: heights at the nodes of squares, each of two triangles."""
-
-    corner: tuple[float, float]
-    """With the lowest x and y [m]."""
-    heights: Float64Array
-    """[m], over x and y, Shape ``[X, Y]``."""
-
-    def at(self, places: Float64Array) -> Float64Array:
-        """Heights of the triangles at x and y [m], Shape ``[N, 2]`` to ``[N]``."""
-        cells = np.clip((places - self.corner) / STEP_M, 0, np.array(self.heights.shape) - 1.000001)
-        (i, j), (u, v) = cells.astype(int).T, (cells % 1).T
-        low, high = self.heights[i, j], self.heights[i + 1, j + 1]
-        beside, beyond = self.heights[i + 1, j], self.heights[i, j + 1]
-        found: Float64Array = np.where(
-            u >= v,
-            low + u * (beside - low) + v * (high - beside),
-            low + v * (beyond - low) + u * (high - beyond),
-        )
-        return found
-
-    def mesh(self) -> Mesh:
-        """The triangles."""
-        x, y = self.heights.shape
-        nodes = np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), axis=-1).reshape(-1, 2)
-        number = np.arange(x * y, dtype=np.int32).reshape(x, y)
-        a, b, c, d = (
-            part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
-        )
-        faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-        return Mesh(np.column_stack([nodes * STEP_M + self.corner, self.heights.ravel()]), faces)
 
 
 class _Assembly:
@@ -437,7 +185,7 @@ class _Assembly:
             for polygon in shapely.get_parts(shapely.get_parts(shape)):
                 if polygon.geom_type != "Polygon":
                     continue
-                if kind := _building(element.tags):
+                if kind := building_kind(element.tags):
                     polygon = shapely.simplify(polygon, 0.02)
                     if not polygon.is_valid or polygon.area < 1.0:
                         self.notes["footprint of less than 1 m²"] += 1
@@ -445,7 +193,7 @@ class _Assembly:
                         (parts if kind == "part" else outlines).append(element._replace(shape=polygon))
                 elif polygon.intersects(frame):
                     inside = [p for p in shapely.get_parts(polygon & frame) if p.geom_type == "Polygon"]
-                    if _is_water(element.tags):
+                    if is_water(element.tags):
                         self.water += inside
                     else:
                         self.woods += [element._replace(shape=p) for p in inside]
@@ -599,7 +347,7 @@ class _Assembly:
 
     def _add(self, name: str, mesh: Mesh, material: str, kind: str, line: int = 0) -> None:
         self.made.pieces[name] = Piece(mesh, material, kind, self.path.name, line)
-        radio = RadioMaterial(material, thickness_m=THICKNESS_M.get(material, 0.2))
+        radio = wall_material(material)
         if kind == "foliage":  # is to waves what a channel says of its volume
             radio = RadioMaterial(colour=(0.0, 0.25, 0.0))
         self.made.materials.setdefault(material, radio)
@@ -635,7 +383,7 @@ class _Assembly:
             raise AssetError(f"{self.request.heights} has no heights within the box; name another grid")
         lowest = float(np.nanmin(heights))
         self.notes[f"place of the ground without a height: {lowest:g} m"] += int(np.isnan(heights).sum())
-        self.terrain = _Terrain((float(x0), float(y0)), np.nan_to_num(heights - lowest, nan=0.0))
+        self.terrain = Terrain((float(x0), float(y0)), np.nan_to_num(heights - lowest, nan=0.0))
         self.origin = self.made.origin = msgspec.structs.replace(self.origin, altitude_m=lowest)
 
     def _add_foliage(self) -> None:

@@ -19,7 +19,7 @@ from caviar_protocol.arrays import MAX_COORDINATE_M, Float64Array, Int64Array
 from caviar_protocol.assets import ITU_MATERIALS
 from caviar_protocol.errors import AssetError, CaviarError, SetupError
 from caviar_protocol.host import install_command
-from caviar_space.imported_scenes import ImportedScene, Piece, source_of
+from caviar_space.imported_scenes import ImportedScene, Piece, source_of, wall_material
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources import Request
@@ -259,7 +259,7 @@ class SceneBuilder:
             name: As the source gives it; empty: it gives none.
             colour: Linear sRGB, 0…1.
         """
-        return self.keep(name, RadioMaterial(self.itu(name or "unnamed"), colour=colour))
+        return self.keep(name, wall_material(self.itu(name or "unnamed"), colour))
 
     def keep(self, name: str, made: RadioMaterial) -> str:
         """Key of a material with its properties.

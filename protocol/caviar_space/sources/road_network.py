@@ -27,7 +27,7 @@ from caviar_protocol.host import install_command
 
 if TYPE_CHECKING:
     from caviar_space.imported_scenes import Georeference
-    from caviar_space.sources.openstreetmap import Way
+    from caviar_space.sources.map_files import Way
 
 NET = "sumo/net.net.xml"
 """Path of the network in the folder of a scene."""
@@ -213,7 +213,9 @@ def _converted(
     if ran.returncode or not (folder / "out.net.xml").is_file():
         said = " ".join((ran.stderr or ran.stdout).strip().splitlines()[-3:])
         raise AssetError(f"netconvert makes no network of the roads: {said}; name another box")
-    return (folder / "out.net.xml").read_bytes()
+    # Without netconvert's comment, which has the time: equal maps give equal files.
+    head, sign, net = (folder / "out.net.xml").read_bytes().partition(b"<net ")
+    return head.partition(b"\n")[0] + b"\n" + sign + net
 
 
 def _write_types(home: Path, file: Path) -> None:
@@ -269,7 +271,7 @@ def _write_roads(
 
 
 def _hits(net: ElementTree.Element, buildings: Any, solid: Any) -> Iterator[tuple[bool, Any]]:
-    """Whether a lane is one to walk on, and where it reaches into a building, for each that does [m]."""
+    """Find lanes that reach into buildings: whether each is one to walk on, and where it does [m]."""
     import shapely
 
     walked, lines, halves = list[bool](), list[Any](), list[float]()

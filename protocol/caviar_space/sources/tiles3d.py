@@ -23,7 +23,7 @@ from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference, ImportedScene, box_in_metres
 from caviar_space.sources import Request
-from caviar_space.sources.gltf import Gltf
+from caviar_space.sources.gltf import Buffer, Gltf, Index, Part, View
 from caviar_space.sources.pieces import Y_UP, SceneBuilder, at, beside, contents, moved, reading
 
 _MOST_TILES = 20_000
@@ -31,37 +31,32 @@ _MOST_TILES = 20_000
 _EARTH_M = (6.2e6, 6.6e6)
 _WGS84 = "EPSG:4979"
 _ECEF = "EPSG:4978"
-_Index = Annotated[int, msgspec.Meta(ge=0)]
 
 
-class _Part(msgspec.Struct, frozen=True, rename="camel"):
-    """A part of a tileset; what scenes do not need is not read."""
-
-
-class _Content(_Part, frozen=True):
+class _Content(Part, frozen=True):
     uri: str = ""
     url: str = ""
     """Its name before 1.0."""
 
 
-class _Volume(_Part, frozen=True):
+class _Volume(Part, frozen=True):
     box: list[float] | None = None
     region: list[float] | None = None
     sphere: list[float] | None = None
 
 
-class _Uri(_Part, frozen=True):
+class _Uri(Part, frozen=True):
     uri: str
 
 
-class _Implicit(_Part, frozen=True):
+class _Implicit(Part, frozen=True):
     subdivision_scheme: str
     subtree_levels: Annotated[int, msgspec.Meta(ge=1, le=20)]
     available_levels: Annotated[int, msgspec.Meta(ge=1, le=60)]
     subtrees: _Uri
 
 
-class _Tile(_Part, frozen=True):
+class _Tile(msgspec.Struct, frozen=True, rename="camel"):
     geometric_error: float
     bounding_volume: _Volume = _Volume()
     refine: str = ""
@@ -72,40 +67,29 @@ class _Tile(_Part, frozen=True):
     implicit_tiling: _Implicit | None = None
 
 
-class _Asset(_Part, frozen=True):
+class _Asset(Part, frozen=True):
     version: str
     gltf_up_axis: str = "Y"
 
 
-class _Tileset(_Part, frozen=True):
+class _Tileset(Part, frozen=True):
     asset: _Asset
     root: _Tile
 
 
-class _Availability(_Part, frozen=True):
+class _Availability(Part, frozen=True):
     constant: int | None = None
-    bitstream: _Index | None = None
-    buffer_view: _Index | None = None
+    bitstream: Index | None = None
+    buffer_view: Index | None = None
     """Name of the bitstream in drafts of 1.1."""
 
 
-class _Buffer(_Part, frozen=True):
-    byte_length: _Index
-    uri: str | None = None
-
-
-class _View(_Part, frozen=True):
-    buffer: _Index
-    byte_offset: _Index
-    byte_length: _Index
-
-
-class _SubtreeHead(_Part, frozen=True):
+class _SubtreeHead(msgspec.Struct, frozen=True, rename="camel"):
     tile_availability: _Availability
     child_subtree_availability: _Availability
     content_availability: list[_Availability] = []
-    buffers: list[_Buffer] = []
-    buffer_views: list[_View] = []
+    buffers: list[Buffer] = []
+    buffer_views: list[View] = []
 
 
 @dataclass(frozen=True)
