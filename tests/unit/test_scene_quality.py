@@ -14,7 +14,7 @@ from caviar_protocol.errors import AssetError, ScenarioError
 from caviar_scenes.checks import KINDS, check
 from caviar_scenes.cli import app
 from caviar_scenes.look import look
-from caviar_scenes.opened import open_scene
+from caviar_scenes.opened import open_scene, write_changed
 from caviar_scenes.repairs import repair
 from caviar_scenes.simplification import simplify
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, write_scene
@@ -109,6 +109,20 @@ def test_a_fault_is_repaired_and_nothing_else_changes(kind: str, tmp_path: Path)
         assert shape.radio is not None
         assert 'name="thickness" value="0.2"' in shape.radio.xml
         assert np.unique(after.meshes[name].vertices[:, 1]) == pytest.approx([5.1])
+
+
+def test_a_sheet_of_a_material_for_cameras_keeps_what_it_is_made_of(tmp_path: Path) -> None:
+    xml = town(tmp_path, PLANTED["thin closed wall"]) / "scene.xml"
+    cameras = '<bsdf type="twosided" id="itu_brick"><bsdf type="diffuse"><rgb name="color" value="1 0 0"/>'
+    text = xml.read_text().replace("</scene>", cameras + "</bsdf></bsdf></scene>")
+    wall = text.index("mesh-wall")
+    xml.write_text(text[:wall] + text[wall:].replace('"concrete"', '"itu_brick"', 1))
+    done, _ = repair(open_scene(str(xml)))
+    write_changed(open_scene(str(xml)), done, tmp_path / "better", {}, "repaired")
+    shape = open_scene(str(tmp_path / "better")).shapes["wall"]
+    assert (shape.itu_material, shape.colour) == ("brick", (1.0, 0.0, 0.0))
+    assert shape.radio is not None
+    assert '"thickness" value="0.2"' in shape.radio.xml
 
 
 def test_overlapping_bodies_of_one_material_are_united(tmp_path: Path) -> None:
