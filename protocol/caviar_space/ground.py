@@ -63,7 +63,7 @@ def are_ground(meshes: Sequence[Mesh]) -> list[bool]:
 
 def _ground_of(shapes: Sequence[Piece]) -> list[bool]:
     lowest = min((shape.corners[..., 2].min() for shape in shapes), default=0.0)
-    walls = [_extent(shape) for shape in shapes if not _is_level(shape)]
+    walls = np.array([_extent(shape) for shape in shapes if not _is_level(shape)]).reshape(-1, 2, 2)
     return [_is_ground(shape, lowest, walls) for shape in shapes]
 
 
@@ -83,14 +83,14 @@ def _piece(mesh: Mesh) -> Piece:
     )
 
 
-def _is_ground(shape: Piece, lowest: float, walls: Sequence[Float64Array]) -> bool:
-    """Test whether a mesh is ground, given the extents of the meshes with walls.
+def _is_ground(shape: Piece, lowest: float, walls: Float64Array) -> bool:
+    """Test whether a mesh is ground, given the extents of the meshes with walls, Shape ``[W, 2, 2]``.
 
     A roof may reach the ground too, as a mesh apart from its walls; it has their extent.
     """
     if not _is_level(shape) or shape.corners[..., 2].min() >= lowest + 1.0:
         return False
-    return not any(np.allclose(_extent(shape), other, rtol=0, atol=0.05) for other in walls)
+    return not bool((np.abs(_extent(shape) - walls) <= 0.05).all(axis=(1, 2)).any())
 
 
 def _is_level(shape: Piece) -> bool:
