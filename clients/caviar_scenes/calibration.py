@@ -48,7 +48,7 @@ DECADES = 0.5
 plates in which waves resonate, which fits noise well."""
 SEARCHED = np.concatenate([np.arange(1.4, 9.0, 0.2), np.arange(9.0, 20.0, 1.0)])
 """Permittivities from which the fit may start."""
-RIPPLE = np.linspace(0.75, 1.25, 101)
+RIPPLE = np.linspace(0.85, 1.15, 241)
 """Parts of a permittivity at which the interval is looked at beyond the optimum."""
 FAINT = 1e-3
 """Share of the received power, summed over places, below which a material counts as unseen."""
@@ -480,6 +480,18 @@ def calibrate(
     before = float(np.sqrt(np.mean(misfit(x) ** 2)))
     after, deviation = before, np.zeros(0)
     if seen:
+
+        def cost(x: Float64Array) -> float:
+            return 0.5 * float((residuals(x) ** 2).sum())
+
+        def refined(x: Float64Array) -> Any:
+            return least_squares(residuals, x, jac="3-point", bounds=(low, high), x_scale="jac")
+
+        def varied(x: Float64Array, k: int, values: Float64Array) -> Float64Array:
+            tried = np.tile(x, (len(values), 1))
+            tried[:, count * k] = np.clip(values, *BOUNDS[0])
+            return tried
+
         fits = []
         for more in (0.0, -DECADES, DECADES):
             begin = x.copy()
@@ -487,28 +499,25 @@ def calibrate(
             begin = np.clip(begin, low + 1e-6, high - 1e-6)
             for _ in range(2):
                 for k in range(len(seen)):
-                    tried = np.tile(begin, (len(SEARCHED) + 1, 1))
-                    tried[:-1, count * k] = SEARCHED
-                    begin = tried[int(np.argmin([(residuals(one) ** 2).sum() for one in tried]))]
-            fits.append(least_squares(residuals, begin, jac="3-point", bounds=(low, high), x_scale="jac"))
+                    begin = min(varied(begin, k, np.append(SEARCHED, begin[count * k])), key=cost)
+            fits.append(refined(begin))
+        # What a slab reflects has a ripple over its permittivity: its neighbours may fit as well, or better.
+        best = min(fits, key=lambda one: float(one.cost)).x
+        for k in range(len(seen)):
+            tried = varied(best, k, RIPPLE * best[count * k])
+            costs = np.array([cost(one) for one in tried])
+            dips = 1 + np.flatnonzero((costs[1:-1] <= costs[:-2]) & (costs[1:-1] <= costs[2:]))
+            fits += [refined(tried[dip]) for dip in dips[np.argsort(costs[dips])][:6]]
         fit = min(fits, key=lambda one: float(one.cost))
-        # Of other optima that fit as well, none can be ruled out.
-        rivals = np.array([one.x for one in fits if one.cost < fit.cost + 2.0])
         x, left = fit.x, misfit(fit.x)
         after = float(np.sqrt(np.mean(left**2)))
         # Noise larger than what was given widens the intervals; less of it may be chance.
         larger = max(1.0, float((left**2).sum()) / max(1, len(left) - len(x)))
         deviation = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac, rcond=1e-14)) * larger)
         deviation[(fit.jac**2).sum(0) < 1e-12] = math.inf
-        deviation = np.maximum(deviation, np.abs(rivals - x).max(0) / 1.96)
-        # So are all permittivities within the ripple of a slab, at this conductivity or at the known one.
-        for k in range(len(seen)):
-            tried = np.tile(x, (2 * len(RIPPLE), 1))
-            tried[:, count * k] = np.clip(np.repeat(RIPPLE, 2) * x[count * k], *BOUNDS[0])
-            tried[::2, count * k + 1] = known[k]
-            near = tried[[0.5 * (residuals(one) ** 2).sum() < fit.cost + 1.92 for one in tried], count * k]
-            off = np.abs(near - x[count * k]).max(initial=0.0)
-            deviation[count * k] = max(deviation[count * k], off / 1.96)
+        # Of other optima, those are not ruled out that are as likely as the ends of the interval.
+        rivals = np.array([one.x for one in fits if one.cost < fit.cost + 1.92])
+        deviation += np.abs(rivals - x).max(0) / 1.96
     found = [
         fitted
         for name in materials

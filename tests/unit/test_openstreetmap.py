@@ -84,6 +84,7 @@ def town() -> MapFile:
     made.block(60, 20, 16, 8, building="house", height="10,5", roof__shape="gabled", roof__height="3",
                building__material="brick", roof__material="copper")  # fmt: skip
     made.block(60, 40, 10, 10, building="yes")
+    made.block(60, -60, 8, 20, building="yes", building__levels="2", roof__shape="hipped")  # w1007
     made.block(60, 60, 8, 8, building="roof", roof__material="glass")
     made.block(-20, -60, 40, 30, natural="water")
     made.node(-5, 12, natural="tree", height="12")
@@ -117,7 +118,8 @@ def volume(*meshes: Mesh) -> float:
         ("building-r1", (40 * 30 - 20 * 10) * 12, 0.0, 12.0),  # four storeys about a courtyard
         ("building-w1003", 10 * 10 * 9, 0.0, 9.0),  # what its part leaves
         ("building-w1004", 10 * 10 * 20, 0.0, 20.0),
-        ("building-w1006", 10 * 10 * 10.5, 0.0, 10.5),  # the median of 9, 10.5 and 12
+        ("building-w1006", 10 * 10 * 9.75, 0.0, 9.75),  # the median of 9, 9, 10.5 and 12
+        ("building-w1007", 8 * 20 * 6 + 8 * 3 * (12 / 2 + 8 / 3), 0.0, 9.0),  # two storeys and a hipped roof
     ],
 )
 def test_bodies_have_the_heights_and_footprints_of_the_map(
@@ -129,8 +131,8 @@ def test_bodies_have_the_heights_and_footprints_of_the_map(
 
 
 def test_a_roof_without_walls_is_one_face(scene: ImportedScene) -> None:
-    mesh = scene.pieces["building-w1007"].mesh
-    assert scene.pieces["building-w1007"].material == "glass"
+    mesh = scene.pieces["building-w1008"].mesh
+    assert scene.pieces["building-w1008"].material == "glass"
     assert set(mesh.vertices[:, 2]) == {4.5}
     assert len(mesh.faces) == 2
 

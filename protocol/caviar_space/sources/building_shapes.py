@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 # Corners of a footprint that are nearer to the line between their neighbours [m] are no corners of its roof.
 _STRAIGHT_M = 0.3
 
+PITCHED = ("gabled", "hipped", "pyramidal")
+"""Shapes of roofs that are not flat."""
+
 
 class Body(NamedTuple):
     """Mesh of a building, closed but for a `plate`."""
@@ -29,7 +32,7 @@ class Roof(NamedTuple):
     """Form of a roof."""
 
     shape: str = "flat"
-    """``flat``, ``gabled``, ``hipped``, ``pyramidal``; others are flat."""
+    """One of `PITCHED`; others are flat."""
     height_m: float | None = None
     """Of the ridge over the eaves; None: a pitch of 30°, and at most half of the body's height."""
     across: bool = False
@@ -112,7 +115,7 @@ def roofed(polygon: Polygon, low: float, high: float, roof: Roof) -> Body | None
     plain = polygon.simplify(_STRAIGHT_M)
     corners = np.array(_rings(plain)[0].coords)[:-1, :2] if not plain.is_empty else np.zeros((0, 2))
     convex = not polygon.interiors and plain.convex_hull.area < 1.01 * plain.area
-    if not convex or roof.shape not in ("gabled", "hipped", "pyramidal"):
+    if not convex or roof.shape not in PITCHED:
         return None
     if roof.shape != "pyramidal" and len(corners) != 4:
         return None

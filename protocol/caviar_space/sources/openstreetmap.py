@@ -28,7 +28,7 @@ from caviar_space.imported_scenes import (
 )
 from caviar_space.meshes import Mesh, joined
 from caviar_space.mitsuba_xml import RadioMaterial
-from caviar_space.sources.building_shapes import Roof, crown, plate, prism, roofed, triangulated
+from caviar_space.sources.building_shapes import PITCHED, Roof, crown, plate, prism, roofed, triangulated
 from caviar_space.sources.height_grids import STEP_M, Terrain
 from caviar_space.sources.map_files import (
     Element,
@@ -297,10 +297,13 @@ class _Assembly:
         levels = metres(tags.get("roof:levels", ""))
         if rise is None and levels and 0 < levels < 10:
             rise = levels * STOREY_M
+        shape = tags.get("roof:shape", "flat")
+        if rise is None and "height" not in tags and shape in PITCHED:
+            rise = STOREY_M  # on top of the storeys
         towards = tags.get("roof:direction", "").upper()
         direction = _COMPASS.index(towards) * 22.5 if towards in _COMPASS else metres(towards)
         across = tags.get("roof:orientation") == "across"
-        return Roof(tags.get("roof:shape", "flat"), rise or None, across, direction)
+        return Roof(shape, rise or None, across, direction)
 
     def _solid(self, element: Element, polygon: Polygon, high: float) -> _Solid:
         tags = element.tags
