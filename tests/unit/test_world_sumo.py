@@ -254,7 +254,8 @@ def test_a_parked_train_stands_on_its_track(make: Make, tmp_path: Path) -> None:
     (tmp_path / "r.nod.xml").write_text(NODES.format(x0=0, y0=0, z0=0, x1=300, y1=0, z1=0))
     (tmp_path / "r.edg.xml").write_text(EDGES)
     (tmp_path / "r.rou.xml").write_text(
-        '<routes><vType id="t" vClass="truck" length="60"/><vehicle id="T" type="t" depart="0" departPos="70">'
+        '<routes><vType id="t" vClass="truck" length="60"/>'
+        '<vehicle id="T" type="t" depart="0" departPos="70">'
         '<route edges="ab"/><stop lane="ab_0" endPos="90" duration="20" parking="true"/></vehicle>'
         "</routes>"
     )
