@@ -281,12 +281,13 @@ def _off_ground(parts: Parts, low: Float64Array, high: Float64Array) -> dict[str
     known = body & np.isfinite(ground)
     floating = known & (low[:, 2] > ground + GAP_M)
     # What stands on a roof, or hangs at a wall, touches another part's box.
-    others = np.flatnonzero(body)
-    others = others[np.argsort(low[others, 0], kind="stable")]
-    starts, widest = low[others, 0], float((high - low)[others, 0].max(initial=0.0))
+    wide = (high - low)[:, 0] > _CELL_M
+    narrow, large = np.flatnonzero(body & ~wide), np.flatnonzero(body & wide)
+    narrow = narrow[np.argsort(low[narrow, 0], kind="stable")]
+    starts = low[narrow, 0]
     for part in np.flatnonzero(floating).tolist():
-        ends = low[part, 0] - GAP_M - widest, high[part, 0] + GAP_M
-        near = others[slice(*np.searchsorted(starts, ends))]
+        ends = low[part, 0] - GAP_M - _CELL_M, high[part, 0] + GAP_M
+        near = np.concatenate([narrow[slice(*np.searchsorted(starts, ends))], large])
         touch = (low[near] <= high[part] + GAP_M).all(1) & (high[near] >= low[part] - GAP_M).all(1)
         floating[part] = not (touch & (near != part)).any()
     return {"floating": floating, "sunken": known & (high[:, 2] < ground - 1e-3)}

@@ -301,7 +301,7 @@ def simplify_command(
                f"{left.smallest_m:g} m; triangles merged within {left.tolerance_m:g} m")  # fmt: skip
     print_line(console, f"error at {error.users} users of {found.positions[1]} frames held out: median "
                f"{error.median_db:.3f}, 90 % {error.p90_db:.3f}, most {error.max_db:.3f} dB")  # fmt: skip
-    print_line(console, f"frame of the channel: {ms:.0f} → {faster:.0f} ms")
+    print_line(console, f"frame of the channel: {ms:.0f} → {faster:.0f} ms of processor time")
     print_line(console, f'{out}: simplified.json, and a scene to use: scenery = "file:{out}/scene.xml"')
 
 

@@ -203,16 +203,19 @@ def _set_thickness(
     key = (reference if reference is not None else nested).get("id", "")  # type: ignore[union-attr]
     name = f"{key}-{thickness * 1e3:g}mm"
     if name not in materials:
-        made = copy.deepcopy(materials[key] if nested is None else nested)
+        old = materials[key] if nested is None else nested
+        made = copy.deepcopy(old)
+        itu = re.fullmatch(r"(?:mat-)?itu[_-](.+?)(?:\.\d+)?", key)
+        if itu and not old.get("type", "").endswith("radio-material"):
+            # The id says what a material for cameras is made of; one that ends in a thickness does not.
+            made = ElementTree.Element("bsdf", type="itu-radio-material")
+            ElementTree.SubElement(made, "string", name="type", value=itu.group(1))
+            for rgb in list(old.iter("rgb"))[:1]:
+                ElementTree.SubElement(made, "rgb", name="color", value=rgb.get("value", ""))
         made.set("id", name)
-        for old in made.findall("float[@name='thickness']"):
-            made.remove(old)
+        for given in made.findall("float[@name='thickness']"):
+            made.remove(given)
         ElementTree.SubElement(made, "float", name="thickness", value=f"{thickness:.9g}")
-        if "itu" in key and made.get("type") != "itu-radio-material":
-            # A name that ends in a thickness no longer says what it is made of.
-            itu = key.removeprefix("mat-").removeprefix("itu_").removeprefix("itu-").partition(".")[0]
-            made.set("type", "itu-radio-material")
-            ElementTree.SubElement(made, "string", name="type", value=itu)
         materials[name] = made
         root.insert(0, made)
     if nested is not None:

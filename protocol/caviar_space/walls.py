@@ -201,15 +201,15 @@ def solid_walls(mesh: Mesh, most: float) -> list[tuple[Mesh, float | None]]:
         Meshes with the thickness of their walls [m], to 0.1 mm; None: of what is no plate, which comes first.
     """
     part = piece_numbers(mesh)
+    order = np.argsort(part, kind="stable")
     sheets: dict[float, list[Mesh]] = {}
     rest = np.ones(len(part), np.bool_)
-    for number in range(int(part.max(initial=-1)) + 1):
-        chosen = part == number
-        used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    for rows in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+        used, faces = np.unique(mesh.faces[rows], return_inverse=True)
         found = solid_wall(Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)), most)
         if found is not None:
             sheets.setdefault(round(found[1], 4), []).append(found[0])
-            rest[chosen] = False
+            rest[rows] = False
     made: list[tuple[Mesh, float | None]] = [(joined(of), thickness) for thickness, of in sheets.items()]
     if not sheets:
         return [(mesh, None)]

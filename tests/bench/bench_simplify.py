@@ -1,4 +1,4 @@
-"""Triangles, errors and frame times of scenes that are simplified within errors of received power.
+"""Triangles, errors and processor times of scenes that are simplified within errors of received power.
 
     python tests/bench/bench_simplify.py [--scenario SCENARIO …] [--error-db DB …] [--markdown FILE]
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from caviar_scenes.simplification import Simplified, simplify
 
 HEAD = (
-    "| scenario and error | triangles | triangles left | median dB | 90 % dB | largest dB | ms | ms left |\n"
+    "| scenario and error | triangles | left | median dB | 90 % dB | largest dB | CPU ms | CPU ms left |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n"
 )
 

@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from forked import Forked
 from scenarios_support import SCENARIOS, running
@@ -194,3 +195,20 @@ def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     assert "tcp://127.0.0.1:9 within 0.5 s" in done.stdout + done.stderr
+
+
+def test_materials_of_streets(tmp_path: Path) -> None:
+    """A model trained for a second by ``train_segmentation.py`` is judged by ``street_materials.py``."""
+    image = pytest.importorskip("PIL.Image")
+    random = np.random.default_rng(1)
+    for part in ("train", "test"):
+        for folder, most, shape in ((part, 256, (96, 128, 3)), (f"{part}annot", 12, (96, 128))):
+            (tmp_path / folder).mkdir()
+            image.fromarray(random.integers(0, most, shape, dtype=np.uint8)).save(tmp_path / folder / "0.png")
+    short = ("--streets", "1", "--minutes", "0.02", "--out", "m.onnx")
+    assert "mean IoU" in started(tmp_path, "train_segmentation.py", ".", *short)
+    short = ("--streets", "1", "--views", "2", "--samples", "20000", "--out", "made")
+    assert re.search(
+        r"error \[dB\], from pictures \d", started(tmp_path, "street_materials.py", "m.onnx", *short)
+    )
+    assert len(list((tmp_path / "made").glob("fig*.png"))) == 4

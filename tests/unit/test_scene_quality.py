@@ -150,6 +150,20 @@ def test_materials_that_cannot_be_are_refused(wrong: RadioMaterial) -> None:
         scenery_files("s", {"house": (HOUSE, "m")}, {"m": wrong})
 
 
+def test_a_sheet_of_a_material_for_cameras_keeps_what_it_is_made_of(tmp_path: Path) -> None:
+    xml = town(tmp_path, PLANTED["thin closed wall"]) / "scene.xml"
+    cameras = '<bsdf type="twosided" id="itu_brick"><bsdf type="diffuse"><rgb name="color" value="1 0 0"/>'
+    text = xml.read_text().replace("</scene>", cameras + "</bsdf></bsdf></scene>")
+    wall = text.index("mesh-wall")
+    xml.write_text(text[:wall] + text[wall:].replace('"concrete"', '"itu_brick"', 1))
+    done, _ = repair(open_scene(str(xml)))
+    write_changed(open_scene(str(xml)), done, tmp_path / "better", {}, "repaired")
+    shape = open_scene(str(tmp_path / "better")).shapes["wall"]
+    assert (shape.itu_material, shape.colour) == ("brick", (1.0, 0.0, 0.0))
+    assert shape.radio is not None
+    assert '"thickness" value="0.2"' in shape.radio.xml
+
+
 def test_overlapping_bodies_of_one_material_are_united(tmp_path: Path) -> None:
     wing = box((0.0, 8.0), (5.0, 30.0), (0.0, 6.0))
     scene = open_scene(str(town(tmp_path, {"wing": (wing, "concrete")})))
