@@ -198,7 +198,7 @@ def test_the_remote_trainer_says_that_there_is_no_broker(tmp_path: Path) -> None
 
 
 def test_materials_of_streets(tmp_path: Path) -> None:
-    """A model trained for a second by ``train_segmentation.py`` is judged by ``street_materials.py``."""
+    """``street_materials.py`` judges a model that ``train_segmentation.py`` trains for a second."""
     image = pytest.importorskip("PIL.Image")
     random = np.random.default_rng(1)
     for part in ("train", "test"):
