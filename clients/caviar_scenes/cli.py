@@ -100,6 +100,8 @@ def import_command(
     with progress_bar(Console(stderr=True), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task(path.name, total=1.0)
         latitude, longitude = _numbers("--origin", origin, 2, "LAT,LON [°]: 60.17,24.94") or (0.0, 0.0)
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+            raise AssetError(f"--origin {origin}: beyond 90° and 180°; write LAT,LON [°]: 60.17,24.94")
         request = Request(
             box_deg=_box("--box", box, "W,S,E,N [°]: 24.93,60.16,24.95,60.18"),
             box_m=_box("--box-m", box_m, "X0,Y0,X1,Y1 [m]: -300,-300,300,300"),
@@ -156,6 +158,8 @@ def _box(option: str, text: str, example: str) -> tuple[float, float, float, flo
     x0, y0, x1, y1 = _numbers(option, text, 4, example)
     if not (x0 < x1 and y0 < y1):
         raise AssetError(f"{option} {text}: the lower corner comes first; write {example}")
+    if "°" in example and not (x0 >= -180 and x1 <= 180 and y0 >= -90 and y1 <= 90):
+        raise AssetError(f"{option} {text}: beyond 180° and 90°; write {example}")
     return x0, y0, x1, y1
 
 

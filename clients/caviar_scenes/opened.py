@@ -145,17 +145,23 @@ def write_changed(
         root.remove(element)
         for number, (mesh, thickness) in enumerate(pieces.get(name, ())):
             called = f"{name}-part{number}" if number else name
+            while number and (called in scene.shapes or called in described):
+                called += "-"
+            plain = re.sub(r"[^\w.+-]", "-", called)[:100]  # ids may have any characters
+            path = f"meshes/{plain}.ply"
+            while path in files:
+                path = path.replace(".ply", "-.ply")
             made = copy.deepcopy(element)
             made.set("id", f"mesh-{called}")
             for transform in made.findall("transform"):
                 made.remove(transform)
             file = made.find("string[@name='filename']")
             if file is not None:
-                file.set("value", f"meshes/{called}.ply")
+                file.set("value", path)
             if thickness is not None:
                 _set_thickness(root, made, materials, thickness)
             root.insert(place + number, made)
-            files[f"meshes/{called}.ply"] = ply(mesh)
+            files[path] = ply(mesh)
             old = scene.about.get("pieces", {}).get(name, {"material": scene.shapes[name].material})
             described[called] = {**old, "triangles": len(mesh.faces)}
     # Materials that were added come before the shapes that name them.
@@ -178,7 +184,7 @@ def write_changed(
             for path, content in files.items():
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
                 (folder / path).write_bytes(content)
-            shutil.move(folder, out)
+            folder.rename(out)  # not into one that came to be meanwhile
     except OSError as error:
         raise AssetError(f"cannot write {out}: {error.strerror}; choose another folder") from error
 

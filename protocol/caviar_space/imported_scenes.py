@@ -6,7 +6,6 @@ what ``scenery = "file:…/scene.xml"`` names, and ``scene.json``, which says wh
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -303,6 +302,6 @@ def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | Non
             for path, content in {**files, **scene.files, **(more or {})}.items():
                 (made / path).parent.mkdir(parents=True, exist_ok=True)
                 (made / path).write_bytes(content)
-            shutil.move(made, out)
+            made.rename(out)  # not into a folder that came to be meanwhile
     except OSError as error:
         raise AssetError(f"cannot write {out}: {error.strerror}; choose another folder") from error

@@ -154,9 +154,20 @@ def scenery_files(
                 f"material {key!r}: ITU-R P.2040 has no material {material.itu_material!r}; "
                 f"{suggestion(material.itu_material, ITU_MATERIALS)}"
             )
-        if not material.thickness_m > 0:
+        if not 0 < material.thickness_m < math.inf:
             raise AssetError(
                 f"material {key!r}: a thickness of {material.thickness_m:g} m; write one above 0"
+            )
+        permittivity, conductivity = material.constants or (1.0, 0.0)
+        shares = material.scattering_coefficient, material.xpd_coefficient
+        if not (
+            0 < permittivity < math.inf
+            and 0 <= conductivity < math.inf
+            and 0 <= min(shares) <= max(shares) <= 1
+        ):
+            raise AssetError(
+                f"material {key!r}: permittivity {permittivity:g}, conductivity {conductivity:g} S/m, shares "
+                f"scattered and cross-polarised {shares}; write above 0, from 0, and from 0 to 1"
             )
         numbers = {"thickness": material.thickness_m}
         if cameras:

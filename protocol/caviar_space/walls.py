@@ -148,7 +148,7 @@ def solid_wall(mesh: Mesh, most: float) -> tuple[Mesh, float] | None:
     """Sheet in the middle of a plate: of a closed body that is one flat face moved by a thickness.
 
     A wall with openings is one, too. What is not of one thickness, as a box that is no wall or two walls that
-    meet at a corner, is none.
+    meet at a corner, is none; nor is a post, whose narrow sides have more area than a face.
 
     Args:
         mesh: One connected body.
@@ -182,6 +182,8 @@ def solid_wall(mesh: Mesh, most: float) -> tuple[Mesh, float] | None:
     other = (size > 0) & (areas @ normal < -(1 - _PLATE) * size) & (number != largest)
     opposite = float(size[other].sum())
     if thickness > most or max(abs(opposite - area), abs(volume / thickness - area)) > _PLATE * area:
+        return None
+    if size.sum() - area - opposite > area:  # a post or a cube: a sheet would be missed from a side
         return None
     inwards = -np.sign(np.einsum("fx,fx->", a, areas)) * normal * thickness / 2
     used, faces = np.unique(mesh.faces[number == largest], return_inverse=True)

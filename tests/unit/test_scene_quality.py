@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from caviar_scenes.repairs import repair
 from caviar_scenes.simplification import simplify
 from caviar_space.imported_scenes import Georeference, ImportedScene, Piece, write_scene
 from caviar_space.meshes import Mesh, box, joined
-from caviar_space.mitsuba_xml import RadioMaterial
+from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
 
 HOUSE = box((0.0, 8.0), (0.0, 9.0), (0.0, 6.0))
 WALL = box((20.0, 29.0), (5.0, 5.2), (0.0, 3.0))
@@ -109,6 +110,44 @@ def test_a_fault_is_repaired_and_nothing_else_changes(kind: str, tmp_path: Path)
         assert shape.radio is not None
         assert 'name="thickness" value="0.2"' in shape.radio.xml
         assert np.unique(after.meshes[name].vertices[:, 1]) == pytest.approx([5.1])
+
+
+def test_posts_stay_and_parts_and_odd_names_get_files_of_their_own(tmp_path: Path) -> None:
+    post = box((30.0, 30.4), (30.0, 30.4), (0.0, 9.0))
+    more = {
+        "post": (post, "concrete"),
+        "a": (joined([moved(40), WALL]), "wood"),
+        "a-part1": (moved(60), "wood"),
+    }
+    folder = town(tmp_path, more)
+    xml = folder / "scene.xml"
+    xml.write_text(xml.read_text().replace('id="mesh-house"', 'id="mesh-../../house"'))
+    opened = open_scene(str(folder))
+    done, _ = repair(opened)
+    write_changed(opened, done, tmp_path / "out", {}, "")
+    assert not (tmp_path / "house.ply").exists()
+    made = open_scene(str(tmp_path / "out")).meshes
+    faces = {name: len(made[name].faces) for name in ("post", "a", "a-part1-", "a-part1", "../../house")}
+    assert faces == {"post": 12, "a": 12, "a-part1-": 2, "a-part1": 12, "../../house": 12}
+
+
+def test_a_folder_that_comes_to_be_meanwhile_is_not_written_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = town(tmp_path, {})
+    monkeypatch.setattr(Path, "exists", lambda self: False)
+    with pytest.raises(AssetError, match="cannot write"):
+        town(tmp_path, {})
+    assert not (first / "scene").is_dir()
+
+
+@pytest.mark.parametrize("wrong", [
+    RadioMaterial(constants=(math.nan, 0.0)), RadioMaterial(constants=(3.0, -1.0)),
+    RadioMaterial("brick", math.inf), RadioMaterial("brick", scattering_coefficient=7.0),
+])  # fmt: skip
+def test_materials_that_cannot_be_are_refused(wrong: RadioMaterial) -> None:
+    with pytest.raises(AssetError, match="material 'm': "):
+        scenery_files("s", {"house": (HOUSE, "m")}, {"m": wrong})
 
 
 def test_a_sheet_of_a_material_for_cameras_keeps_what_it_is_made_of(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import pytest
 from world_builders import T_SAM_NS, scene_at, wire_bytes
@@ -247,6 +248,29 @@ def test_carriages_stay_on_the_track_through_right_angles(
     assert len(heads) > 200
     assert min(head[0] for head in heads) < -80
     assert max(head[1] for head in heads) > 100
+
+
+def test_a_parked_train_stands_on_its_track(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "r.nod.xml").write_text(NODES.format(x0=0, y0=0, z0=0, x1=300, y1=0, z1=0))
+    (tmp_path / "r.edg.xml").write_text(EDGES)
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><vType id="t" vClass="truck" length="60"/>'
+        '<vehicle id="T" type="t" depart="0" departPos="70">'
+        '<route edges="ab"/><stop lane="ab_0" endPos="90" duration="20" parking="true"/></vehicle>'
+        "</routes>"
+    )
+    converted(tmp_path)
+    files = {"net": str(tmp_path / "r.net.xml"), "routes": str(tmp_path / "r.rou.xml")}
+    found = scenes(make(**files, carriages={"t": 20.0}, begin_s=0.0), 1, 300)
+    parked = [scene for scene in found if scene.names and np.allclose(scene.position[0, 0], 80.0, atol=1e-3)]
+    assert len(parked) > 100
+    assert parked[0].position[:, :2].ravel() == pytest.approx([80.0, 0, 60, 0, 40, 0], abs=1e-3)
+
+
+@pytest.mark.parametrize("length", [-1.0, 1e-9, math.nan, math.inf])
+def test_lengths_that_no_carriage_has_are_refused(length: float) -> None:
+    with pytest.raises(msgspec.ValidationError, match=r"carriages\.ice is .* m; write 1 to 1000 m"):
+        msgspec.convert({"carriages": {"ice": length}}, SumoSettings)
 
 
 def test_carriages_move_as_rigid_bodies() -> None:

@@ -110,8 +110,10 @@ def new_scenario(name: str, scene: Path | None = None) -> Path:
     suffix = Path(name).suffix
     if suffix != ".toml" and suffix[1:2].isalpha():  # not the ".2" of v1.2
         raise RunError(f"a scenario is a TOML file, not {suffix}: write {Path(name).with_suffix('.toml')}")
-    if _NAME.fullmatch(path.stem) is None:
-        raise RunError(f"{path.stem!r} is no name of a scenario: use letters, digits, '_', '.' and '-'")
+    if _NAME.fullmatch(path.stem) is None or len(path.stem) > 100:  # its traffic is named after it
+        raise RunError(
+            f"{path.stem[:120]!r} is no name of a scenario: use up to 100 letters, digits, '_', '.' and '-'"
+        )
     if scene is not None:
         resolve_name(_TOWN)(path, scene, say=typer.echo)
         return path

@@ -28,7 +28,8 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 _FOLIAGE = RadioMaterial(colour=(0.0, 0.25, 0.0))
 _LEAVES = {"SolitaryVegetationObject", "PlantCover"}
 _Place = tuple[float, float, float]
-_Rings = list[list[list[Annotated[int, msgspec.Meta(ge=0)]]]]
+_Index = Annotated[int, msgspec.Meta(ge=0)]
+_Rings = list[list[list[_Index]]]
 
 
 class _Semantics(msgspec.Struct, frozen=True):
@@ -155,7 +156,7 @@ def _surfaces(
 ) -> Iterator[tuple[list[Float64Array], str]]:
     """Rings of each surface in the file's coordinates, and the type of its semantics."""
     if geometry.type == "GeometryInstance":
-        anchor = vertices[geometry.boundaries[0]]
+        anchor = vertices[msgspec.convert(geometry.boundaries, list[_Index])[0]]
         template = at(city.templates.templates, geometry.template, "template")
         if template.type not in _DEPTHS:
             return

@@ -213,7 +213,7 @@ def _read_geojson(path: Path) -> Map:
         given = feature.properties or {}
         given = given | given["tags"] if isinstance(given.get("tags"), dict) else given
         tags = {key: str(value) for key, value in given.items() if value is not None}
-        name = re.sub(r"\W+", "-", str(feature.id or given.get("@id") or index)).strip("-")
+        name = re.sub(r"\W+", "-", str(feature.id or given.get("@id") or index))[:60].strip("-")
         if not feature.geometry:
             found.left_out["feature without a geometry"] += 1
             continue

@@ -75,6 +75,8 @@ BEYOND_M = 500.0
 """Distance from the box of an extract within which buildings are taken, where none is asked for [m]."""
 ROW_M = 8.0
 """Distance between the trees of a row [m]."""
+# [m] from the origin: beyond, the projection's scale is off by more than 0.5 per mille.
+_FAR_M = 200e3
 # Distance from the border of a map to the last node of a coast, at most [m].
 _CUT_M = 100.0
 _COMPASS = (
@@ -129,6 +131,11 @@ class _Assembly:
         )
         self.origin = msgspec.structs.replace(self.origin, projection="tmerc")
         self.box = request.box_m or box_in_metres((west, south, east, north), self.origin)
+        if not max(map(abs, self.box)) <= _FAR_M:  # nor is an infinite one
+            raise AssetError(
+                f"{path}: the box reaches {max(map(abs, self.box)) / 1e3:.0f} km from the origin, of at most "
+                f"{_FAR_M / 1e3:.0f}; write --box W,S,E,N, or an --origin within it"
+            )
 
     def _extent(self) -> tuple[float, float, float, float]:
         import shapely
@@ -312,7 +319,7 @@ class _Assembly:
     def _add_building(self, solid: _Solid) -> None:
         name, tags = f"building-{solid.element.name}", solid.element.tags
         number = 1
-        while name in self.made.pieces:
+        while {name, f"{name}-roof"} & self.made.pieces.keys():
             number += 1
             name = f"building-{solid.element.name}-{number}"
         ground = self._lowest(solid.polygon)

@@ -323,7 +323,7 @@ class SceneBuilder:
         self._dropped += int(flat.sum())
         if flat.all():
             return
-        base = key = slug(name) or "piece"
+        base = key = slug(name)[:100] or "piece"  # of which a file has its name
         count = 1
         while key in self.scene.pieces:
             count, key = count + 1, f"{base}-{number}" if count == 1 else f"{base}-{number}-{count}"

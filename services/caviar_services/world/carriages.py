@@ -145,6 +145,10 @@ class Ways:
         """
         domain = self._api.vehicle
         front, lane = domain.getPosition3D(vehicle), domain.getLaneID(vehicle)
+        if domain.isStoppedParking(vehicle):  # SUMO has it beside the lane, and on none
+            lane = domain.getStops(vehicle, 1)[0].lane
+            edge, _, number = lane.rpartition("_")
+            front = self._api.simulation.convert3D(edge, domain.getLanePosition(vehicle), int(number))
         shape = self._shape(lane)
         drawn = sum(math.dist(a, b) for a, b in pairwise(shape))
         # What lies ahead of the front; a lane may be said to be longer or shorter than it is drawn.

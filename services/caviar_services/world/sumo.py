@@ -98,6 +98,13 @@ class SumoSettings(WorldSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     options: tuple[str, ...] = ()
     """More of SUMO's command line: ``["--lanechange.duration", "2"]``."""
 
+    def __post_init__(self) -> None:
+        for name, length in self.carriages.items():
+            if not (length == 0 or 1 <= length <= 1000):
+                raise ValueError(
+                    f"carriages.{name} is {length:g} m; write 1 to 1000 m, or 0 for one rigid body"
+                )
+
 
 class _Kind(NamedTuple):
     """Class and size of an object, which do not change while it is there."""
