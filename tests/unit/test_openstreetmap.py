@@ -418,6 +418,8 @@ def test_buildings_and_roads_stand_on_the_ground(tmp_path: Path) -> None:
     heights = 50.0 + 0.5 * columns  # a slope to the west of 0.5 m on 11 m
     grid = tiff(tmp_path / "slope.tif", heights, west, north, step)
     file = town().write(tmp_path / "town.osm")
+    with pytest.raises(AssetError, match="squares of ground of 20 m within the box"):
+        read_source(file, Request(origin=HERE, box_m=(-9e4, -9e4, 9e4, 9e4), heights=grid))
     made = read_source(file, Request(origin=HERE, box_m=(-90.0, -95.0, 95.0, 95.0), heights=grid))
     assert made.origin is not None
     slope = 0.5 / (made.origin.to_scene(60.17, west + step)[0] - made.origin.to_scene(60.17, west)[0])

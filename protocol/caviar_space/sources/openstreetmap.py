@@ -77,6 +77,8 @@ ROW_M = 8.0
 """Distance between the trees of a row [m]."""
 # [m] from the origin: beyond, the projection's scale is off by more than 0.5 per mille.
 _FAR_M = 200e3
+# Of ground that is not level: 40 by 40 km.
+_MOST_SQUARES = 4_000_000
 # Distance from the border of a map to the last node of a coast, at most [m].
 _CUT_M = 100.0
 _COMPASS = (
@@ -384,6 +386,9 @@ class _Assembly:
         grid = read_heights(self.request.heights)
         self.made.sources.append(source_of(self.request.heights))
         x, y = (np.arange(a, b + STEP_M, STEP_M) for a, b in ((x0, x1), (y0, y1)))
+        if len(x) * len(y) > _MOST_SQUARES:
+            raise AssetError(f"{self.path} has {len(x) * len(y)} squares of ground of {STEP_M:g} m within the box, "
+                             f"of at most {_MOST_SQUARES}; write a smaller --box")  # fmt: skip
         places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
         latitude, longitude, _ = self.origin.to_wgs84(
             *cast("Any", (places[..., 0], places[..., 1], 0 * places[..., 0]))
