@@ -387,8 +387,8 @@ class _Assembly:
         self.made.sources.append(source_of(self.request.heights))
         x, y = (np.arange(a, b + STEP_M, STEP_M) for a, b in ((x0, x1), (y0, y1)))
         if len(x) * len(y) > _MOST_SQUARES:
-            raise AssetError(f"{self.path} has {len(x) * len(y)} squares of ground of {STEP_M:g} m within the "
-                             f"box, of at most {_MOST_SQUARES}; write a smaller --box")  # fmt: skip
+            raise AssetError(f"{self.path} has {len(x) * len(y)} squares of ground of {STEP_M:g} m within "
+                             f"the box, of at most {_MOST_SQUARES}; write a smaller --box")  # fmt: skip
         places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
         latitude, longitude, _ = self.origin.to_wgs84(
             *cast("Any", (places[..., 0], places[..., 1], 0 * places[..., 0]))
