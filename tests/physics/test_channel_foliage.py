@@ -148,6 +148,18 @@ def test_without_it_all_else_is_as_if_it_were_not_there(lab: Lab) -> None:
     assert (np.abs(with_it.a[0]) < np.abs(bare.a[0])).any()
 
 
+def test_a_frame_without_any_path_has_nothing_to_attenuate(lab: Lab) -> None:
+    """A wall on the ground hides all, and reflections find no way around it."""
+    hidden = Plate(
+        "hides", [(40.0, -90.0, 0.0), (40.0, 90.0, 0.0), (40.0, 90.0, 99.0), (40.0, -90.0, 99.0)], SURFACE
+    )
+    plates = [GROUND, hidden, *(crown(name, bounds) for name, bounds in CROWNS.items())]
+    model = lab.traced(CARRIERS, plates, foliage={"crown.*": STATED}, max_depth=2, bodies=2)
+    channel = link(model, TX, RX)
+    assert not channel.tau.size
+    assert not channel.los.any()
+
+
 def test_the_product_states_what_attenuates(lab: Lab) -> None:
     """Kinds and carriers in the options, which its digest includes; 949 MHz has γ and A_m of table 1."""
     channel = link(woods(lab), TX, RX)

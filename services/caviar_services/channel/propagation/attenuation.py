@@ -232,7 +232,7 @@ class Foliage(Attenuation):
         paths, legs = len(corners), corners.shape[1] - 1
         ends = corners[:, :-1].reshape(-1, 3), corners[:, 1:].reshape(-1, 3)
         inside = lengths_inside((self._still, self._moving), *ends, len(self.kinds))
-        inside = inside.reshape(paths, legs, -1).sum(1)
+        inside = inside.reshape(paths, legs, len(self.kinds)).sum(1)
         lost = sum(kind.attenuation_db(inside[:, k]) for k, kind in enumerate(self.kinds))
         return 10 ** (-np.asarray(lost) / 20)
 
