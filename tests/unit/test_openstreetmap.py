@@ -130,6 +130,22 @@ def test_bodies_have_the_heights_and_footprints_of_the_map(
     assert volume(mesh) == pytest.approx(solid_m3, rel=2e-3)  # OSM: 1e-7°
 
 
+@pytest.mark.parametrize(
+    ("levels", "outline_m3"),
+    [
+        ("2", 20 * 10 * 6),  # of the storeys below the part
+        ("5", 10 * 10 * 15),  # of the whole: below the part is a passage
+    ],
+)
+def test_a_part_stands_on_an_outline_that_is_lower(levels: str, outline_m3: float, tmp_path: Path) -> None:
+    made = MapFile()
+    made.block(20, 20, 20, 10, building="yes", building__levels=levels)
+    made.block(20, 20, 10, 10, building__part="yes", building__levels="5", building__min_level="2")
+    pieces = read_source(made.write(tmp_path / "town.osm"), Request(origin=HERE)).pieces
+    assert volume(pieces["building-w1001"].mesh) == pytest.approx(outline_m3, rel=2e-3)
+    assert volume(pieces["building-w1002"].mesh) == pytest.approx(10 * 10 * 9, rel=2e-3)
+
+
 def test_a_roof_without_walls_is_one_face(scene: ImportedScene) -> None:
     mesh = scene.pieces["building-w1008"].mesh
     assert scene.pieces["building-w1008"].material == "glass"

@@ -265,8 +265,9 @@ class _Assembly:
             self.notes[f"building with its height by {how}"] += 1
             rest = outline.shape
             for part in owned.get(index, ()):
-                rest = rest - part.shape
-                solids.append(self._solid(part, part.shape, self._tagged(part.tags) or height))
+                solids.append(body := self._solid(part, part.shape, self._tagged(part.tags) or height))
+                if not (body.low and 0 < known[index] < body.high):  # else it stands on its outline's storeys
+                    rest = rest - part.shape
             # A strip that is narrower than a metre is a matter of how outline and parts were drawn.
             left = [
                 p for p in shapely.get_parts(rest) if p.geom_type == "Polygon" and p.buffer(-0.5).area > 1.0
