@@ -19,18 +19,22 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.assets import ITU_MATERIALS
 from caviar_protocol.errors import AssetError, suggestion
-from caviar_scenes.opened import open_scene
+from caviar_scenes.opened import open_scene, texture_files
 from caviar_scenes.segmentation import Segmenter, material_matrix
 from caviar_scenes.views import Eye, Picture, read_table
 from caviar_space.imported_scenes import ImportedScene, Piece
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial, SceneryShape
+from caviar_space.sources.pieces import beside, contents, reading
+from caviar_space.textures import WRAPS, Texture
+from caviar_space.textures import picture as decoded
 
 NAME = "materials.csv"
 """Name of the table in the folder of a scene."""
@@ -82,7 +86,7 @@ def read_scene(given: str) -> ImportedScene:
         setattr(scene, key, list(about.get(key, ())))
     if about and file.stem == "scene":  # roads and scenarios of an imported scene
         others = [p for p in sorted(file.parent.rglob("*")) if p.is_file() and p.suffix != ".ply"]
-        own = ("scene.xml", "scene.json", NAME, f"applied-{NAME}")
+        own = {"scene.xml", "scene.json", NAME, f"applied-{NAME}", *texture_files(about)}
         names = {str(path.relative_to(file.parent)): path for path in others}
         scene.files = {name: path.read_bytes() for name, path in names.items() if name not in own}
     for name, shape in found.shapes.items():
@@ -91,9 +95,25 @@ def read_scene(given: str) -> ImportedScene:
         kind = "foliage" if name in found.foliage else str(known.get("kind", "object"))
         where, _, line = str(known.get("source", f"{file.name}:1")).rpartition(":")
         number = int(line) if line.isdigit() else 1
-        scene.pieces[name] = Piece(found.meshes[name], material, kind, where, number)
+        texture = _texture(file, known.get("texture"), len(found.meshes[name].faces))
+        scene.pieces[name] = Piece(found.meshes[name], material, kind, where, number, texture)
         scene.materials[material] = _radio_material(shape)
     return scene
+
+
+def _texture(file: Path, given: dict[str, Any] | None, faces: int) -> Texture | None:
+    """Texture of a piece, as `Texture.described` says it."""
+    if given is None:
+        return None
+    with reading(file.with_suffix(".json"), f"what `caviar scene import` wrote, in {given}"):
+        image, uv = (contents(beside(file.parent, given[key], file)) for key in ("image", "uv"))
+        places = np.frombuffer(uv, "<f4").reshape(faces, 3, 2).astype(np.float64)
+        if not np.isfinite(places).all():
+            raise ValueError("a place in the picture is not finite")
+        decoded(image)
+        (right, down), (red, green, blue) = given["wrap"], map(float, given["tint"])
+        _ = WRAPS[right], WRAPS[down]
+        return Texture(image, places, (right, down), (red, green, blue))
 
 
 def _radio_material(shape: SceneryShape) -> RadioMaterial:
@@ -336,7 +356,8 @@ def with_materials(
                 called = f"{called}-{material}"
             faces = np.flatnonzero(wanted == material)
             mesh = piece.mesh if len(kinds) == 1 else _part(piece.mesh, faces)
-            made.pieces[called] = replace(piece, mesh=mesh, material=material)
+            texture = piece.texture and piece.texture.part(faces)
+            made.pieces[called] = replace(piece, mesh=mesh, material=material, texture=texture)
             parts[called] = first + faces
         first += count
     return made, parts

@@ -61,10 +61,12 @@ def views_command(
         material.colour or linear(MATERIALS.get(material.itu_material, OTHER)).tolist()
         for material in (found.materials[piece.material] for piece in found.pieces.values())
     ]
+    textures = [piece.texture for piece in found.pieces.values()]
     _make(out)
     for device in cameras:
         seen = eye.look(device)
-        save_picture(out / f"{device.name}.png", eye.paint(device, np.array(colours)))
+        drawn = eye.paint(device, np.array(colours), textures=textures)
+        save_picture(out / f"{device.name}.png", drawn)
         np.savez_compressed(
             out / f"{device.name}.npz",
             face=seen.face.astype(np.int32),

@@ -15,6 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import msgspec
+import numpy as np
 
 from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import Georeference
@@ -59,6 +60,12 @@ class OpenedScene:
         """Place of the scene on the Earth; None: it has none."""
         given = self.about.get("origin")
         return msgspec.convert(given, Georeference) if given else None
+
+
+def texture_files(about: Mapping[str, Any]) -> set[str]:
+    """Pictures and places in them that a ``scene.json`` names, relative to its folder."""
+    textures = [piece["texture"] for piece in about.get("pieces", {}).values() if "texture" in piece]
+    return {str(texture[key]) for texture in textures for key in ("image", "uv") if key in texture}
 
 
 def open_scene(given: str) -> OpenedScene:
@@ -140,6 +147,7 @@ def write_changed(
     materials = {element.get("id", ""): element for element in root.findall("bsdf")}
     files = dict(more)
     described: dict[str, Any] = {}
+    dropped = 0
     for name, element in elements.items():
         place = list(root).index(element)
         root.remove(element)
@@ -164,16 +172,22 @@ def write_changed(
             files[path] = ply(mesh)
             old = scene.about.get("pieces", {}).get(name, {"material": scene.shapes[name].material})
             described[called] = {**old, "triangles": len(mesh.faces)}
+            before = scene.meshes[name]
+            if number or not np.array_equal(mesh.vertices[mesh.faces], before.vertices[before.faces]):
+                dropped += described[called].pop("texture", None) is not None
     # Materials that were added come before the shapes that name them.
     root[:] = [e for e in root if e.tag != "shape"] + [e for e in root if e.tag == "shape"]
     files["scene.xml"] = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
     notes = [*scene.about.get("notes", ()), said]
+    notes += [f"textures of {dropped} pieces whose faces changed: left out"] if dropped else []
     about = {"name": scene.name, **scene.about, "pieces": described, "notes": notes}
     files["scene.json"] = msgspec.json.format(msgspec.json.encode(about), indent=2)
     kept = [path for path in scene.scenery.files if (source.parent / path).suffix != ".ply"]
     if source.stem == "scene" and scene.about:  # roads and scenarios of an imported scene
         folder = source.parent
         kept += [str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and p.suffix != ".ply"]
+        unused = texture_files(scene.about) - texture_files(about)
+        kept = [path for path in kept if path not in unused]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:

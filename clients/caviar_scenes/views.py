@@ -28,6 +28,7 @@ from caviar_space.meshes import Mesh, joined
 
 if TYPE_CHECKING:
     from caviar_services.sensors.shading import View
+    from caviar_space.textures import Texture
 
 COLUMNS = ("file", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "hfov_deg")
 """Of a table of pictures."""
@@ -274,7 +275,11 @@ class Eye:
         )
 
     def paint(
-        self, device: CameraDevice, albedo: Float64Array, sun_deg: tuple[float, float] = (-55.0, 45.0)
+        self,
+        device: CameraDevice,
+        albedo: Float64Array,
+        sun_deg: tuple[float, float] = (-55.0, 45.0),
+        textures: Sequence[Texture | None] = (),
     ) -> UInt8Array:
         """Draw a picture, sRGB of Shape ``[H, W, 3]``.
 
@@ -282,6 +287,7 @@ class Eye:
             device: The camera.
             albedo: Linear sRGB of each mesh, Shape ``[meshes, 3]``.
             sun_deg: Azimuth and elevation of the sun.
+            textures: Of each mesh; they are shown as they are, since photographs have their light in them.
         """
         from caviar_services.sensors.base import active_variant
         from caviar_services.sensors.shading import Painter
@@ -292,7 +298,30 @@ class Eye:
         )
         colours = np.concatenate([albedo.reshape(-1, 3), np.zeros((1, 3))])  # and of the triangle of no body
         with active_variant(self._variant) as mi:
-            return Painter(mi, self._traced, colours, sun).paint(self._view(device))
+            picture = Painter(mi, self._traced, colours, sun).paint(self._view(device))
+        return self._textured(device, picture, textures) if any(textures) else picture
+
+    def _textured(
+        self, device: CameraDevice, picture: UInt8Array, textures: Sequence[Texture | None]
+    ) -> UInt8Array:
+        """Put textures in a picture: the mean of four points of each pixel, if it is not very large."""
+        from caviar_services.sensors.shading import encoded, linear
+
+        width, height = device.width, device.height
+        fine = 2 if width * height <= 1 << 22 else 1
+        seen = self.look(msgspec.structs.replace(device, width=fine * width, height=fine * height))
+        drawn = picture.repeat(fine, axis=0).repeat(fine, axis=1)
+        for number in np.unique(seen.owner[seen.owner >= 0]).tolist():
+            if (texture := textures[number]) is None:
+                continue
+            met = seen.owner == number
+            face, first = seen.face[met], int(np.argmax(self.owner == number))
+            weights = _barycentric(self.mesh.vertices[self.mesh.faces[face]], seen.points[met])
+            tinted = encoded((linear(np.arange(256)[:, None] / 255) * texture.tint).astype(np.float32))
+            drawn[met] = tinted[texture.texels(face - first, weights), [0, 1, 2]]
+        mean = drawn.reshape(height, fine, width, fine, 3).mean(axis=(1, 3))
+        result: UInt8Array = np.rint(mean).astype(np.uint8)
+        return result
 
     @staticmethod
     def _view(device: CameraDevice) -> View:
@@ -300,6 +329,15 @@ class Eye:
         from caviar_services.sensors.shading import View
 
         return View(device, intrinsics(device), Pose(device.position, device.orientation))
+
+
+def _barycentric(corners: Float64Array, points: Float64Array) -> Float64Array:
+    """Weights of the corners of triangles, Shape ``[N, 3, 3]``, at points on them, Shape ``[N, 3]``."""
+    after = np.roll(corners, -1, axis=1) - points[:, None]
+    opposite = np.cross(after, np.roll(after, -1, axis=1))  # of each corner: twice the area it faces
+    areas = np.maximum(np.einsum("ncx,nx->nc", opposite, opposite.sum(axis=1)), 0.0)
+    weights: Float64Array = areas / np.maximum(areas.sum(axis=1, keepdims=True), 1e-300)
+    return weights
 
 
 def viewpoints(

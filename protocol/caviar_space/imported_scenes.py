@@ -22,6 +22,7 @@ from caviar_protocol.host import install_command
 from caviar_space.ground import are_ground
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial, scenery_files
+from caviar_space.textures import Texture
 from caviar_space.volumes import outward
 
 Place = tuple[float, float, float]
@@ -101,6 +102,7 @@ class Piece:
     file: str
     line: int
     """Of the source, where it begins."""
+    texture: Texture | None = None
 
 
 @dataclass(eq=False, kw_only=True)
@@ -185,6 +187,8 @@ def cut_to_box(scene: ImportedScene, box: Box) -> None:
         triangles = piece.mesh.vertices[piece.mesh.faces]
         part = np.zeros(len(triangles), np.int64) if level[name] else _connected(piece.mesh)
         parts = int(part.max(initial=-1)) + 1
+        if piece.texture is not None:
+            triangles = np.concatenate([triangles, piece.texture.uv], axis=2)
         ends = np.full((2, parts, 2), np.inf)
         np.minimum.at(ends[0], part, triangles[..., :2].min(axis=1))
         np.minimum.at(ends[1], part, -triangles[..., :2].max(axis=1))
@@ -194,11 +198,13 @@ def cut_to_box(scene: ImportedScene, box: Box) -> None:
         # A volume that is cut is open: it stays whole.
         cut = large & (piece.kind != "foliage")
         kept = [triangles[(middle.all(axis=1) & ~cut)[part]], _clipped(triangles[cut[part]], low, high)]
-        corners = np.concatenate(kept).reshape(-1, 3)
-        if len(corners):
+        triangles = np.concatenate(kept)
+        if len(triangles):
+            corners = triangles[..., :3].reshape(-1, 3)
             vertices, places = np.unique(corners, axis=0, return_inverse=True)
             mesh = Mesh(vertices, places.reshape(-1, 3).astype(np.int32))
-            scene.pieces[name] = replace(piece, mesh=mesh)
+            texture = piece.texture and replace(piece.texture, uv=triangles[..., 3:])
+            scene.pieces[name] = replace(piece, mesh=mesh, texture=texture)
     if not scene.pieces:
         raise AssetError(f"nothing of the {count} pieces of {scene.name} is within the box; name another one")
     if len(scene.pieces) < count:
@@ -224,7 +230,8 @@ def _connected(mesh: Mesh) -> Int64Array:
 
 
 def _clipped(triangles: Float64Array, low: Float64Array, high: Float64Array) -> Float64Array:
-    """Parts of triangles within a box, as triangles, Shape ``[F, 3, 3]`` to ``[G, 3, 3]``."""
+    """Parts of triangles within a box, as triangles, Shape ``[F, 3, N]`` to ``[G, 3, N]``; what corners have
+    beside x and y is interpolated."""
     for axis, sign, limit in ((0, 1, low[0]), (1, 1, low[1]), (0, -1, -high[0]), (1, -1, -high[1])):
         distance = sign * triangles[..., axis] - limit
         inside = distance >= 0
@@ -284,6 +291,7 @@ def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | Non
                 "material": piece.material,
                 "source": f"{piece.file}:{piece.line}",
                 "triangles": len(piece.mesh.faces),
+                **({"texture": piece.texture.described(name)} if piece.texture else {}),
             }
             for name, piece in scene.pieces.items()
         },
@@ -294,6 +302,10 @@ def write_scene(scene: ImportedScene, out: Path, more: Mapping[str, bytes] | Non
         "notes": scene.notes,
         "sources": scene.sources,
     }
+    for name, piece in scene.pieces.items():
+        if piece.texture:
+            files[piece.texture.path] = piece.texture.image
+            files[f"meshes/{name}.uv"] = piece.texture.uv.astype("<f4").tobytes()
     files["scene.json"] = msgspec.json.format(msgspec.json.encode(description), indent=2)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -101,14 +101,19 @@ class Recording:
         for segment in self._segments:
             self._starts.append(self._starts[-1] + len(segment.chunks))
         # Segments of two runs in one folder would interleave: numbers must ascend without exception.
-        order = [(entry.episode, entry.frame) for segment in self._segments for entry in segment.entries]
+        order = [
+            (entry.episode, entry.frame, segment.path.name)
+            for segment in self._segments
+            for entry in segment.entries
+        ]
         for earlier, later in pairwise(order):
-            if later <= earlier:
+            if later[:2] <= earlier[:2]:
                 raise RecordingError(
-                    f"{self.path}: frame {later[1]} of episode {later[0]} follows frame {earlier[1]} of "
-                    f"episode {earlier[0]}: segments of two runs are mixed"
+                    f"{self.path}: frame {later[1]} of episode {later[0]} in {later[2]} follows frame "
+                    f"{earlier[1]} of episode {earlier[0]} in {earlier[2]}: segments of two runs are mixed, "
+                    "or one is damaged"
                 )
-        self._index = {key: index for index, key in enumerate(order)}
+        self._index = {(episode, frame): index for index, (episode, frame, _) in enumerate(order)}
         self._latest: tuple[int, dict[tuple[Channel, int], memoryview]] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:

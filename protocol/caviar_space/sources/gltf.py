@@ -8,7 +8,8 @@ from __future__ import annotations
 import base64
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -16,9 +17,11 @@ import msgspec
 import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.errors import AssetError
 from caviar_space.imported_scenes import ImportedScene
 from caviar_space.sources import Request
 from caviar_space.sources.pieces import Y_UP, Colour, SceneBuilder, at, beside, contents, moved, reading
+from caviar_space.textures import Texture, picture
 
 Index = Annotated[int, msgspec.Meta(ge=0)]
 """Of an item in a list of the document."""
@@ -30,7 +33,9 @@ _EXTENSIONS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_mesh_features",
     "EXT_structural_metadata", "EXT_instance_features", "CESIUM_primitive_outline", "KHR_xmp",
 )  # fmt: skip
+_MOST_UV = 1e5
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -62,8 +67,41 @@ class _Mesh(Part, frozen=True):
     name: str = ""
 
 
+class _TextureTransform(Part, frozen=True):
+    offset: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+    scale: tuple[float, float] = (1.0, 1.0)
+    tex_coord: Index | None = None
+
+
+class _TextureExtensions(Part, frozen=True):
+    transform: _TextureTransform = msgspec.field(default=_TextureTransform(), name="KHR_texture_transform")
+
+
+class _TextureOf(Part, frozen=True):
+    index: Index
+    tex_coord: Index = 0
+    extensions: _TextureExtensions = _TextureExtensions()
+
+
 class _Surface(Part, frozen=True):
     base_color_factor: _Numbers4 = (1.0, 1.0, 1.0, 1.0)
+    base_color_texture: _TextureOf | None = None
+
+
+class _Texture(Part, frozen=True):
+    source: Index | None = None
+    sampler: Index | None = None
+
+
+class _Image(Part, frozen=True):
+    uri: str | None = None
+    buffer_view: Index | None = None
+
+
+class _Sampler(Part, frozen=True):
+    wrap_s: int = 10497
+    wrap_t: int = 10497
 
 
 class _Material(Part, frozen=True):
@@ -120,6 +158,9 @@ class _Document(Part, frozen=True):
     nodes: list[_Node] = []
     meshes: list[_Mesh] = []
     materials: list[_Material] = []
+    textures: list[_Texture] = []
+    images: list[_Image] = []
+    samplers: list[_Sampler] = []
     accessors: list[_Accessor] = []
     buffer_views: list[View] = []
     buffers: list[Buffer] = []
@@ -138,6 +179,8 @@ class Surface(NamedTuple):
     """Name; empty: none."""
     colour: Colour | None
     """Linear sRGB, 0…1."""
+    texture: Texture | None
+    """With the places of the vertices in its picture, Shape ``[V, 2]``."""
 
 
 class Gltf:
@@ -167,6 +210,7 @@ class Gltf:
             raise ValueError(f"it requires the extension {unknown[0]}; export it without")
         self._folder, self._where = folder, where
         self._buffers: dict[int, bytes] = {}
+        self._images: dict[int, bytes] = {}
 
     def surfaces(self, turn: Float64Array = Y_UP) -> Iterator[Surface]:
         """Triangles of all nodes of the document's scene.
@@ -204,14 +248,63 @@ class Gltf:
                 if primitive.material is not None:
                     material = at(document.materials, primitive.material, "material")
                 pbr = material.pbr_metallic_roughness
-                colour = None
+                colour = texture = None
+                vertices, faces, coordinates = read
                 if pbr is not None:
                     red, green, blue = (min(max(part, 0.0), 1.0) for part in pbr.base_color_factor[:3])
                     colour = red, green, blue
+                    if pbr.base_color_texture is not None:
+                        try:
+                            texture = self._texture(
+                                pbr.base_color_texture, coordinates, len(vertices), colour
+                            )
+                        except (AssetError, ValueError) as error:
+                            what = f"textures of surfaces ({str(error)[:200]})"
+                            self.left_out[what] = self.left_out.get(what, 0) + 1
                 for instance in self._instances(node):
-                    yield Surface(name, *moved(here @ instance, *read), material.name, colour)
+                    placed = moved(here @ instance, vertices, faces)
+                    yield Surface(name, *placed, material.name, colour, texture)
 
-    def _triangles(self, primitive: _Primitive) -> tuple[Float64Array, Int64Array] | None:
+    def _texture(
+        self, given: _TextureOf, coordinates: Callable[[int], Float64Array], count: int, tint: Colour
+    ) -> Texture:
+        """Picture of a surface of ``count`` vertices."""
+        texture: _Texture = at(self._document.textures, given.index, "texture")
+        if texture.source is None:
+            raise ValueError("it is no PNG or JPEG")
+        sampler = _Sampler()
+        if texture.sampler is not None:
+            sampler = at(self._document.samplers, texture.sampler, "sampler")
+        wrap = _WRAPS.get(sampler.wrap_s, "repeat"), _WRAPS.get(sampler.wrap_t, "repeat")
+        change = given.extensions.transform
+        uv = coordinates(given.tex_coord if change.tex_coord is None else change.tex_coord)
+        cosine, sine = math.cos(change.rotation), math.sin(change.rotation)
+        uv = uv * change.scale @ [[cosine, -sine], [sine, cosine]] + change.offset
+        if uv.shape != (count, 2) or not (np.abs(uv) <= _MOST_UV).all():
+            raise ValueError(f"{len(uv)} places in it for {count} vertices, or one that is not finite")
+        return Texture(self._image(texture.source), uv, wrap, tint)
+
+    def _image(self, index: int) -> bytes:
+        """PNG or JPEG of an image, which can be decoded."""
+        if index not in self._images:
+            given: _Image = at(self._document.images, index, "image")
+            if given.buffer_view is not None:
+                data = self._view(given.buffer_view)[0]
+            else:
+                data = self._buffer(Buffer(0, given.uri or ""))
+            picture(data)
+            self._images[index] = data
+        return self._images[index]
+
+    def _coordinates(self, primitive: _Primitive, number: int) -> Float64Array:
+        if f"TEXCOORD_{number}" not in primitive.attributes:
+            raise ValueError(f"there is no TEXCOORD_{number}")
+        return self._values(primitive.attributes[f"TEXCOORD_{number}"], 2)
+
+    def _triangles(
+        self, primitive: _Primitive
+    ) -> tuple[Float64Array, Int64Array, Callable[[int], Float64Array]] | None:
+        """Vertices, triangles, and what gives a set of texture coordinates by its number."""
         if primitive.mode not in (4, 5, 6):
             what = "primitives of points" if primitive.mode == 0 else "primitives of lines"
             self.left_out[what] = self.left_out.get(what, 0) + 1
@@ -220,22 +313,25 @@ class Gltf:
             import DracoPy
 
             decoded = DracoPy.decode(self._view(draco["bufferView"])[0])
-            return np.asarray(decoded.points, np.float64), np.asarray(decoded.faces, np.int64)
+            uv = np.zeros((0, 2)) if decoded.tex_coord is None else np.asarray(decoded.tex_coord, np.float64)
+            points, corners = np.asarray(decoded.points, np.float64), np.asarray(decoded.faces, np.int64)
+            return points, corners, lambda _: uv
         if "POSITION" not in primitive.attributes:
             return None
         vertices = self._values(primitive.attributes["POSITION"], 3)
+        coordinates = partial(self._coordinates, primitive)
         if primitive.indices is None:
             corners = np.arange(len(vertices))
         else:
             corners = self._values(primitive.indices, 1)[:, 0].astype(np.int64)
         if primitive.mode == 4:
-            return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
+            return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3), coordinates
         faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=-1)
         if primitive.mode == 5:
             faces[1::2] = faces[1::2, [1, 0, 2]]
         else:
             faces[:, 0] = corners[0]
-        return vertices, faces
+        return vertices, faces, coordinates
 
     def _instances(self, node: _Node) -> Iterator[Float64Array]:
         """Transforms of the instances of a node (EXT_mesh_gpu_instancing)."""
@@ -291,8 +387,9 @@ class Gltf:
         if buffer.uri.startswith("data:"):
             return base64.b64decode(buffer.uri.partition(",")[2], validate=True)
         file = beside(self._folder, buffer.uri, self._where)
+        data = contents(file)
         self.files.append(file)
-        return contents(file)
+        return data
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
@@ -342,7 +439,8 @@ def read_gltf(path: Path, request: Request) -> ImportedScene:
         gltf = Gltf(data, path.parent, str(path))
         for number, surface in enumerate(gltf.surfaces(), 1):
             material = builder.material(surface.material, surface.colour)
-            builder.add(surface.name, surface.vertices, surface.faces, material, "object", path, number)
+            vertices, faces = surface.vertices, surface.faces
+            builder.add(surface.name, vertices, faces, material, "object", path, number, surface.texture)
         for file in gltf.files:
             builder.read(file)
         builder.note_left_out(gltf.left_out)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -23,6 +24,7 @@ from caviar_space.imported_scenes import ImportedScene, Piece, source_of, wall_m
 from caviar_space.meshes import Mesh
 from caviar_space.mitsuba_xml import RadioMaterial
 from caviar_space.sources import Request
+from caviar_space.textures import Texture
 
 Colour = tuple[float, float, float]
 Item = TypeVar("Item")
@@ -281,7 +283,15 @@ class SceneBuilder:
         return vertices @ Y_UP[:3, :3].T if self.request.up == "y" else vertices
 
     def add(
-        self, name: str, vertices: Float64Array, faces: Any, material: str, kind: str, file: Path, number: int
+        self,
+        name: str,
+        vertices: Float64Array,
+        faces: Any,
+        material: str,
+        kind: str,
+        file: Path,
+        number: int,
+        texture: Texture | None = None,
     ) -> None:
         """Add triangles, without those that have no area; corners at one place become one.
 
@@ -292,6 +302,7 @@ class SceneBuilder:
             material: Key.
             kind: Of the piece.
             file, number: Of the source, and of the piece in it.
+            texture: With the places of all ``vertices`` in its picture, Shape ``[V, 2]``.
 
         Raises:
             AssetError: A coordinate is not finite or too large, or a corner is no vertex.
@@ -307,7 +318,7 @@ class SceneBuilder:
         if not 0 <= corners.min() <= corners.max() < len(vertices):
             wrong = corners.max() if corners.max() >= len(vertices) else corners.min()
             raise AssetError(f"{said} has a corner at vertex {wrong} of {len(vertices)}; export it again")
-        used, corners = np.unique(corners, return_inverse=True)
+        of_vertices, used, corners = corners, *np.unique(corners, return_inverse=True)
         points = np.asarray(vertices, np.float64)[used]
         bad = np.flatnonzero(~(np.abs(points) <= MAX_COORDINATE_M).all(1))
         if len(bad):
@@ -328,7 +339,8 @@ class SceneBuilder:
         while key in self.scene.pieces:
             count, key = count + 1, f"{base}-{number}" if count == 1 else f"{base}-{number}-{count}"
         mesh = Mesh(points, corners[~flat].astype(np.int32))
-        self.scene.pieces[key] = Piece(mesh, material, kind, file.name, number)
+        texture = texture and texture.part(of_vertices[~flat])
+        self.scene.pieces[key] = Piece(mesh, material, kind, file.name, number, texture)
 
     def note_left_out(self, counts: Mapping[str, int]) -> None:
         """Note what is left out.
@@ -363,7 +375,7 @@ class SceneBuilder:
         if scene.origin is None and (about_corner or max(-low.min(), high.max()) > _NEAR_M):
             for name, piece in pieces.items():
                 mesh = Mesh(piece.mesh.vertices - low, piece.mesh.faces)
-                pieces[name] = Piece(mesh, piece.material, piece.kind, piece.file, piece.line)
+                pieces[name] = replace(piece, mesh=mesh)
             x, y, z = low.tolist()
             scene.notes.append(f"the origin of the scene is at {x:.0f}, {y:.0f}, {z:.0f} m of the source")
         scene.origin = scene.origin or self.request.origin

@@ -401,7 +401,8 @@ def read_tileset(path: Path, request: Request) -> ImportedScene:
                     to_scene = to_scene or _conversion(builder, origin, vertices)
                     material = builder.material(surface.material, surface.colour)
                     name = f"{file.stem}-{surface.name}"
-                    builder.add(name, to_scene(vertices), faces, material, "tile", file, number)
+                    points, texture = to_scene(vertices), surface.texture
+                    builder.add(name, points, faces, material, "tile", file, number, texture)
                 for what, count in gltf.left_out.items():
                     left_out[what] = left_out.get(what, 0) + count
     builder.note_left_out(left_out)
