@@ -185,7 +185,8 @@ def scenery_files(
         lines += [f'    <float name="{name}" value="{value:.9g}"/>' for name, value in numbers.items()]
         if material.colour is not None:
             red, green, blue = material.colour
-            lines.append(f'    <rgb name="color" value="{red:.6f} {green:.6f} {blue:.6f}"/>')
+            colour = "reflectance" if cameras else "color"
+            lines.append(f'    <rgb name="{colour}" value="{red:.6f} {green:.6f} {blue:.6f}"/>')
         lines.append("  </bsdf>")
     for shape, (_, key) in shapes.items():
         if key not in materials:

@@ -10,7 +10,15 @@ import pytest
 
 from caviar_protocol.errors import AssetError
 from caviar_services.channel.sionna.scene_loading import file_pieces
-from caviar_space.mitsuba_xml import ITU_MATERIALS, SceneryShape, find_scenery, read_scenery
+from caviar_space.meshes import unit_box
+from caviar_space.mitsuba_xml import (
+    ITU_MATERIALS,
+    RadioMaterial,
+    SceneryShape,
+    find_scenery,
+    read_scenery,
+    scenery_files,
+)
 from caviar_space.scenery import scenery_assets
 
 SHAPE = '<shape type="ply" id="mesh-{0}"><string name="filename" value="meshes/{0}.ply"/>{1}</shape>'
@@ -244,3 +252,13 @@ def test_the_ray_tracer_refuses_a_shape_without_radio_constants(tmp_path: Path) 
     body = '<bsdf type="diffuse" id="paint"/>\n' + SHAPE.format("wall", '<ref id="paint" name="bsdf"/>')
     with pytest.raises(AssetError, match=r"^scenery/scene\.xml:2.*'mesh-wall'.*'paint'"):
         file_pieces(described(tmp_path, body, "wall"))
+
+
+def test_a_colour_for_cameras_has_the_name_that_mitsuba_takes(tmp_path: Path) -> None:
+    leaves = RadioMaterial(colour=(0.0, 0.25, 0.0))
+    files = scenery_files("wood", {"tree": (unit_box(), "leaves")}, {"leaves": leaves})
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    assert '<rgb name="reflectance"' in (tmp_path / "scenery/wood.xml").read_text()
+    assert read_scenery(tmp_path / "scenery/wood.xml").shapes[0].colour == leaves.colour
