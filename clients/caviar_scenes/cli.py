@@ -52,7 +52,7 @@ def import_command(
         str, typer.Option(help="W,S,E,N of what is taken, longitudes and latitudes [°]; by default all")
     ] = "",
     box_m: Annotated[
-        str, typer.Option("--box-m", help="X0,Y0,X1,Y1 of what is taken, in the scene [m]; by default all")
+        str, typer.Option("--box-m", help="X0,Y0,X1,Y1 of what is taken, in the scene, in m; by default all")
     ] = "",
     form: Annotated[
         str, typer.Option("--format", help="format of the source; by default by the names of files")
@@ -71,7 +71,8 @@ def import_command(
         str, typer.Option(help="level of detail, where there are several; by default the finest")
     ] = "",
     error_m: Annotated[
-        float, typer.Option("--error-m", min=0.0, help="largest geometric error of tiles [m]; 0: the finest")
+        float,
+        typer.Option("--error-m", min=0.0, help="largest geometric error of tiles, in m; 0: the finest"),
     ] = 0.0,
     heights: Annotated[
         Path | None,
@@ -86,7 +87,9 @@ def import_command(
     ] = None,
     lidar: Annotated[
         str,
-        typer.Option(help="X0,Y0,X1,Y1 of the grid of LIDARs beside the receivers [m]; by default no LIDAR"),
+        typer.Option(
+            help="X0,Y0,X1,Y1 of the grid of LIDARs beside the receivers, in m; by default no LIDAR"
+        ),
     ] = "",
 ) -> None:
     """Import a scene: meshes, materials, roads of a map, or scenarios with a project's transmitters."""
@@ -188,14 +191,14 @@ SceneArgument = Annotated[
 def check_command(
     scene: SceneArgument,
     thin_m: Annotated[
-        float, typer.Option("--thin-m", min=0.0, help="closed bodies up to this thickness are walls [m]")
+        float, typer.Option("--thin-m", min=0.0, help="closed bodies up to this thickness are walls, in m")
     ] = 0.5,
     as_json: Annotated[bool, typer.Option("--json", help="print all faults, each with its place")] = False,
 ) -> None:
     """Check a scene for faults that rays meet; status 1 where received powers are wrong by one."""
     from collections import Counter
 
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from caviar_scenes.checks import KINDS, check
     from caviar_scenes.opened import open_scene
@@ -211,7 +214,9 @@ def check_command(
         sys.stdout.write("\n")
         raise typer.Exit(bool(wrong))
     console = Console()
-    table = Table("fault", "count", "where (first three) [m]", "effect on rays", "remedy")
+    table = Table(
+        "fault", "count", Column("where (first three), in m", overflow="fold"), "effect on rays", "remedy"
+    )
     for kind, count in counts.items():
         where = [
             f"{fault.piece} {fault.place}{f': {fault.note}' if fault.note else ''}"
@@ -237,14 +242,14 @@ def repair_command(
     out: Annotated[Path, typer.Option(help="folder of the repaired scene, which is made")],
     thin_m: Annotated[
         float,
-        typer.Option("--thin-m", min=0.0, help="closed plates up to this become sheets [m]; 0: none"),
+        typer.Option("--thin-m", min=0.0, help="closed plates up to this become sheets, in m; 0: none"),
     ] = 0.5,
     union: Annotated[
         bool, typer.Option("--union", help="unite closed bodies of one material that overlap")
     ] = False,
 ) -> None:
     """Repair a scene: weld, drop slivers and duplicates, turn bodies, fold walls; print what changed."""
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from caviar_scenes.opened import open_scene, write_changed
     from caviar_scenes.repairs import repair
@@ -253,7 +258,7 @@ def repair_command(
     done, changes = repair(opened, thin_m, union)
     said = f"repaired by caviar scene repair: {len(changes)} pieces changed"
     write_changed(opened, done, out, {}, said)
-    table = Table("piece", "triangles", "area m²", "volume m³", "what")
+    table = Table(Column("piece", overflow="fold"), "triangles", "area m²", "volume m³", "what")
     for change in changes:
         before, after = change.before, change.after
         pairs = zip(astuple(before), astuple(after), strict=True)
@@ -273,7 +278,7 @@ def simplify_command(
     out: Annotated[Path, typer.Option(help="folder of the simplified scene, which is made")],
     error_db: Annotated[
         float,
-        typer.Option("--error-db", min=0.0, help="error of received power at 9 of 10 positions [dB]"),
+        typer.Option("--error-db", min=0.0, help="error of received power at 9 of 10 positions, in dB"),
     ] = 0.5,
     positions: Annotated[
         int, typer.Option(min=4, help="frames at which devices are looked at; half choose, half are held out")

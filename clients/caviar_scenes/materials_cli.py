@@ -30,9 +30,11 @@ def views_command(
     count: Annotated[int, typer.Option(min=1, max=1000, help="cameras, where none are given")] = 12,
     at: Annotated[
         list[str] | None,
-        typer.Option(help="X,Y,Z,YAW[,PITCH] of a camera [m, °]; may be repeated; by default chosen"),
+        typer.Option(
+            help="X,Y,Z,YAW or X,Y,Z,YAW,PITCH of a camera, in m and °; may be repeated; by default chosen"
+        ),
     ] = None,
-    size: Annotated[str, typer.Option(help="width and height [px]")] = "640x480",
+    size: Annotated[str, typer.Option(help="width and height, in px")] = "640x480",
     fov: Annotated[float, typer.Option(min=1, max=170, help="horizontal field of view [°]")] = 90.0,
 ) -> None:
     """Draw a scene from its streets and from above: pictures, their table, and faces and depths of pixels."""
@@ -160,7 +162,7 @@ def calibrate_command(
     ],
     materials: Annotated[str, typer.Option(help="names of the materials that are fitted: brick,glass")],
     noise_db: Annotated[
-        float, typer.Option(min=0.001, help="standard deviation of a measurement [dB]")
+        float, typer.Option(min=0.001, help="standard deviation of a measurement, in dB")
     ] = 1.0,
     carrier: Annotated[str, typer.Option(help="name of the carrier; by default the first")] = "",
     out: Annotated[

@@ -6,8 +6,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+from rich.text import Text
 from typer.testing import CliRunner
 
 from caviar_clients.cli import commands
@@ -127,3 +130,17 @@ def test_a_command_loads_no_other_and_the_help_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n[]\n"
+
+
+def test_help_is_shown_as_it_is_written() -> None:
+    """Rich takes what is in brackets, as a unit, for a style, and leaves it out."""
+    root: Any = typer.main.get_command(app)
+    context = root.context_class(root)
+    waiting, helps = [root], list[str]()
+    while waiting:
+        command = waiting.pop()
+        if hasattr(command, "commands"):
+            waiting += [command.get_command(context, name) for name in command.list_commands(context)]
+        helps += [part.help for part in (command, *command.params) if getattr(part, "help", None)]
+    assert len(helps) > 200
+    assert not [text for text in helps if Text.from_markup(text).plain != text]

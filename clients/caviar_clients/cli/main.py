@@ -158,7 +158,7 @@ def view(
     link: Annotated[
         str, typer.Option(help="link to the page, or its part from # on, that says what is seen")
     ] = "",
-    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="of the picture [pixels]")] = "1280x720",
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="of the picture, in px")] = "1280x720",
     episode: Annotated[int | None, typer.Option(min=0, help="of a dataset; default: its first")] = None,
     http: Annotated[str, typer.Option(help="HOST:PORT to serve at; port 0: any free one")] = "127.0.0.1:0",
     keys: Keys = None,
@@ -364,7 +364,7 @@ def radio_map(
     samples: Annotated[
         int, typer.Option(min=1000, max=1_000_000_000, help="rays of each transmitter")
     ] = 10_000_000,
-    memory_gib: Annotated[float, typer.Option(min=0.05, help="memory that it may take [GiB]")] = 2.0,
+    memory_gib: Annotated[float, typer.Option(min=0.05, help="memory that it may take, in GiB")] = 2.0,
     out: Annotated[
         Path | None,
         typer.Option(

@@ -46,10 +46,11 @@ def tradeoff(
         typer.Option(help="ladder, keyframes, spacing, arrays or convergence; by default all"),
     ] = None,
     error_db: Annotated[
-        list[float] | None, typer.Option(help="name the fastest setting with this NMSE of H [dB], as -20")
+        list[float] | None, typer.Option(help="name the fastest setting with this NMSE of H, in dB, as -20")
     ] = None,
     time_ms: Annotated[
-        list[float] | None, typer.Option(help="name the most accurate setting with this time of a scene [ms]")
+        list[float] | None,
+        typer.Option(help="name the most accurate setting with this time of a scene, in ms"),
     ] = None,
 ) -> None:
     """Compare channel settings: time and error of each over the same scenes."""
