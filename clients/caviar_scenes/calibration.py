@@ -75,12 +75,15 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True):
     parameter: str
     value: float
     low: float
-    """Of the interval of 95 %; for what is not told, the value before."""
+    """Of the interval of 95 %; of a parameter that is not identified, the value before."""
     high: float
-    told: bool
-    """Whether the data tell it."""
     why: str = ""
-    """Why they do not."""
+    """Why the data do not identify it; empty: they do."""
+
+    @property
+    def identified(self) -> bool:
+        """Whether the data identify it."""
+        return not self.why
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -570,17 +573,15 @@ def _fitted(
             k = count * seen.index(name) + p
             half = 1.96 * float(deviation[k])
             ends = [float(np.clip(x[k] + sign * half, *BOUNDS[p])) for sign in (-1, 1)]
-            told = 2 * half < WIDEST[p] and BOUNDS[p][0] + 1e-3 < x[k] < BOUNDS[p][1] - 1e-3
+            narrow = 2 * half < WIDEST[p] and BOUNDS[p][0] + 1e-3 < x[k] < BOUNDS[p][1] - 1e-3
             value, low, high = (10.0**v if p == 1 else v for v in (float(x[k]), *ends))
-            why = "" if told else "its interval is as wide as its range"
-        found.append(
-            Fitted(material=name, parameter=parameter, value=value, low=low, high=high, told=not why, why=why)
-        )
+            why = "" if narrow else "its interval is as wide as its range"
+        found.append(Fitted(material=name, parameter=parameter, value=value, low=low, high=high, why=why))
     return found
 
 
 def settings_text(found: Calibration) -> str:
-    """Write what is told as tables of a scenario, with intervals, and what is not as remarks.
+    """Write identified parameters as tables of a scenario, with intervals, and the others as remarks.
 
     Args:
         found: The result.
@@ -590,12 +591,16 @@ def settings_text(found: Calibration) -> str:
     for fitted in found.parameters:
         by_material.setdefault(fitted.material, []).append(fitted)
     for material, parameters in by_material.items():
-        told = [fitted for fitted in parameters if fitted.told]
-        if told:
+        identified = [fitted for fitted in parameters if fitted.identified]
+        if identified:
             lines.append(
                 f"[services.{found.service}.settings.materials.{msgspec.json.encode(material).decode()}]"
             )
-        lines += [f"{one.parameter} = {one.value:.6g}  # {one.low:.4g} to {one.high:.4g}" for one in told]
-        lines += [f"# {material}: {one.parameter} is not told: {one.why}" for one in parameters if one.why]
+        lines += [
+            f"{one.parameter} = {one.value:.6g}  # {one.low:.4g} to {one.high:.4g}" for one in identified
+        ]
+        lines += [
+            f"# {material}: {one.parameter} is not identified: {one.why}" for one in parameters if one.why
+        ]
         lines.append("")
     return "\n".join(lines)

@@ -191,8 +191,11 @@ def calibrate_command(
         f"{found.after:.3g} after [{unit}]; fields agree with the channel's to {found.agreement:.1e}",
     )
     for one in found.parameters:
-        told = f"{one.value:.4g} ({one.low:.4g} to {one.high:.4g})" if one.told else f"not told: {one.why}"
-        print_line(console, f"{one.material}: {one.parameter} {told}")
+        value = f"{one.value:.4g} ({one.low:.4g} to {one.high:.4g})"
+        print_line(
+            console,
+            f"{one.material}: {one.parameter} {value if one.identified else f'not identified: {one.why}'}",
+        )
     if out:
         write_file(out, settings_text(found))
         print_line(console, out)
@@ -205,10 +208,10 @@ def _say(out: Path, made: ImportedScene, first: str) -> None:
     console = Console()
     if first:
         print_line(console, first)
-    told = ", ".join(
+    counted = ", ".join(
         f"{material} {count}" for material, count in sorted(counts.items(), key=lambda kv: -kv[1])
     )
-    print_line(console, f"{out}: {len(made.pieces)} pieces; faces of {told}")
+    print_line(console, f"{out}: {len(made.pieces)} pieces; faces of {counted}")
 
 
 def _weights(text: str) -> dict[str, float]:

@@ -109,13 +109,13 @@ def test_planted_permittivities_are_found_and_an_unseen_material_is_named(
     fitted = by_name(found.parameters)
     for name, planted in PLANTED.items():
         one = fitted[name, "relative"]
-        assert one.told
+        assert one.identified
         assert one.value == pytest.approx(planted, rel=0.05)
         assert one.low < one.value < one.high
-    assert not fitted["marble", "relative"].told
+    assert not fitted["marble", "relative"].identified
     assert fitted["marble", "relative"].why == "unseen: no path at these places is by way of it"
     assert fitted["brick", "scattering"].why == "the channel has no diffuse paths (scattering = false)"
-    assert not fitted["glass", "conductivity"].told
+    assert not fitted["glass", "conductivity"].identified
 
 
 def test_responses_tell_more_than_powers(truth: tuple[Scenes, Measurements, FixedPaths]) -> None:

@@ -98,7 +98,8 @@ class LiveView:
         self._observed = endpoint, PAGE, EVERYTHING, credentials
         self._starting = asyncio.Lock()
         self._asking = asyncio.Lock()
-        self._told: Mapping[str, Any] = {}
+        # What the run waits for, as the broker last said, and when.
+        self._why: Mapping[str, Any] = {"state": "", "paused": False, "waits": []}
         self._why_at = 0.0
         self._answers: Answers | None = None
         self._frames: LiveFrames | None = None
@@ -162,7 +163,7 @@ class LiveView:
         frames, told, said_at = (await self.answers("news")).frames, -1, 0.0
         while not self._ended:
             if frames.end != told or time.monotonic() - said_at > QUIET_S:
-                why = await self._why()
+                why = await self._waits()
                 added = self._answers.blocks(told) if self._answers else []
                 told, said_at = frames.end, time.monotonic()
                 event = {key: why.get(key) for key in ("state", "paused", "waits")}
@@ -171,16 +172,16 @@ class LiveView:
             await asyncio.sleep(NEWS_S)
         yield f"data: {json.dumps({'ended': self._ended})}\n\n".encode()
 
-    async def _why(self) -> Mapping[str, Any]:
+    async def _waits(self) -> Mapping[str, Any]:
         """What the run waits for, as the broker said at most `QUIET_S` ago, for all pages."""
         async with self._asking:
             if time.monotonic() - self._why_at > QUIET_S:
                 try:
-                    self._told = (await self._ask(do="why"))["why"]
+                    self._why = (await self._ask(do="why"))["why"]
                 except RunError:  # a broker that is busy, or that has ended, as the observer finds out
                     await asyncio.sleep(QUIET_S)
                 self._why_at = time.monotonic()
-            return self._told
+            return self._why
 
 
 Views = Mapping[str, Callable[[str], Awaitable[Answers]]]
