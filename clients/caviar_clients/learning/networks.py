@@ -194,7 +194,11 @@ class _Grid(_Module):  # type: ignore[misc]
     def __init__(self, shape: tuple[int, ...], small: bool) -> None:
         super().__init__()
         self._shape = shape
-        self._pool = tuple(max(1, size // most) for size, most in zip(shape, (100, 20, 5), strict=True))
+        # The longer axis of the ground first, whichever of x and y it is.
+        self._swap = shape[1] > shape[0]
+        ground = (shape[1], shape[0]) if self._swap else shape[:2]
+        most = (100, 20, 5)
+        self._pool = tuple(max(1, size // top) for size, top in zip((*ground, shape[2]), most, strict=True))
         layers = -(-shape[2] // self._pool[2])
         first, second, units = (4, 8, 16) if small else (8, 16, 64)
         self.cells = nn.Sequential(
@@ -221,7 +225,8 @@ class _Grid(_Module):  # type: ignore[misc]
         line = (torch.gather(flat, 1, index) > 0).float() * has_tx
         kx, ky, kz = self._pool
         heights = [(rows[..., low : low + kz] > 0).float().amax(dim=-1) for low in range(0, z, kz)]
-        cells = max_pool2d(torch.stack(heights, dim=1), (kx, ky), ceil_mode=True)
+        layers = torch.stack(heights, dim=1)
+        cells = max_pool2d(layers.transpose(2, 3) if self._swap else layers, (kx, ky), ceil_mode=True)
         return {
             "cells": cells.to(torch.uint8),
             "rx": ends["rx"],
