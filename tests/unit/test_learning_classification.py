@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
 from caviar_clients.learning.samples import read_samples
-from caviar_clients.learning.supervised import train_classifier
+from caviar_clients.learning.supervised import Rows, export_classifier, make_model, train_classifier
 from caviar_clients.learning.training import POLICY, Progress, seed_folder
 from caviar_protocol.errors import ScenarioError
 from caviar_services.agent.policy import PolicyModel
@@ -203,6 +204,30 @@ def test_a_network_of_the_users_own_is_trained_from_a_file(data: Path, tmp_path:
     judged = CliRunner().invoke(app, ["policy", "evaluate", str(tmp_path / "training"), "--on", str(data)])
     assert judged.exit_code != 0
     assert "test = " in str(judged.exception or judged.output)
+
+
+def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_path: Path) -> None:
+    """Of one carrier the spectrum tells the best pair; the picture is one for all places of a scene."""
+    dataset = Dataset(data)
+    samples = read_samples(dataset, ("spectrum", "position"))
+    spectrum = samples.rows("spectrum", np.arange(len(samples)))
+    np.testing.assert_array_equal(spectrum.argmax(1), samples.best)
+    pictures = np.random.default_rng(2).integers(0, 256, (len(samples.episode), 90, 130, 3), dtype=np.uint8)
+    seen = replace(
+        samples,
+        observed={"camera": pictures, "position": samples.observed["position"]},
+        row_shapes={"camera": None, "position": (3,)},
+    )
+    made = experiment(data, 'model = { name = "image" }')
+    model = make_model(made, seen)
+    rows = Rows.read(model, seen, np.arange(len(seen)), made)
+    model.fit(rows.reduced)
+    export_classifier(made, model.eval(), seen, tmp_path / "image.onnx", 1, 1, {})
+    order = ranked_by_policy(PolicyModel(tmp_path / "image.onnx"), seen, "policy").order
+    given, _ = rows.batch(torch.arange(len(seen)), "cpu")
+    with torch.no_grad():
+        wanted = model(given).argmax(1).numpy()
+    assert np.mean(order[:, 0] == wanted) > 0.95  # pictures of training are rounded to 16 bits
 
 
 def test_a_grid_tells_where_receiver_and_obstacles_are() -> None:
