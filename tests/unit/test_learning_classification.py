@@ -18,6 +18,7 @@ from caviar_clients.cli.main import app
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
+from caviar_clients.learning.networks import OBSERVED
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
 from caviar_clients.learning.samples import read_samples
@@ -82,7 +83,7 @@ def test_an_agent_chooses_what_was_judged(policy: Path, tmp_path: Path) -> None:
     dataset = Dataset(generated(played, tmp_path / "served", 3))
     users = dataset.users()
     served = np.stack([users["link.tx_beam"], users["link.rx_beam"]], axis=1)
-    samples = read_samples(dataset, ("position",))
+    samples = read_samples(dataset, OBSERVED["position"])
     order = ranked_by_policy(PolicyModel(policy), samples, "policy").order
     assert len(samples) == 3 * SCENES * 2
     np.testing.assert_array_equal(order[:, 0], served[:, 0] * RX + served[:, 1])
@@ -92,7 +93,7 @@ def test_an_agent_chooses_what_was_judged(policy: Path, tmp_path: Path) -> None:
 
 def test_both_orders_of_pairs_are_served_as_one(data: Path, policy: Path, tmp_path: Path) -> None:
     other = trained(experiment(data, 'model = { name = "position" }\nlabel = { order = "rx-tx" }'), tmp_path)
-    samples = read_samples(Dataset(data), ("position",))
+    samples = read_samples(Dataset(data), OBSERVED["position"])
     for file in (policy, other):
         order = ranked_by_policy(PolicyModel(file), samples, "policy").order
         chosen = np.take_along_axis(samples.abs_y, order[:, :4], axis=1).max(1)
@@ -218,7 +219,7 @@ def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_p
         observed={"camera": pictures, "position": samples.observed["position"]},
         row_shapes={"camera": None, "position": (3,)},
     )
-    made = experiment(data, 'model = { name = "image" }')
+    made = experiment(data, 'model = { name = "image", observe = ["camera", "position"] }')
     model = make_model(made, seen)
     rows = Rows.read(model, seen, np.arange(len(seen)), made)
     model.fit(rows.reduced)

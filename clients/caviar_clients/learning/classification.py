@@ -14,7 +14,7 @@
 ... name = "position"
 ... ''')
 >>> experiment.observe
-('position',)
+('position', 'departure', 'aoa')
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ClassifierSubject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     name: Name
     seeds: tuple[Seed, ...]
     """Each is trained by itself, into a folder of its own. They draw weights and the order of users."""
-    epochs: Count = 100
+    epochs: Count = 60
     """Passes over the users at most."""
 
     def __post_init__(self) -> None:
@@ -120,11 +120,11 @@ class TrainingSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Table ``[training]``: Adam with decoupled weight decay, and early stopping."""
 
     batch_size: Rows = 128
-    learning_rate: Rate = 2e-3
-    final_learning_rate: Rate | None = None
-    """Reached after ``epochs``, in proportion; absent: the rate stays as it is."""
+    learning_rate: Rate = 3e-3
+    final_learning_rate: Rate = 1e-4
+    """Reached after ``epochs``, in proportion to these."""
     weight_decay: Annotated[float, quantity("1", "of the weights", ge=0, le=10)] = 1e-3
-    patience: Count = 10
+    patience: Count = 15
     """Epochs without a lower loss of validation after which training stops; the weights of the lowest
     stay."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -26,17 +26,20 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 _Module: Any = object if nn is None else nn.Module
 
+_PLACE = ("position", "departure", "aoa")
 OBSERVED: Mapping[str, tuple[str, ...]] = {
-    "position": ("position",),
+    "position": _PLACE,
     "lidar": ("lidar_grid",),
-    "image": ("camera", "position"),
-    "fusion": ("position", "lidar_grid"),
+    "image": ("camera", *_PLACE),
+    "fusion": (*_PLACE, "lidar_grid"),
 }
-"""Models by name, with the parts that they observe where an experiment names none. A picture that all users
-share does not say which of them is meant: so ``image`` has the position, too."""
+"""Models by name, with the parts that they observe where an experiment names none. A position is three of
+them: in the world, and as the directions that both arrays see it under, in which beams are evenly spaced and
+which mean the same at another station. A picture that all users share does not say which of them is meant: so
+``image`` has the position, too."""
 SMALL = ("lidar",)
 """Models of at most 10,000 parameters: the winner of the ITU challenge ML5G-PHY had 7,462."""
-WAVES = {"position": 32, "last_beam": 16, "aod": 16, "aoa": 16, "departure": 16}
+WAVES = {"position": 16, "last_beam": 16, "aod": 32, "aoa": 32, "departure": 32}
 """Sines and cosines of a part, as of an encoding (`caviar_clients.learning.experiment.Encoding`)."""
 PICTURE = (36, 64)
 """Rows and columns that pictures are reduced to, or a few more, by means of whole pixels."""
@@ -80,6 +83,7 @@ class BeamNetwork(BeamModel):
         shapes: Of a row of each part.
         beams: Nt and Nr.
         units: Of the layers that join the parts.
+        dropout: Share of these units that a step of training leaves out.
         small: At most 10,000 parameters: scores of a pair are a sum and a product of those of its two beams.
 
     Raises:
@@ -92,7 +96,12 @@ class BeamNetwork(BeamModel):
     """
 
     def __init__(
-        self, shapes: Shapes, beams: Sequence[int], units: Sequence[int] = (128, 128), small: bool = False
+        self,
+        shapes: Shapes,
+        beams: Sequence[int],
+        units: Sequence[int] = (256, 256),
+        dropout: float = 0.3,
+        small: bool = False,
     ) -> None:
         super().__init__()
         self._shapes, self._small = dict(shapes), small
@@ -105,7 +114,7 @@ class BeamNetwork(BeamModel):
         sizes = [width, *((24,) if small else units)]
         layers: list[Any] = []
         for a, b in pairwise(sizes):
-            layers += [nn.Linear(a, b), nn.ReLU()]
+            layers += [nn.Linear(a, b), nn.ReLU(), nn.Dropout(0.0 if small else dropout)]
         self.joined = nn.Sequential(*layers)
         self.scores = _Product(sizes[-1], *beams) if small else nn.Linear(sizes[-1], beams[0] * beams[1])
 

@@ -329,11 +329,9 @@ def _train_epoch(experiment: Classification, state: _State, rows: Rows, seed: in
     import torch
 
     training, total = experiment.training, 0.0
-    if training.final_learning_rate is not None:
-        done = state.epoch / experiment.experiment.epochs
-        rate = training.learning_rate + (training.final_learning_rate - training.learning_rate) * done
-        for group in state.optimizer.param_groups:
-            group["lr"] = rate
+    done = state.epoch / experiment.experiment.epochs
+    for group in state.optimizer.param_groups:
+        group["lr"] = training.learning_rate + (training.final_learning_rate - training.learning_rate) * done
     (word,) = np.random.SeedSequence([seed, state.epoch]).generate_state(1)
     torch.manual_seed(int(word))  # of what a network of the user's own draws
     order = torch.randperm(len(rows))
