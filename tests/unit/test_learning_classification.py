@@ -18,7 +18,7 @@ from caviar_clients.cli.main import app
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
-from caviar_clients.learning.networks import OBSERVED
+from caviar_clients.learning.networks import AROUND, LINE, OBSERVED, STEPS, BeamNetwork
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
 from caviar_clients.learning.samples import read_samples
@@ -231,29 +231,34 @@ def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_p
     assert np.mean(order[:, 0] == wanted) > 0.95  # pictures of training are rounded to 16 bits
 
 
-def test_a_grid_tells_where_receiver_and_obstacles_are() -> None:
-    from caviar_clients.learning.networks import LINE, BeamNetwork
-
+@pytest.mark.parametrize("shape", [(40, 12, 6), (12, 40, 10)])
+def test_a_grid_tells_what_stands_on_the_line_and_around(shape: tuple[int, int, int]) -> None:
+    """Held against loops over cells; halves are rounded either way, so that a few points may differ."""
     rng = np.random.default_rng(3)
-    grid = (rng.random((5, 40, 12, 6)) < 0.05).astype(np.int8)
+    grid = (rng.random((5, *shape)) < 0.05).astype(np.int8)
     ends: list[Any] = []
     for cells in grid:
         tx, rx = rng.integers(0, cells.shape, (2, 3))
         cells[tuple(tx)], cells[tuple(rx)] = -1, -2
         ends.append((tx, rx))
-    model = BeamNetwork({"lidar_grid": grid.shape[1:]}, (8, 4), small=True)
-    rows = {
-        name: value.numpy() for name, value in model.reduce({"lidar_grid": torch.from_numpy(grid)}).items()
-    }
-    np.testing.assert_array_equal(rows["lidar_grid/rx"], [rx for _, rx in ends])
+    model = BeamNetwork({"lidar_grid": shape}, (8, 4), small=True)
+    reduced = model.reduce({"lidar_grid": torch.from_numpy(grid)})
+    rows = {name.partition("/")[2]: value.numpy() for name, value in reduced.items()}
+    np.testing.assert_array_equal(rows["rx"], [rx for _, rx in ends])
+    length, width = AROUND
     for n, (tx, rx) in enumerate(ends):
-        points = [
-            np.round(np.float32(tx + (rx - tx) * i / (LINE + 1))).astype(int) for i in range(1, LINE + 1)
-        ]
-        wanted = [grid[(n, *point)] > 0 for point in points]
-        found = rows["lidar_grid/line"][n, :-1] > 0
-        assert np.count_nonzero(found != wanted) <= 1  # halves are rounded either way
-    assert (
-        sum(p.numel() for p in BeamNetwork({"lidar_grid": (200, 20, 10)}, (64, 8), small=True).parameters())
-        <= 10_000
-    )
+        away, most = rx - tx, np.abs(rx - tx).max()
+        back = [*(np.arange(1, LINE + 1) / (LINE + 1)), *(np.arange(1, STEPS + 1) / most)]
+        points = [np.round(rx - away * share).astype(int) for share in back]
+        wanted = [share < 1 and grid[(n, *point)] > 0 for share, point in zip(back, points, strict=True)]
+        assert np.count_nonzero((rows["line"][n, :-1] > 0) != wanted) <= 2
+        layer = max(1, shape[2] // 5)
+        for _ in range(40):
+            a, b = rng.integers(-length, length + 1), rng.integers(-width, width + 1)
+            k = rng.integers(0, rows["around"].shape[1])
+            x, y = (rx[0] + b, rx[1] + a) if shape[1] > shape[0] else (rx[0] + a, rx[1] + b)
+            inside = 0 <= x < shape[0] and 0 <= y < shape[1]
+            stands = inside and (grid[n, x, y, k * layer : (k + 1) * layer] > 0).any()
+            assert rows["around"][n, k, length + a, width + b] == stands
+    challenge = BeamNetwork({"lidar_grid": (20, 200, 10)}, (64, 8), small=True)
+    assert sum(weights.numel() for weights in challenge.parameters()) <= 10_000

@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 try:
     import torch
     from torch import nn
-    from torch.nn.functional import avg_pool2d, max_pool2d
+    from torch.nn.functional import avg_pool2d, pad
 except ImportError:  # `supervised.train_classifier` says what is missing, before this module is needed
     nn = None
 
@@ -43,8 +43,11 @@ WAVES = {"position": 16, "last_beam": 16, "aod": 32, "aoa": 32, "departure": 32}
 """Sines and cosines of a part, as of an encoding (`caviar_clients.learning.experiment.Encoding`)."""
 PICTURE = (36, 64)
 """Rows and columns that pictures are reduced to, or a few more, by means of whole pixels."""
-LINE = 24
-"""Points of the straight line from TX to RX at which a LIDAR grid is looked at."""
+LINE, STEPS = 24, 32
+"""Points of the straight line from RX to TX at which a LIDAR grid is looked at: by shares of the distance,
+and cell by cell from RX on."""
+AROUND = (16, 6)
+"""Cells to each side of RX that are looked at, along the longer and the shorter axis of the ground."""
 MARKED = {"tx": -1, "rx": -2}
 """Cells of a LIDAR grid that have the devices."""
 
@@ -108,7 +111,7 @@ class BeamNetwork(BeamModel):
         self.encoders = nn.ModuleDict()
         width = 0
         for name, shape in shapes.items():
-            encoder = _encoder(name, shape, small)
+            encoder = _encoder(name, shape, small, "position" in shapes)
             self.encoders[_key(name)] = encoder
             width += encoder.width
         sizes = [width, *((24,) if small else units)]
@@ -142,12 +145,12 @@ def _of(rows: Tensors, part: str) -> dict[str, Any]:
     return {name[len(part) + 1 :]: value for name, value in rows.items() if name.startswith(f"{part}/")}
 
 
-def _encoder(name: str, shape: tuple[int, ...], small: bool) -> Any:
+def _encoder(name: str, shape: tuple[int, ...], small: bool, placed: bool) -> Any:
     kind = name.partition(":")[0]
     if len(shape) == 1:
         return _Numbers(shape[0], WAVES.get(kind, 0))
     if kind == "lidar_grid" and len(shape) == 3:
-        return _Grid(shape, small)
+        return _Grid(shape, small, placed)
     if len(shape) == 2 or (len(shape) == 3 and shape[2] == 3):
         return _Picture(shape)
     raise ScenarioError(
@@ -197,50 +200,65 @@ class _Numbers(_Module):  # type: ignore[misc]
 
 
 class _Grid(_Module):  # type: ignore[misc]
-    """A LIDAR grid: where TX and RX are in it, what stands on the straight line between them, and what
-    stands anywhere, by convolutions over x and y with layers of height as channels."""
+    """A LIDAR grid: what stands on the straight line between TX and RX, what stands around RX, by
+    convolutions with layers of height as channels, and unless that is known better, where RX is and its
+    direction from TX."""
 
-    def __init__(self, shape: tuple[int, ...], small: bool) -> None:
+    def __init__(self, shape: tuple[int, ...], small: bool, placed: bool) -> None:
         super().__init__()
-        self._shape = shape
+        self._shape, self._placed = shape, placed
         # The longer axis of the ground first, whichever of x and y it is.
         self._swap = shape[1] > shape[0]
-        ground = (shape[1], shape[0]) if self._swap else shape[:2]
-        most = (100, 20, 5)
-        self._pool = tuple(max(1, size // top) for size, top in zip((*ground, shape[2]), most, strict=True))
-        layers = -(-shape[2] // self._pool[2])
-        first, second, units = (4, 8, 16) if small else (8, 16, 64)
-        self.cells = nn.Sequential(
-            nn.Conv2d(layers, first, (5, 3), (4, 2), (2, 1)), nn.ReLU(),
-            nn.Conv2d(first, second, 3, 2, 1), nn.ReLU(),
-            nn.Conv2d(second, second, 3, 2, 1), nn.ReLU(), nn.Flatten(),
+        self._half = (AROUND[1], AROUND[0]) if self._swap else AROUND
+        self._layer = max(1, shape[2] // 5)
+        layers = -(-shape[2] // self._layer)
+        first, second, units = (4, 4, 12) if small else (8, 16, 48)
+        self.around = nn.Sequential(
+            nn.Conv2d(layers, first, 3, 2, 1), nn.ReLU(),
+            nn.Conv2d(first, second, 3, 2, 1), nn.ReLU(), nn.Flatten(),
         )  # fmt: skip
         with torch.no_grad():
             blank = self.reduce(torch.zeros((1, *shape), dtype=torch.int8))
-            flat = self.cells(blank["cells"].float()).shape[1]
-        self.dense = nn.Sequential(nn.Linear(flat, units), nn.ReLU())
-        self.at = _Numbers(3, 8 if small else 32)
-        self.width = units + self.at.width + LINE + 1
+            flat = self.around(blank["around"].float()).shape[1]
+        self.dense = nn.Sequential(nn.Linear(flat, units), nn.ReLU(), nn.Dropout(0.0 if small else 0.3))
+        self.rx, self.direction = _Numbers(3, 4 if small else 16), _Numbers(3, 10 if small else 32)
+        self.width = units + blank["line"].shape[1]
+        if not placed:
+            self.width += self.rx.width + self.direction.width
 
     def reduce(self, rows: Any) -> dict[str, Any]:
         _, y, z = self._shape
         flat = rows.flatten(1)
-        ends = {name: self._cell(flat == value) for name, value in MARKED.items()}
-        # Points of the line, each the nearest cell; the ends themselves are left out.
-        share = (torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1))[None, :, None]
-        point = torch.round(ends["tx"][:, None] + (ends["rx"] - ends["tx"])[:, None] * share).long()
-        index = (point[..., 0] * y + point[..., 1]) * z + point[..., 2]
+        tx, rx = (self._cell(flat == value) for value in (MARKED["tx"], MARKED["rx"]))
         has_tx = (flat == MARKED["tx"]).any(1, keepdim=True).float()
-        line = (torch.gather(flat, 1, index) > 0).float() * has_tx
-        kx, ky, kz = self._pool
-        heights = [(rows[..., low : low + kz] > 0).float().amax(dim=-1) for low in range(0, z, kz)]
-        layers = torch.stack(heights, dim=1)
-        cells = max_pool2d(layers.transpose(2, 3) if self._swap else layers, (kx, ky), ceil_mode=True)
+        away = rx - tx
+        # Cells from RX to TX, by shares of the distance and one by one; those beyond TX count for nothing.
+        length = away.abs().amax(dim=1, keepdim=True).clamp(min=1)
+        shares = torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1)
+        steps = torch.arange(1, STEPS + 1, device=rows.device) / length
+        back = torch.cat([shares.expand(len(rows), LINE), steps], dim=1)
+        point = torch.round(rx[:, None] - away[:, None] * back.clamp(max=1)[:, :, None]).long()
+        index = (point[..., 0] * y + point[..., 1]) * z + point[..., 2]
+        line = (torch.gather(flat, 1, index) > 0).float() * has_tx * (back < 1).float()
         return {
-            "cells": cells.to(torch.uint8),
-            "rx": ends["rx"],
+            "rx": rx,
+            "direction": away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=1),
             "line": torch.cat([line, has_tx], dim=1),
+            "around": self._around((rows > 0).to(torch.uint8), rx.long()),
         }
+
+    def _around(self, occupied: Any, rx: Any) -> Any:
+        """Cells around RX, the greatest of each layer, Shape ``[N, layers, …]``."""
+        (a, b), (_, y, z) = self._half, self._shape
+        padded = pad(occupied, (0, 0, b, b, a, a)).flatten(1)
+        wide = y + 2 * b
+        i, j, k = (torch.arange(n, device=occupied.device) for n in (2 * a + 1, 2 * b + 1, z))
+        offset = (i[:, None, None] * wide + j[:, None]) * z + k
+        index = (rx[:, :1] * wide + rx[:, 1:2]) * z + offset.flatten()
+        cells = torch.gather(padded, 1, index).reshape(-1, len(i), len(j), z)
+        heights = [cells[..., low : low + self._layer].amax(dim=-1) for low in range(0, z, self._layer)]
+        found = torch.stack(heights, dim=1)
+        return found.transpose(2, 3) if self._swap else found
 
     def _cell(self, is_here: Any) -> Any:
         """Index of the first cell that is marked, along each axis, Shape ``[N, 3]``."""
@@ -251,11 +269,14 @@ class _Grid(_Module):  # type: ignore[misc]
         return torch.stack([x, row - x * y, at - row * z], dim=1).float()
 
     def fit(self, rows: Tensors) -> None:
-        self.at.fit({"numbers": rows["rx"]})
+        self.rx.fit({"numbers": rows["rx"]})
+        self.direction.fit({"numbers": rows["direction"]})
 
     def forward(self, rows: Tensors) -> Any:
-        dense = self.dense(self.cells(rows["cells"].float()))
-        return torch.cat([dense, self.at({"numbers": rows["rx"]}), rows["line"]], dim=1)
+        parts = [self.dense(self.around(rows["around"].float())), rows["line"]]
+        if not self._placed:
+            parts += [self.rx({"numbers": rows["rx"]}), self.direction({"numbers": rows["direction"]})]
+        return torch.cat(parts, dim=1)
 
 
 class _Picture(_Module):  # type: ignore[misc]
