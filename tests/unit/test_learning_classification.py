@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,14 @@ from caviar_clients.cli.main import app
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
-from caviar_clients.learning.networks import AROUND, LINE, OBSERVED, STEPS, BeamNetwork
+from caviar_clients.learning.networks import AROUND, LINE, OBSERVED, STEPS, BeamModel, BeamNetwork
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
-from caviar_clients.learning.samples import read_samples
+from caviar_clients.learning.samples import Samples, read_samples
 from caviar_clients.learning.supervised import Rows, export_classifier, make_model, train_classifier
 from caviar_clients.learning.training import POLICY, Progress, seed_folder
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ScenarioError, SetupError
+from caviar_protocol.topics import AntennaArray
 from caviar_services.agent.policy import PolicyModel
 
 pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
@@ -175,6 +176,26 @@ def test_what_cannot_be_trained_is_refused(
     assert all(word in str(caught.value) for word in words), caught.value
 
 
+def test_a_network_that_mixes_users_is_not_exported(data: Path, tmp_path: Path) -> None:
+    samples = read_samples(Dataset(data), ("departure",))
+    made = experiment(data, 'model = { name = "position", observe = ["departure"] }')
+
+    class Mixed(BeamModel):
+        def forward(self, rows: Any) -> Any:
+            z = rows["departure"].flip(0)[:, 1:2] * 16 + 16  # of another user
+            return -((torch.arange(TX * RX) - z) ** 2)
+
+    class Constant(BeamModel):
+        def forward(self, rows: Any) -> Any:
+            of_each = rows["departure"].sum(1, keepdim=True).expand(len(rows["departure"]), 1)
+            return of_each + torch.zeros(TX * RX)
+
+    for model, words in ((Mixed(), "by itself"), (Constant(), "x.shape[0]")):
+        with pytest.raises(SetupError) as caught:
+            export_classifier(made, model, samples, tmp_path / "mixed.onnx", 1, 1, {})
+        assert words in str(caught.value)
+
+
 def test_a_network_of_the_users_own_is_trained_from_a_file(data: Path, tmp_path: Path) -> None:
     (tmp_path / "my_network.py").write_text(
         "import torch\n"
@@ -232,7 +253,9 @@ def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_p
 
 
 @pytest.mark.parametrize("shape", [(40, 12, 6), (12, 40, 10)])
-def test_a_grid_tells_what_stands_on_the_line_and_around(shape: tuple[int, int, int]) -> None:
+def test_a_grid_tells_what_stands_on_the_line_and_around(
+    data: Path, tmp_path: Path, shape: tuple[int, int, int]
+) -> None:
     """Held against loops over cells; halves are rounded either way, so that a few points may differ."""
     rng = np.random.default_rng(3)
     grid = (rng.random((5, *shape)) < 0.05).astype(np.int8)
@@ -260,5 +283,20 @@ def test_a_grid_tells_what_stands_on_the_line_and_around(shape: tuple[int, int, 
             inside = 0 <= x < shape[0] and 0 <= y < shape[1]
             stands = inside and (grid[n, x, y, k * layer : (k + 1) * layer] > 0).any()
             assert rows["around"][n, k, length + a, width + b] == stands
+    model.eval()
+    given = ("arrays", "places", "observed", "row_shapes")
+    scene = Samples(
+        arrays=(AntennaArray(columns=8), AntennaArray(columns=4)),
+        places=5,
+        observed={"lidar_grid": grid[None]},
+        row_shapes={"lidar_grid": shape},
+        **{field.name: np.zeros(5) for field in fields(Samples) if field.name not in given},
+    )
+    made = experiment(data, 'model = { name = "lidar" }')
+    export_classifier(made, model, scene, tmp_path / "grid.onnx", 1, 1, {})
+    with torch.no_grad():
+        scores = model(reduced).numpy()
+    ranked = PolicyModel(tmp_path / "grid.onnx").ranked({"lidar_grid": grid})
+    np.testing.assert_array_equal(ranked[:, 0], scores.argmax(1))
     challenge = BeamNetwork({"lidar_grid": (20, 200, 10)}, (64, 8), small=True)
     assert sum(weights.numel() for weights in challenge.parameters()) <= 10_000

@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 try:
     import torch
     from torch import nn
-    from torch.nn.functional import avg_pool2d, pad
+    from torch.nn.functional import avg_pool2d
 except ImportError:  # `supervised.train_classifier` says what is missing, before this module is needed
     nn = None
 
@@ -229,14 +229,17 @@ class _Grid(_Module):  # type: ignore[misc]
     def reduce(self, rows: Any) -> dict[str, Any]:
         _, y, z = self._shape
         flat = rows.flatten(1)
-        tx, rx = (self._cell(flat == value) for value in (MARKED["tx"], MARKED["rx"]))
-        has_tx = (flat == MARKED["tx"]).any(1, keepdim=True).float()
+        # RX is the least value of a grid and TX the next: a search for bytes, of 40,000 for each user.
+        rx_at = flat.argmin(dim=1, keepdim=True)
+        tx_at = torch.where(flat == MARKED["rx"], torch.zeros_like(flat), flat).argmin(dim=1, keepdim=True)
+        has_tx = (torch.gather(flat, 1, tx_at) == MARKED["tx"]).float()
+        tx, rx = self._cell(tx_at), self._cell(rx_at)
         away = rx - tx
         # Cells from RX to TX, by shares of the distance and one by one; those beyond TX count for nothing.
         length = away.abs().amax(dim=1, keepdim=True).clamp(min=1)
         shares = torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1)
         steps = torch.arange(1, STEPS + 1, device=rows.device) / length
-        back = torch.cat([shares.expand(len(rows), LINE), steps], dim=1)
+        back = torch.cat([shares + torch.zeros_like(length), steps], dim=1)
         point = torch.round(rx[:, None] - away[:, None] * back.clamp(max=1)[:, :, None]).long()
         index = (point[..., 0] * y + point[..., 1]) * z + point[..., 2]
         line = (torch.gather(flat, 1, index) > 0).float() * has_tx * (back < 1).float()
@@ -244,29 +247,29 @@ class _Grid(_Module):  # type: ignore[misc]
             "rx": rx,
             "direction": away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=1),
             "line": torch.cat([line, has_tx], dim=1),
-            "around": self._around((rows > 0).to(torch.uint8), rx.long()),
+            "around": self._around(flat, rx.long()),
         }
 
-    def _around(self, occupied: Any, rx: Any) -> Any:
-        """Cells around RX, the greatest of each layer, Shape ``[N, layers, …]``."""
-        (a, b), (_, y, z) = self._half, self._shape
-        padded = pad(occupied, (0, 0, b, b, a, a)).flatten(1)
-        wide = y + 2 * b
-        i, j, k = (torch.arange(n, device=occupied.device) for n in (2 * a + 1, 2 * b + 1, z))
-        offset = (i[:, None, None] * wide + j[:, None]) * z + k
-        index = (rx[:, :1] * wide + rx[:, 1:2]) * z + offset.flatten()
-        cells = torch.gather(padded, 1, index).reshape(-1, len(i), len(j), z)
+    def _around(self, flat: Any, rx: Any) -> Any:
+        """Whether cells around RX are occupied, the greatest of each layer, Shape ``[N, layers, …]``."""
+        (a, b), (x, y, z) = self._half, self._shape
+        i = rx[:, :1] + torch.arange(-a, a + 1, device=flat.device)
+        j = rx[:, 1:2] + torch.arange(-b, b + 1, device=flat.device)
+        inside = ((i >= 0) & (i < x))[:, :, None] & ((j >= 0) & (j < y))[:, None]
+        ground = i.clamp(0, x - 1)[:, :, None] * y + j.clamp(0, y - 1)[:, None]
+        index = ground[..., None] * z + torch.arange(z, device=flat.device)
+        cells = torch.gather(flat, 1, index.flatten(1)).reshape(-1, 2 * a + 1, 2 * b + 1, z)
+        cells = ((cells > 0) & inside[..., None]).to(torch.uint8)
         heights = [cells[..., low : low + self._layer].amax(dim=-1) for low in range(0, z, self._layer)]
         found = torch.stack(heights, dim=1)
         return found.transpose(2, 3) if self._swap else found
 
-    def _cell(self, is_here: Any) -> Any:
-        """Index of the first cell that is marked, along each axis, Shape ``[N, 3]``."""
+    def _cell(self, at: Any) -> Any:
+        """Index of a cell along each axis, Shape ``[N, 3]``, of that in all, Shape ``[N, 1]``."""
         _, y, z = self._shape
-        at = is_here.to(torch.float32).argmax(dim=1)
         row = torch.div(at, z, rounding_mode="floor")
         x = torch.div(row, y, rounding_mode="floor")
-        return torch.stack([x, row - x * y, at - row * z], dim=1).float()
+        return torch.cat([x, row - x * y, at - row * z], dim=1).float()
 
     def fit(self, rows: Tensors) -> None:
         self.rx.fit({"numbers": rows["rx"]})
