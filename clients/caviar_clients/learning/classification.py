@@ -97,7 +97,7 @@ class LabelSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     order: Literal["tx-rx", "rx-tx"] = "tx-rx"
     """Index of a pair in the network: ``tx_beam·Nr + rx_beam``, or ``rx_beam·Nt + tx_beam`` as in the
     training data of the ITU challenge. An exported policy always has the first."""
-    target: Literal["best", "amplitude", "power"] = "amplitude"
+    target: Literal["best", "amplitude", "power"] = "power"
     """``best``: the best pair alone. ``amplitude``: a distribution in proportion to |y| of the pairs that are
     within ``within_db`` of the best, as in the ITU challenge; ``power``: to |y|²."""
     within_db: Positive = 6.0
@@ -123,7 +123,7 @@ class TrainingSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     learning_rate: Rate = 3e-3
     final_learning_rate: Rate = 1e-4
     """Reached after ``epochs``, in proportion to these."""
-    weight_decay: Annotated[float, quantity("1", "of the weights", ge=0, le=10)] = 1e-3
+    weight_decay: Annotated[float, quantity("1", "of the weights", ge=0, le=10)] = 0.1
     patience: Count = 15
     """Epochs without a lower loss of validation after which training stops; the weights of the lowest
     stay."""

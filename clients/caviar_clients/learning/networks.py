@@ -103,7 +103,7 @@ class BeamNetwork(BeamModel):
         shapes: Shapes,
         beams: Sequence[int],
         units: Sequence[int] = (256, 256),
-        dropout: float = 0.3,
+        dropout: float = 0.5,
         small: bool = False,
     ) -> None:
         super().__init__()

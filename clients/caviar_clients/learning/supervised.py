@@ -497,11 +497,14 @@ def _check_any_size(file: Path, samples: Samples) -> None:
                 if shape is not None:
                     row = scene[name].reshape(samples.places, *shape)[place]
                     alone[name] = row if len(shape) == 1 else row[None]
-            otherwise += int(model.ranked(alone)[0, 0] != together[place])
+            (first, *_), *others = model.ranked(alone).tolist()
+            if others:
+                raise ValueError(f"{1 + len(others)} rankings for one user")  # noqa: TRY301 - one remedy
+            otherwise += int(first != together[place])
     except Exception as error:  # of ONNX Runtime, whose exceptions have no common base
         reason = str(error).partition("\n")[0]
         raise SetupError(
-            f"the exported policy cannot be run for {samples.places} users ({reason}); in the network write "
+            f"the exported policy is of a number of users ({reason}); in the network write "
             "x.shape[0], and not len(x), which PyTorch's exporter takes for a constant"
         ) from error
     if otherwise > 1:  # one may be a tie
