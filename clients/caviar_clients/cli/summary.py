@@ -52,9 +52,9 @@ _EVER: Mapping[str, str] = {
     "computes is wrong there",
     "persons-put-elsewhere": "{source} shows people elsewhere at once {times}: SUMO put them farther away "
     "than they walk; see its option --pedestrian.model",
-    "snr-above-60-db": "{source}: SNR above 60 dB in {frames}, first in {first}, where beams hardly matter; see "
-    "power_dbm of the transmitters, bandwidth_hz of the carriers, services.{source}.settings.noise_figure_db "
-    "and the channel's normalization",
+    "snr-above-60-db": "{source}: SNR above 60 dB in {frames}, first in {first}, where beams hardly matter; "
+    "see power_dbm of the transmitters, bandwidth_hz of the carriers, "
+    "services.{source}.settings.noise_figure_db and the channel's normalization",
     LEFT_GEOFENCE_PREFIX: "{rest!r} of {source} left its geofence {times}, first in {first}",
     OUTSIDE_GEOFENCE_PREFIX: "{rest!r} of {source} was commanded to places outside of its geofence in "
     "{frames}, first in {first}, and kept within",
