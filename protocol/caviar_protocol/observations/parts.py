@@ -102,6 +102,8 @@ class Part(ABC):
     """What it needs beside the scene and the link of the frame before."""
     needs_sensor: ClassVar[str] = ""
     """Kind of the device that it is of; empty: none."""
+    per_user: bool = False
+    """Whether axis 0 of its values holds the places one after the other; else all users share them."""
 
     def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         self.users, self.sensor = users, sensor
@@ -123,6 +125,7 @@ class Part(ABC):
 class _PerUser(Part):
     """Numbers for each place; zeros for an empty one."""
 
+    per_user = True
     width: ClassVar[int] = 1
     bound: ClassVar[float] = FAR
 
@@ -208,6 +211,7 @@ class Velocity(_PerUser):
 class OfLink(Part):
     """A number for each place out of the link of the frame before; 0 in frame 0 and for an empty place."""
 
+    per_user = True
     low: ClassVar[float] = 0.0
     high: ClassVar[float] = FAR
     _known: tuple[Any, Any, Any] | None = None  # what `_taken` was found for
@@ -354,8 +358,8 @@ class _OfSensor(Part):
     def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         super().__init__(scenario, users, sensor)
         spec = next(d for d in scenario.devices if d.name == sensor)
-        self._is_per_user = spec.count > 1
-        if self._is_per_user and not users.on_objects_of(spec):
+        self.per_user = spec.count > 1
+        if self.per_user and not users.on_objects_of(spec):
             raise ScenarioError(
                 f"{spec.kind} {sensor!r} is on up to {spec.count} objects {spec.on!r}, of which none carries "
                 f"a receiver that is served: {', '.join(users.receivers)}; observe one that is on one object"
@@ -365,7 +369,7 @@ class _OfSensor(Part):
     @property
     def bounds(self) -> Bounds:
         shape = self._one.shape
-        return self._one._replace(shape=(len(self.users), *shape)) if self._is_per_user else self._one
+        return self._one._replace(shape=(len(self.users), *shape)) if self.per_user else self._one
 
     def read(self, moment: Moment) -> NDArray[Any] | None:
         seen = {name: value for name, value in self._seen(moment) if spec_name(name) == self.sensor}
@@ -375,7 +379,7 @@ class _OfSensor(Part):
                     f"{name} shows {list(value.shape)}, and the policy observes {list(self._one.shape)}; use "
                     "the grid, or the size of the picture, that it was trained with"
                 )
-        if not self._is_per_user:
+        if not self.per_user:
             return next(iter(seen.values()), None)
         found = np.zeros(self.bounds.shape, self._one.dtype)
         for place, pair in moment.users:

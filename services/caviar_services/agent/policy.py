@@ -37,8 +37,22 @@ CARD_KEY = "caviar.card"
 """Key of the card in the metadata of an ONNX file."""
 ACTION = "action"
 """Name of the output with the action."""
+SCORES = "scores"
+"""Name of the output of a policy that ranks pairs of beams: a score for each pair of each place, float32,
+Shape ``[1, U, Nt·Nr]`` by the index of the pair."""
 MAX_REASON = 500
 """Characters of the reason for which a policy is refused: it travels in the header of a DONE."""
+
+
+class TrainedOn(msgspec.Struct, frozen=True, kw_only=True):
+    """Dataset, and episodes of it, that a policy was trained on."""
+
+    dataset: str
+    """Name of its folder."""
+    fingerprint: str
+    """Digest of its settings (`caviar_clients.datasets.settings.fingerprint`)."""
+    episodes: tuple[tuple[int, int], ...]
+    """First and last number of each range of episodes, those of validation too."""
 
 
 class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,6 +68,9 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Parts of the observation, as in `caviar_protocol.observations.PARTS`."""
     codebooks: tuple[tuple[int, int], ...]
     """Beams of the transmitter and of the receiver, of each place."""
+    per_user: bool = False
+    """Whether each user is decided for by itself: ``codebooks`` has one entry, which holds for all places,
+    and the model takes any number of them."""
     transmitters: tuple[str, ...] = ("*",)
     """Those that it chooses for, as names with ``*`` and ``?``."""
     environment: str = ""
@@ -66,6 +83,8 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Of training."""
     figures: Mapping[str, float] = {}
     """What was measured of it, by name."""
+    trained_on: TrainedOn | None = None
+    """Of a policy that was trained on a dataset."""
     versions: Mapping[str, str] = {}
     """Of the packages that it was trained with."""
 
@@ -153,6 +172,20 @@ class PolicyModel:
         rows = {name: observation[name][None] for name in self.inputs}
         (found,) = self._session.run([ACTION], rows)
         return np.asarray(found).reshape(-1)
+
+    def ranked(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """Rank the pairs of beams of each place; the model has the output `SCORES`.
+
+        Args:
+            observation: Parts by name, without the axis of the batch.
+
+        Returns:
+            Indices of pairs, best first, Shape ``[U, Nt·Nr]``; of equal ones that of lower index is first.
+        """
+        rows = {name: observation[name][None] for name in self.inputs}
+        (scores,) = self._session.run([SCORES], rows)
+        order: NDArray[np.int64] = np.argsort(-np.asarray(scores)[0], axis=1, kind="stable")
+        return order
 
 
 class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -267,7 +300,8 @@ class PolicyAgent(Agent[PolicySettings]):
         transmitters = card.transmitters if card else ("*",)
         places = Users(known, self.settings.users, self.settings.except_users, transmitters)
         sizes = tuple(place.beams for place in places.places)
-        if card is not None and card.codebooks != sizes:
+        trained = card.codebooks if card else ()
+        if card is not None and (set(trained) != set(sizes) if card.per_user else trained != sizes):
             raise ScenarioError(
                 f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
