@@ -147,7 +147,7 @@ def main() -> None:
             (
                 name,
                 *(f"{value:.2f}" for value in last),
-                f"{min(by_seed):.3f}–{max(by_seed):.3f}",
+                f"{min(ratios):.3f}–{max(ratios):.3f}",
                 f"{worst:.3f}",
             )
         )
