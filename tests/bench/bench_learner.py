@@ -129,7 +129,8 @@ def main() -> None:
             runs.append(rates_of(scenario, Path(folder) / str(seed)))
     users = min(rates.shape[2] for rates, _, _ in runs)
     rates = np.stack([one[:, :, :users] for one, _, _ in runs], axis=1)
-    has_path, los = (np.stack([one[which][:, :users] for one in runs]) for which in (1, 2))
+    has_path = np.stack([one[:, :users] for _, one, _ in runs])
+    los = np.stack([one[:, :users] for _, _, one in runs])
     curves, rows = {}, []
     for name, chosen in (("in sight", has_path & los), ("out of sight", has_path & ~los)):
         if not chosen.any():
@@ -137,10 +138,10 @@ def main() -> None:
         curves[name] = curve = windows(rates, chosen)
         late = last_quarter(chosen)
         last = rates[:, late].mean(axis=-1)
-        by_seed = [
-            rates[0, s][late[s]].mean() / rates[1, s][late[s]].mean()
-            for s in range(len(runs))
-            if late[s].any()
+        ratios = [
+            of_seed[0, own].mean() / of_seed[1, own].mean()
+            for of_seed, own in zip(np.moveaxis(rates, 1, 0), late, strict=True)
+            if own.any()
         ]
         worst = np.nanmin(curve[0] / curve[1])
         rows.append(
