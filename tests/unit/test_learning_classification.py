@@ -5,69 +5,30 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dataset_builders import RX, SCENES, TX, generated, written_scenario
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
-from caviar_clients.datasets.catalogue import Catalogue
-from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
-from caviar_clients.datasets.episode import EpisodeTask, play_episode
-from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
 from caviar_clients.learning.samples import read_samples
-from caviar_clients.learning.supervised import train_classifier
+from caviar_clients.learning.supervised import Rows, export_classifier, make_model, train_classifier
 from caviar_clients.learning.training import POLICY, Progress, seed_folder
 from caviar_protocol.errors import ScenarioError
-from caviar_protocol.scenario import find_scenario, load_scenario
 from caviar_services.agent.policy import PolicyModel
 
 pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
 torch = pytest.importorskip("torch", reason="needs the extra `learning`")
 pytestmark = pytest.mark.slow
-
-SCENES, TX, RX = 20, 16, 2
-
-
-def written_scenario(folder: Path, agent: str = 'use = "los-beam"') -> Path:
-    """Two UAVs under a statistical channel, both ends with several beams."""
-    text = find_scenario("geometric").read_text()
-    uav = text[text.index("[[services.world.settings.objects]]") : text.index("[services.channel]")]
-    second = uav.replace('"uav"', '"uav2"', 1).replace("60.0, -25.0", "45.0, 30.0")
-    for old, new in (
-        (uav, uav + second),
-        ("frames = 500", f"frames = {SCENES}"),
-        ("columns = 64", f"columns = {TX}"),
-        ('on = "uav"', f'on = "uav*"\ncount = 2\narray = {{ columns = {RX} }}'),
-        ('use = "los-beam"', agent),
-        ("sampling_period_ns = 100_000_000", "sampling_period_ns = 2_000_000_000"),
-    ):
-        assert old in text, old
-        text = text.replace(old, new, 1)
-    file = folder / "uavs.toml"
-    file.write_text(text)
-    return file
-
-
-def generated(scenario: Path, out: Path, episodes: int) -> Path:
-    plan = plan_dataset(load_scenario(scenario), episodes=episodes, scenes=SCENES)
-    directory = DatasetDirectory(out)
-    with writing_dataset(directory):
-        catalogue = Catalogue(directory.catalogue, writable=True)
-        catalogue.plan(plan.settings(), episodes)
-        for number in range(episodes):
-            result = play_episode(EpisodeTask(plan.scenario, number, str(out)))
-            assert result.rows is not None, result.error
-            catalogue.add(result.rows, result.measured)
-        catalogue.close()
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -243,6 +204,30 @@ def test_a_network_of_the_users_own_is_trained_from_a_file(data: Path, tmp_path:
     judged = CliRunner().invoke(app, ["policy", "evaluate", str(tmp_path / "training"), "--on", str(data)])
     assert judged.exit_code != 0
     assert "test = " in str(judged.exception or judged.output)
+
+
+def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_path: Path) -> None:
+    """Of one carrier the spectrum tells the best pair; the picture is one for all places of a scene."""
+    dataset = Dataset(data)
+    samples = read_samples(dataset, ("spectrum", "position"))
+    spectrum = samples.rows("spectrum", np.arange(len(samples)))
+    np.testing.assert_array_equal(spectrum.argmax(1), samples.best)
+    pictures = np.random.default_rng(2).integers(0, 256, (len(samples.episode), 90, 130, 3), dtype=np.uint8)
+    seen = replace(
+        samples,
+        observed={"camera": pictures, "position": samples.observed["position"]},
+        row_shapes={"camera": None, "position": (3,)},
+    )
+    made = experiment(data, 'model = { name = "image" }')
+    model = make_model(made, seen)
+    rows = Rows.read(model, seen, np.arange(len(seen)), made)
+    model.fit(rows.reduced)
+    export_classifier(made, model.eval(), seen, tmp_path / "image.onnx", 1, 1, {})
+    order = ranked_by_policy(PolicyModel(tmp_path / "image.onnx"), seen, "policy").order
+    given, _ = rows.batch(torch.arange(len(seen)), "cpu")
+    with torch.no_grad():
+        wanted = model(given).argmax(1).numpy()
+    assert np.mean(order[:, 0] == wanted) > 0.95  # pictures of training are rounded to 16 bits
 
 
 def test_a_grid_tells_where_receiver_and_obstacles_are() -> None:
