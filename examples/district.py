@@ -1,0 +1,516 @@
+"""A district of three by three blocks for data sets: scenery, road network, traffic, and scenarios that use them.
+
+    python examples/district.py --out FOLDER --seed 1 [--name district]
+
+Writes ``NAME.toml``, ten vehicles with receivers and LIDARs, ``NAME-fixed.toml``, ten receivers that stand, and
+the folder ``NAME``; equal seeds give equal files. ``netconvert`` of the extra ``world`` makes the network. The
+shipped scenarios `district` and `district-b` are seeds 1 and 2.
+"""
+
+import argparse
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from caviar_space.imported_scenes import ImportedScene, Piece, wall_material, write_scene
+from caviar_space.meshes import SHAPES, Mesh
+
+LANE_M, AVENUE_LANES, SIDEWALK_M, KERB_M = 3.2, 2, 3.0, 2.6
+"""Widths; the kerb is where vehicles stand, between lanes and sidewalk."""
+AVENUE_M = LANE_M * AVENUE_LANES + KERB_M + SIDEWALK_M
+"""From the middle of the avenue to its façades."""
+STREET_M = LANE_M + SIDEWALK_M
+"""The same of a side street, on whose eastern or northern side vehicles stand, too."""
+END_M = 32.0
+"""Roads go on so far beyond the blocks."""
+MATERIALS = {"brick": 0.4, "concrete": 0.3, "glass": 0.2, "metal": 0.1}
+CELLS = (20, 200, 10)
+"""Of the LIDAR's grid, as in the paper's s008."""
+
+Point = tuple[float, float]
+
+
+class Shapes:
+    """Triangles by name of the piece."""
+
+    def __init__(self) -> None:
+        self.kinds: dict[str, tuple[str, str]] = {}
+        self._parts: dict[str, list[Mesh]] = {}
+
+    def add(self, name: str, material: str, mesh: Mesh, kind: str = "building") -> None:
+        self.kinds[name] = material, kind
+        self._parts.setdefault(name, []).append(mesh)
+
+    def pieces(self, file: str) -> dict[str, Piece]:
+        made = {}
+        for name, parts in sorted(self._parts.items()):
+            begins = np.cumsum([0, *(len(part.vertices) for part in parts)])
+            faces = np.concatenate([p.faces + b for p, b in zip(parts, begins, strict=False)])
+            mesh = Mesh(np.concatenate([part.vertices for part in parts]), faces.astype(np.int32))
+            made[name] = Piece(mesh, self.kinds[name][0], self.kinds[name][1], file, 1)
+        return made
+
+
+def soup(triangles: list) -> Mesh:
+    """A mesh of triangles whose common corners are one vertex."""
+    corners = np.round(np.array(triangles, float).reshape(-1, 3), 3)
+    vertices, faces = np.unique(corners, axis=0, return_inverse=True)
+    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32))
+
+
+def building(origin: Point, along: Point, bays: list, depth: float, height: float) -> Mesh:
+    """Walls and roof of a building.
+
+    Args:
+        origin: Left end of the façade line, seen from the street [m].
+        along: Unit vector to its right end.
+        bays: Start, end and depth in front of the façade line of each part of the façade [m].
+        depth: Behind the façade line [m].
+        height: [m]
+    """
+    ax, ay = along
+    ox, oy = ay, -ax  # out of the façade
+
+    def at(s: float, t: float, z: float) -> tuple[float, float, float]:
+        return origin[0] + s * ax + t * ox, origin[1] + s * ay + t * oy, z
+
+    triangles = []
+
+    def wall(a: Point, b: Point) -> None:
+        if a != b:
+            low, high, top, other = at(*a, 0.0), at(*b, 0.0), at(*b, height), at(*a, height)
+            triangles.extend([(low, high, top), (low, top, other)])
+
+    for k, (start, end, front) in enumerate(bays):
+        wall((start, front), (end, front))
+        wall((end, -depth), (start, -depth))
+        before = bays[k - 1][2] if k else -depth
+        after = bays[k + 1][2] if k + 1 < len(bays) else -depth
+        # A step of the façade belongs to the part before it.
+        if not k:
+            wall((start, -depth), (start, front))
+        wall((end, front), (end, after))
+        outline = [(start, -depth), (start, front), (end, front), (end, -depth)]
+        if -depth < after < front:
+            outline.insert(3, (end, after))
+        if -depth < before < front:
+            outline.insert(1, (start, before))
+        middle = at((start + end) / 2, (front - depth) / 2, height)
+        for a, b in zip(outline, [*outline[1:], outline[0]], strict=True):
+            triangles.append((middle, at(*a, height), at(*b, height)))
+    return soup(triangles)
+
+
+def facade(rng: np.random.Generator, length: float, deepest: float) -> list:
+    """Parts of a façade of 3 to 9 m, each so far before its line or behind that they differ."""
+    count = max(1, round(length / rng.uniform(4.5, 8.0)))
+    cuts = np.round(np.linspace(0, length, count + 1), 2)
+    fronts = np.round(rng.uniform(-deepest, 0.0, count), 2)
+    return [(float(a), float(b), float(f)) for a, b, f in zip(cuts, cuts[1:], fronts, strict=False)]
+
+
+def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high: Point, tall: Point) -> None:
+    """Buildings around a courtyard.
+
+    Args:
+        shapes: To which they are added.
+        rng: Of sizes, heights and materials.
+        name: Of the block.
+        low, high: Its corners [m].
+        tall: Least and greatest height [m].
+    """
+    (x0, y0), (x1, y1) = low, high
+    deep = rng.uniform(11.0, 14.0)
+    sides = [
+        ((x0, y1), (0.0, -1.0), y1 - y0), ((x1, y0), (0.0, 1.0), y1 - y0),
+        ((x0 + deep + 1, y0), (1.0, 0.0), x1 - x0 - 2 * deep - 2),
+        ((x1 - deep - 1, y1), (-1.0, 0.0), x1 - x0 - 2 * deep - 2),
+    ]  # fmt: skip
+    for origin, along, length in sides:
+        ends = np.linspace(0, length, max(1, round(length / rng.uniform(18.0, 28.0))) + 1)
+        for start, end in zip(ends, ends[1:], strict=False):
+            gap = float(rng.choice([0.3, 0.6, 4.0], p=[0.5, 0.3, 0.2]))  # the widest leads to the courtyard
+            material = str(rng.choice(list(MATERIALS), p=list(MATERIALS.values())))
+            corner = origin[0] + along[0] * start, origin[1] + along[1] * start
+            bays = facade(rng, round(float(end - start) - gap, 2), 1.6)
+            height = round(float(rng.uniform(*tall)), 1)
+            shapes.add(f"{name}-{material}", material, building(corner, along, bays, float(deep), height))
+
+
+def tree(rng: np.random.Generator, x: float, y: float) -> Mesh:
+    """A crown: a closed body of twelve sides."""
+    turns = np.arange(6) * np.pi / 3 + rng.uniform(0, np.pi / 3)
+    radius, bottom, top = rng.uniform(1.3, 2.0), rng.uniform(2.4, 3.0), rng.uniform(6.0, 8.5)
+    ring = [(x + radius * np.cos(t), y + radius * np.sin(t), (bottom + top) / 2) for t in turns]
+    triangles = []
+    for a, b in zip(ring, [*ring[1:], ring[0]], strict=True):
+        triangles += [(a, b, (x, y, top)), (b, a, (x, y, bottom))]
+    return soup(triangles)
+
+
+def box(low: tuple, high: tuple) -> Mesh:
+    (x0, y0, _), (x1, y1, z1) = low, high
+    return building((x0, y0), (1.0, 0.0), [(0.0, x1 - x0, 0.0)], y1 - y0, z1)
+
+
+def standing(kind: str, size: tuple, x: float, y: float, yaw_deg: float) -> Mesh:
+    """A vehicle that stands."""
+    mesh, c, s = SHAPES[kind](), np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    local = mesh.vertices * size
+    turned = np.stack([c * local[:, 0] - s * local[:, 1] + x, s * local[:, 0] + c * local[:, 1] + y], -1)
+    return Mesh(np.column_stack([turned, local[:, 2] + size[2] / 2 + 0.01]), mesh.faces)
+
+
+class Plan:
+    """Where blocks, streets and the station are, from a generator of random numbers."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        west, middle, east = rng.uniform(48, 60), rng.uniform(52, 66), rng.uniform(44, 56)
+        south, centre, north = rng.uniform(58, 70), rng.uniform(72, 84), rng.uniform(58, 70)
+        self.side_x = round(AVENUE_M + middle + STREET_M, 1)
+        self.street_y = round(-centre / 2 - STREET_M, 1), round(centre / 2 + STREET_M, 1)
+        low, high = self.street_y
+        self.columns = (
+            (-AVENUE_M - west, -AVENUE_M), (AVENUE_M, self.side_x - STREET_M),
+            (self.side_x + STREET_M, self.side_x + STREET_M + east),
+        )  # fmt: skip
+        self.rows = (
+            (low - STREET_M - south, low - STREET_M), (low + STREET_M, high - STREET_M),
+            (high + STREET_M, high + STREET_M + north),
+        )  # fmt: skip
+        self.box = self.columns[0][0], self.rows[0][0], self.columns[2][1], self.rows[2][1]
+        x0, y0, x1, y1 = (round(v, 1) for v in self.box)
+        self.nodes = {
+            "as": (0.0, y0 - END_M), "a1": (0.0, low), "a2": (0.0, high), "an": (0.0, y1 + END_M),
+            "bs": (self.side_x, y0 - END_M), "b1": (self.side_x, low),
+            "b2": (self.side_x, high), "bn": (self.side_x, y1 + END_M),
+            "w1": (x0 - END_M, low), "e1": (x1 + END_M, low),
+            "w2": (x0 - END_M, high), "e2": (x1 + END_M, high),
+        }  # fmt: skip
+        self.station = round(-LANE_M * AVENUE_LANES - KERB_M - 0.6, 2), round(float(rng.uniform(-6, 6)), 1), 4.0
+
+
+LINES = (("as", "a1", "a2", "an"), ("bs", "b1", "b2", "bn"), ("w1", "a1", "b1", "e1"), ("w2", "a2", "b2", "e2"))
+"""The avenue, the side street along it, and the streets across, by their nodes."""
+
+
+def scenery(plan: Plan, rng: np.random.Generator, name: str) -> ImportedScene:
+    shapes = Shapes()
+    for i, (x0, x1) in enumerate(plan.columns):
+        for j, (y0, y1) in enumerate(plan.rows):
+            tall = (12.0, 32.0) if i < 2 else (8.0, 20.0)
+            block(shapes, rng, f"block-{i + 1}{j + 1}", (x0, y0), (x1, y1), tall)
+    x0, y0, x1, y1 = plan.box
+    ground = [(x, y, 0.0) for x in (x0 - 60, x1 + 60) for y in (y0 - 60, y1 + 60)]
+    shapes.add("ground", "asphalt", soup([(ground[0], ground[2], ground[3]), (ground[0], ground[3], ground[1])]), "ground")
+    kerb = LANE_M * AVENUE_LANES + KERB_M / 2
+    for side in (-1, 1):
+        for low, high in plan.rows:
+            for y in np.arange(low + 8, high - 6, 9.0):
+                draw = rng.random()
+                if side < 0 and abs(y - plan.station[1]) < 6:
+                    continue  # nothing stands around the station
+                if draw < 0.3:
+                    shapes.add("foliage-trees", "wood", tree(rng, side * (kerb + 2.3), y), "foliage")
+                    trunk = side * (kerb + 2.3)
+                    shapes.add("trunks", "wood", box((trunk - 0.15, y - 0.15, 0), (trunk + 0.15, y + 0.15, 2.3)))
+                elif low < 0 < high:
+                    continue  # the kerb of the middle block is for deliveries
+                elif draw < 0.5:
+                    size = (7.5, 2.3, 3.4) if draw < 0.4 else (5.9, 2.0, 2.6)
+                    shapes.add("parked", "metal", standing("truck", size, side * kerb, y, side * 90.0), "vehicle")
+                elif draw < 0.65:
+                    shapes.add("parked", "metal", standing("car", (4.5, 1.8, 1.5), side * kerb, y, side * 90.0), "vehicle")
+    colours = {"brick": (0.45, 0.2, 0.13), "concrete": None, "glass": None, "metal": None, "wood": None}
+    materials = {material: wall_material(material, colour) for material, colour in colours.items()}
+    materials["asphalt"] = wall_material("concrete", (0.08, 0.08, 0.09))
+    pieces = shapes.pieces("examples/district.py")
+    used = {piece.material for piece in pieces.values()}
+    return ImportedScene(
+        name=name, pieces=pieces, materials={k: v for k, v in materials.items() if k in used},
+        transmitters_m=[plan.station], frequencies_hz=[60e9],
+    )  # fmt: skip
+
+
+def network(plan: Plan) -> bytes:
+    """The road network of SUMO, in the coordinates of the scene."""
+    signals = {"a1", "a2", "b1", "b2"}
+    nodes = [
+        f'<node id="{name}" x="{x:.1f}" y="{y:.1f}" type="{"traffic_light" if name in signals else "dead_end"}"/>'
+        for name, (x, y) in plan.nodes.items()
+    ]
+    edges = []
+    for line in LINES:
+        avenue = line[0] == "as"
+        for a, b in [*zip(line, line[1:], strict=False), *zip(line[1:], line, strict=False)]:
+            lanes = [f'<lane index="0" allow="pedestrian" width="{SIDEWALK_M}"/>']
+            if avenue:
+                lanes.append(f'<lane index="1" disallow="all" width="{KERB_M}"/>')
+            drive = AVENUE_LANES if avenue else 1
+            lanes += [f'<lane index="{len(lanes) + k}" width="{LANE_M}" disallow="pedestrian"/>' for k in range(drive)]
+            edges.append(
+                f'<edge id="{a}-{b}" from="{a}" to="{b}" numLanes="{len(lanes)}" priority="{2 if avenue else 1}" '
+                f'speed="{13.9 if avenue else 8.3}">{"".join(lanes)}</edge>'
+            )
+    with tempfile.TemporaryDirectory() as folder:
+        at = Path(folder)
+        (at / "nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
+        (at / "edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
+        program = shutil.which("netconvert") or shutil.which(Path(sys.executable).with_name("netconvert"))
+        if program is None:
+            sys.exit("netconvert is not there; install the extra `world`: pip install 'caviar-sim[world]'")
+        subprocess.run(
+            [program, "--node-files", "nod.xml", "--edge-files", "edg.xml", "--crossings.guess", "--walkingareas",
+             "--offset.disable-normalization", "--no-turnarounds.except-deadend", "--output.street-names", "false",
+             "--tls.cycle.time", "77", "--tls.left-green.time", "7", "--output-file", "net.xml"],
+            cwd=at, check=True, capture_output=True,
+        )  # fmt: skip
+        text = (at / "net.xml").read_text()
+    return re.sub(r"<!-- generated on.*?-->\s*", "", text, count=1, flags=re.DOTALL).encode()
+
+
+def kerbs(plan: Plan) -> bytes:
+    """Where deliveries stop, two places behind each other on each side."""
+    lines = ["<additional>"]
+    (low, high), middle = plan.street_y, plan.station[1]
+    for edge in DELIVERIES.values():
+        # Places along an edge count from where its lanes begin, behind the junction.
+        sign = 1 if edge == "a1-a2" else -1
+        begin = (low if sign > 0 else -high) + STREET_M + 3.0
+        for number, off in enumerate((-24.0, 2.0)):
+            start = sign * middle + off - begin
+            lines.append(
+                f'    <parkingArea id="{edge}-{number}" lane="{edge}_2" startPos="{start:.1f}" '
+                f'endPos="{start + 22.0:.1f}" roadsideCapacity="2" width="{KERB_M}"/>'
+            )
+    return "\n".join([*lines, "</additional>", ""]).encode()
+
+
+def edges_of(nodes: str) -> str:
+    way = nodes.split()
+    return " ".join(f"{a}-{b}" for a, b in zip(way, way[1:], strict=False))
+
+
+TOURS = (
+    ("as a1 a2 an a2 a1 as", 8, 1400),
+    ("as a1 a2 b2 e2 b2 bn b2 b1 e1 b1 a1 as", 4, 1650),
+    ("w1 a1 a2 an a2 w2 a2 a1 w1", 5, 1350),
+    ("bs b1 a1 a2 b2 b1 e1 b1 bs", 5, 1550),
+)
+"""Ways of the vehicles with receivers, how often each goes round, and after how many seconds the next follows."""
+THROUGH = {
+    "as a1 a2 an": 0.115, "an a2 a1 as": 0.115, "w1 a1 b1 e1": 0.03, "e2 b2 a2 w2": 0.03,
+    "bs b1 b2 bn": 0.03, "bn b2 b1 bs": 0.03, "w2 a2 an": 0.02, "e1 b1 a1 as": 0.02,
+}  # fmt: skip
+"""Ways of other vehicles, and how many a second."""
+DELIVERIES = {"as a1 a2 an": "a1-a2", "an a2 a1 as": "a2-a1"}
+"""Ways of lorries and vans that stand at the kerb beside the station for a while, and where."""
+STAYS_S = {60: 0.008, 150: 0.005, 300: 0.0015}
+"""How long they stand, and how many of them come a second."""
+WALKS = ("as-a1 a2-an", "an-a2 a1-w1", "e2-b2 a1-as")
+TYPES = """    <vType id="car" vClass="passenger" length="4.5" width="1.8" height="1.6" minGap="2.0" speedFactor="normc(0.75,0.1,0.5,1.0)"/>
+    <vType id="van" vClass="delivery" length="5.9" width="2.0" height="2.6" minGap="2.0" accel="2.0" speedFactor="normc(0.70,0.1,0.5,1.0)"/>
+    <vType id="lorry" vClass="truck" length="9.0" width="2.5" height="4.0" minGap="2.5" accel="1.3" decel="4.0" speedFactor="normc(0.65,0.1,0.5,0.9)"/>
+    <vType id="bus" vClass="bus" length="12.0" width="2.5" height="3.2" minGap="2.5" accel="1.2" decel="4.0" speedFactor="0.65"/>
+    <vTypeDistribution id="traffic" vTypes="car van lorry bus" probabilities="0.38 0.18 0.30 0.14"/>
+    <vTypeDistribution id="delivery" vTypes="van lorry" probabilities="0.35 0.65"/>
+    <vTypeDistribution id="users" vTypes="car van lorry" probabilities="0.8 0.12 0.08"/>
+    <vType id="person" vClass="pedestrian" length="0.30" width="0.50" height="1.72" speedFactor="normc(1.0,0.1,0.7,1.3)"/>
+"""
+
+def traffic() -> bytes:
+    """Types, tours, flows and people of SUMO, in the order of their departure."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<routes>", TYPES.rstrip()]
+    flows = []
+    for k in range(10):
+        tour, rounds, period = TOURS[k % len(TOURS)]
+        flows.append((13.0 * k, f'    <flow id="user-{k}" type="users" begin="{13.0 * k}" end="1000000" period="{period}" '
+            f'departLane="best" departSpeed="max"><route edges="{edges_of(tour)}" repeat="{rounds}"/></flow>'))  # fmt: skip
+    for k, (way, rate) in enumerate(THROUGH.items()):
+        flows.append((k * 0.5, f'    <flow id="flow-{k}" type="traffic" begin="{k * 0.5}" end="1000000" '
+            f'period="exp({rate})" departLane="best" departSpeed="max"><route edges="{edges_of(way)}"/></flow>'))  # fmt: skip
+    for k, (way, kerb) in enumerate(DELIVERIES.items()):
+        for stay, rate in STAYS_S.items():
+            for area in "01":
+                flows.append((k * 0.5, f'    <flow id="delivery-{k}{area}-{stay}" type="delivery" begin="{k * 0.5}" '
+                    f'end="1000000" period="exp({rate / 2})" departLane="best" departSpeed="max"><route edges='
+                    f'"{edges_of(way)}"/><stop parkingArea="{kerb}-{area}" duration="{stay}"/></flow>'))  # fmt: skip
+    for k, way in enumerate(WALKS):
+        first, last = way.split()
+        # SUMO makes all people of a flow when it reads it.
+        for begin in range(0, 66_000, 2000):
+            flows.append((begin, f'    <personFlow id="walk-{k}-{begin}" type="person" begin="{begin}" end="{begin + 2000}" '
+                f'period="exp(0.025)"><walk from="{first}" to="{last}"/></personFlow>'))  # fmt: skip
+    lines += [text for _, text in sorted(flows)]
+    return "\n".join([*lines, "</routes>", ""]).encode()
+
+
+SCENARIO = """# $title
+#
+# Written by: python examples/district.py --name $base --seed $seed
+
+[run]
+name = "$name"
+frames = 1
+episodes = 10
+sampling_period_ns = 1_000_000_000
+record = ["scene", "channel", $topic"action", "link"]
+
+[[carriers]]
+name = "60GHz"
+frequency_hz = 60e9
+bandwidth_hz = 100e6
+
+[timeouts]
+connect_s = 120  # for every service to join, on machines that are busy with starting them
+rejoin_s = 60    # a service that died is started again, and the run goes on
+
+# --- services ------------------------------------------------------------------------------
+
+[services.traffic]
+role = "world"
+use = "sumo"
+budget_ms = 20
+
+[services.traffic.settings]
+scenery = "file:$base/scene.xml"
+net = "file:$base/net.xml"
+routes = "file:$base/traffic.rou.xml"
+additional = "file:$base/kerbs.add.xml"
+prefix = "vehicle."
+begin_s = 300.0                 # the roads are busy by then, and the tours spread
+between_episodes_s = 30.0       # all episodes are of one traffic
+meshes = ["bus", "car", "truck"]  # people are boxes
+
+[services.channel]
+role = "channel"
+use = "sionna-rt"
+budget_ms = 1000
+
+[services.channel.settings]  # paths by way of vehicles are enumerated, not launched (candidates)
+max_depth = 3
+los = true
+reflection = true
+refraction = false
+diffraction = false
+scattering = false
+outside_itu_range = "nearest"  # ITU-R P.2040 has no brick between 40 and 110 GHz
+object_materials = { pedestrian = "skin" }
+pool = { car = 64, truck = 64, bus = 32, box = 32 }  # bodies held ready for those who come
+
+[services.channel.settings.foliage."foliage-*"]
+attenuation_db_per_m = { "*" = 1.44 }
+source = "Weissberger's modified exponential decay, ESD-TR-81-101, 1982: 0.45 f^0.284 at 60 GHz, up to 14 m"
+
+$lidar[services.link]
+role = "link"
+use = "beams"
+budget_ms = 50
+
+[services.agent]
+role = "agent"
+use = "los-beam"
+budget_ms = 20
+
+[services.recorder]
+role = "recorder"
+use = "mcap"
+budget_ms = 100
+
+# --- devices -------------------------------------------------------------------------------
+
+# At the western kerb of the avenue, no higher than lorries are.
+[[devices]]
+name = "bs"
+kind = "antenna"
+role = "tx"
+position_m = $station
+pitch_deg = 3.0
+array = { columns = 64, pattern = "tr38901" }
+power_dbm = 30.0
+$devices"""
+LIDAR = """[services.lidar]
+role = "sensors"
+use = "lidar"
+budget_ms = 150
+
+[services.lidar.settings]
+points_every = 0  # the grid alone
+grid = { minimum_m = [$x0, $y0, 0.0], maximum_m = [$x1, $y1, 10.0], cells = $cells }
+
+"""
+MOBILE = """
+# 0.1 m above the roof of each vehicle on a tour.
+[[devices]]
+name = "rx"
+kind = "antenna"
+role = "rx"
+on = "vehicle.user-*"
+count = 10
+mount = "roof"
+position_m = [0.0, 0.0, 0.1]
+array = { columns = 8 }
+
+# Above each of these receivers, and so above everything that the vehicle is made of.
+[[devices]]
+name = "lidar"
+kind = "lidar"
+on = "vehicle.user-*"
+count = 10
+mount = "roof"
+position_m = [0.0, 0.0, 0.5]
+beams = 32
+azimuth_steps = 900
+elevation_deg = [-25.0, 3.0]
+range_m = [0.5, 100.0]
+"""
+FIXED = """
+[[devices]]
+name = "rx$k"
+kind = "antenna"
+role = "rx"
+position_m = $place
+yaw_deg = $yaw
+array = { columns = 8 }
+"""
+
+
+def filled(text: str, **values: object) -> str:
+    for key, value in values.items():
+        text = text.replace(f"${key}", str(value))
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder in which files and a folder are made")
+    parser.add_argument("--seed", type=int, required=True, help="of the city")
+    parser.add_argument("--name", default="district", help="of the scenario; default: district")
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+    plan = Plan(rng)
+    scene = scenery(plan, rng, args.name)
+    write_scene(scene, args.out / args.name, {"net.xml": network(plan), "traffic.rou.xml": traffic(), "kerbs.add.xml": kerbs(plan)})
+    y = plan.station[1]
+    grid = filled(LIDAR, x0=-11.5, x1=11.5, y0=y - 125.0, y1=y + 125.0, cells=list(CELLS))
+    common = {"base": args.name, "seed": args.seed, "station": list(plan.station)}
+    places = [(side * (AVENUE_M - 1.5), round(y + d, 1)) for side, d in zip([1, 1, 1, 1, 1, -1, -1], range(-60, 80, 20), strict=True)]
+    places += [(round(plan.side_x * f, 1), plan.street_y[k] + 4.5) for f, k in ((0.25, 0), (0.5, 1), (0.6, 0))]
+    fixed = "".join(
+        filled(FIXED, k=k, place=[round(px, 1), round(py, 1), 1.5], yaw=-90.0) for k, (px, py) in enumerate(places)
+    )
+    for suffix, title, topic, lidar, devices in (
+        ("", "A district for data sets: ten vehicles with receivers and LIDARs of their own.", '"lidar.grid", ', grid, MOBILE),
+        ("-fixed", "A district for data sets: ten receivers that stand on its pavements.", "", "", fixed),
+    ):
+        text = filled(SCENARIO, title=title, name=args.name + suffix, topic=topic, lidar=lidar, devices=devices, **common)
+        (args.out / f"{args.name}{suffix}.toml").write_text(text)
+
+
+if __name__ == "__main__":
+    main()
