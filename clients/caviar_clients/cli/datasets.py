@@ -106,6 +106,8 @@ def generate_command(
         with_cameras,
         with_own_traffic,
     )
+    from caviar_clients.datasets.reader import Dataset
+    from caviar_clients.datasets.shares import count_users, paper_counts
     from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
@@ -145,6 +147,10 @@ def generate_command(
         f"{counted(outcome.episodes, 'episode')}, {counted(outcome.scenes, 'scene')}, "
         f"{bytes_text(outcome.bytes)} in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
     )
+    if outcome.episodes or outcome.before:
+        print_line(console, str(count_users(Dataset(out))))
+        if words := paper_counts(loaded.run.name):
+            print_line(console, words)
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
             print_line(console, f"episode {number} failed: {printable(one_line(error))}", "red")
