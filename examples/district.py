@@ -1,17 +1,17 @@
-"""A district of three by three blocks for data sets: scenery, road network, traffic, and scenarios that use them.
+"""A district of three by three blocks for data sets: scenery, road network, traffic, and scenarios of them.
 
     python examples/district.py --out FOLDER --seed 1 [--name district]
 
-Writes ``NAME.toml``, ten vehicles with receivers and LIDARs, ``NAME-fixed.toml``, ten receivers that stand, and
-the folder ``NAME``; equal seeds give equal files. ``netconvert`` of the extra ``world`` makes the network. The
-shipped scenarios `district` and `district-b` are seeds 1 and 2.
+Writes ``NAME.toml``, ten vehicles with receivers and LIDARs, ``NAME-fixed.toml``, ten receivers that stand,
+and the folder ``NAME``; equal seeds give equal files. Needs the extra ``world``, whose ``netconvert`` makes
+the network. The shipped scenarios `district` and `district-b` are seeds 1 and 2.
 """
 
 import argparse
 import re
 import subprocess
-import sys
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +101,7 @@ def building(origin: Point, along: Point, bays: list, depth: float, height: floa
         if -depth < before < front:
             outline = [(start, before), *outline[1:], outline[0]]
         corners = [at(*corner, height) for corner in outline]
-        triangles += [(corners[0], b, c) for b, c in zip(corners[1:], corners[2:], strict=False)]
+        triangles += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
     return soup(triangles)
 
 
@@ -113,7 +113,7 @@ def facade(rng: np.random.Generator, length: float, deepest: float) -> list:
     return [(float(a), float(b), float(f)) for a, b, f in zip(cuts, cuts[1:], fronts, strict=False)]
 
 
-def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high: Point, tall: Point) -> None:
+def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high: Point, tall: Point) -> list:
     """Buildings around a courtyard.
 
     Args:
@@ -122,7 +122,11 @@ def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high:
         name: Of the block.
         low, high: Its corners [m].
         tall: Least and greatest height [m].
+
+    Returns:
+        A place at the edge of each roof, 3 m above it [m], and the direction out of the façade [°].
     """
+    masts = []
     (x0, y0), (x1, y1) = low, high
     deep = rng.uniform(11.0, 14.0)
     sides = [
@@ -132,13 +136,17 @@ def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high:
     ]  # fmt: skip
     for origin, along, length in sides:
         ends = np.linspace(0, length, max(1, round(length / rng.uniform(18.0, 28.0))) + 1)
-        for start, end in zip(ends, ends[1:], strict=False):
+        for start, end in pairwise(ends):
             gap = float(rng.choice([0.3, 0.6, 4.0], p=[0.5, 0.3, 0.2]))  # the widest leads to the courtyard
             material = str(rng.choice(list(MATERIALS), p=list(MATERIALS.values())))
             corner = origin[0] + along[0] * start, origin[1] + along[1] * start
             bays = facade(rng, round(float(end - start) - gap, 2), 1.6)
             height = round(float(rng.uniform(*tall)), 1)
             shapes.add(f"{name}-{material}", material, building(corner, along, bays, float(deep), height))
+            half, (ax, ay) = float(end - start - gap) / 2, along
+            place = corner[0] + half * ax - 2.5 * ay, corner[1] + half * ay + 2.5 * ax, height + 3.0
+            masts.append(([round(float(v), 1) for v in place], float(np.degrees(np.arctan2(-ax, ay)) + 0.0)))
+    return masts
 
 
 def tree(rng: np.random.Generator, x: float, y: float) -> Mesh:
@@ -191,22 +199,37 @@ class Plan:
             "w1": (x0 - END_M, low), "e1": (x1 + END_M, low),
             "w2": (x0 - END_M, high), "e2": (x1 + END_M, high),
         }  # fmt: skip
-        self.station = round(-LANE_M * AVENUE_LANES - KERB_M - 0.6, 2), round(float(rng.uniform(-6, 6)), 1), 4.0
+        self.station = (
+            round(-LANE_M * AVENUE_LANES - KERB_M - 0.6, 2),
+            round(float(rng.uniform(-6, 6)), 1),
+            4.0,
+        )
 
 
-LINES = (("as", "a1", "a2", "an"), ("bs", "b1", "b2", "bn"), ("w1", "a1", "b1", "e1"), ("w2", "a2", "b2", "e2"))
+LINES = (
+    ("as", "a1", "a2", "an"),
+    ("bs", "b1", "b2", "bn"),
+    ("w1", "a1", "b1", "e1"),
+    ("w2", "a2", "b2", "e2"),
+)
 """The avenue, the side street along it, and the streets across, by their nodes."""
 
 
-def scenery(plan: Plan, rng: np.random.Generator, name: str) -> ImportedScene:
-    shapes = Shapes()
+def scenery(plan: Plan, rng: np.random.Generator, name: str) -> tuple[ImportedScene, list]:
+    """The scene, and the masts of two roofs beside the avenue."""
+    shapes, masts = Shapes(), {}
     for i, (x0, x1) in enumerate(plan.columns):
         for j, (y0, y1) in enumerate(plan.rows):
             tall = (12.0, 32.0) if i < 2 else (8.0, 20.0)
-            block(shapes, rng, f"block-{i + 1}{j + 1}", (x0, y0), (x1, y1), tall)
+            masts[i, j] = block(shapes, rng, f"block-{i + 1}{j + 1}", (x0, y0), (x1, y1), tall)
     x0, y0, x1, y1 = plan.box
     ground = [(x, y, 0.0) for x in (x0 - 60, x1 + 60) for y in (y0 - 60, y1 + 60)]
-    shapes.add("ground", "asphalt", soup([(ground[0], ground[2], ground[3]), (ground[0], ground[3], ground[1])]), "ground")
+    shapes.add(
+        "ground",
+        "asphalt",
+        soup([(ground[0], ground[2], ground[3]), (ground[0], ground[3], ground[1])]),
+        "ground",
+    )
     kerb = LANE_M * AVENUE_LANES + KERB_M / 2
     for side in (-1, 1):
         for low, high in plan.rows:
@@ -217,44 +240,59 @@ def scenery(plan: Plan, rng: np.random.Generator, name: str) -> ImportedScene:
                 if draw < 0.3:
                     shapes.add("foliage-trees", "wood", tree(rng, side * (kerb + 2.3), y), "foliage")
                     trunk = side * (kerb + 2.3)
-                    shapes.add("trunks", "wood", box((trunk - 0.15, y - 0.15, 0), (trunk + 0.15, y + 0.15, 2.3)))
+                    shapes.add(
+                        "trunks", "wood", box((trunk - 0.15, y - 0.15, 0), (trunk + 0.15, y + 0.15, 2.3))
+                    )
                 elif low < 0 < high:
                     continue  # the kerb of the middle block is for deliveries
                 elif draw < 0.5:
                     size = (7.5, 2.3, 3.4) if draw < 0.4 else (5.9, 2.0, 2.6)
-                    shapes.add("parked", "metal", standing("truck", size, side * kerb, y, side * 90.0), "vehicle")
+                    shapes.add(
+                        "parked", "metal", standing("truck", size, side * kerb, y, side * 90.0), "vehicle"
+                    )
                 elif draw < 0.65:
-                    shapes.add("parked", "metal", standing("car", (4.5, 1.8, 1.5), side * kerb, y, side * 90.0), "vehicle")
+                    shapes.add(
+                        "parked",
+                        "metal",
+                        standing("car", (4.5, 1.8, 1.5), side * kerb, y, side * 90.0),
+                        "vehicle",
+                    )
     colours = {"brick": (0.45, 0.2, 0.13), "concrete": None, "glass": None, "metal": None, "wood": None}
     materials = {material: wall_material(material, colour) for material, colour in colours.items()}
     materials["asphalt"] = wall_material("concrete", (0.08, 0.08, 0.09))
     pieces = shapes.pieces("examples/district.py")
     used = {piece.material for piece in pieces.values()}
-    return ImportedScene(
+    scene = ImportedScene(
         name=name, pieces=pieces, materials={k: v for k, v in materials.items() if k in used},
         transmitters_m=[plan.station], frequencies_hz=[60e9],
     )  # fmt: skip
+    east = [mast for mast in masts[0, 0] if mast[1] == 0.0]
+    west = [mast for mast in masts[1, 2] if abs(mast[1]) == 180.0]
+    return scene, [east[0], west[0]]
 
 
 def network(plan: Plan) -> bytes:
     """The road network of SUMO, in the coordinates of the scene."""
     signals = {"a1", "a2", "b1", "b2"}
-    nodes = [
-        f'<node id="{name}" x="{x:.1f}" y="{y:.1f}" type="{"traffic_light" if name in signals else "dead_end"}"/>'
-        for name, (x, y) in plan.nodes.items()
-    ]
+    nodes = []
+    for name, (x, y) in plan.nodes.items():
+        kind = "traffic_light" if name in signals else "dead_end"
+        nodes.append(f'<node id="{name}" x="{x:.1f}" y="{y:.1f}" type="{kind}"/>')
     edges = []
     for line in LINES:
         avenue = line[0] == "as"
-        for a, b in [*zip(line, line[1:], strict=False), *zip(line[1:], line, strict=False)]:
+        for a, b in [*pairwise(line), *((b, a) for a, b in pairwise(line))]:
             lanes = [f'<lane index="0" allow="pedestrian" width="{SIDEWALK_M}"/>']
             if avenue:
                 lanes.append(f'<lane index="1" disallow="all" width="{KERB_M}"/>')
             drive = AVENUE_LANES if avenue else 1
-            lanes += [f'<lane index="{len(lanes) + k}" width="{LANE_M}" disallow="pedestrian"/>' for k in range(drive)]
+            lanes += [
+                f'<lane index="{len(lanes) + k}" width="{LANE_M}" disallow="pedestrian"/>'
+                for k in range(drive)
+            ]
             edges.append(
-                f'<edge id="{a}-{b}" from="{a}" to="{b}" numLanes="{len(lanes)}" priority="{2 if avenue else 1}" '
-                f'speed="{13.9 if avenue else 8.3}">{"".join(lanes)}</edge>'
+                f'<edge id="{a}-{b}" from="{a}" to="{b}" numLanes="{len(lanes)}" '
+                f'priority="{2 if avenue else 1}" speed="{13.9 if avenue else 8.3}">{"".join(lanes)}</edge>'
             )
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder)
@@ -263,12 +301,12 @@ def network(plan: Plan) -> bytes:
         import sumo  # of the extra `world`
 
         program = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-        subprocess.run(
-            [str(program), "--node-files", "nod.xml", "--edge-files", "edg.xml", "--crossings.guess", "--walkingareas",
-             "--offset.disable-normalization", "--no-turnarounds.except-deadend", "--output.street-names", "false",
-             "--tls.cycle.time", "77", "--tls.left-green.time", "7", "--output-file", "net.xml"],
-            cwd=at, check=True, capture_output=True,
-        )  # fmt: skip
+        options = (
+            "--node-files nod.xml --edge-files edg.xml --crossings.guess --walkingareas "
+            "--offset.disable-normalization --no-turnarounds.except-deadend --output.street-names false "
+            "--tls.cycle.time 77 --tls.left-green.time 7 --output-file net.xml"
+        )
+        subprocess.run([str(program), *options.split()], cwd=at, check=True, capture_output=True)  # noqa: S603
         text = (at / "net.xml").read_text()
     text = re.sub(r"<!-- generated on.*?-->\s*", "", text, count=1, flags=re.DOTALL)
     return re.sub(r"\n\s+", "\n", text).encode()
@@ -293,7 +331,7 @@ def kerbs(plan: Plan) -> bytes:
 
 def edges_of(nodes: str) -> str:
     way = nodes.split()
-    return " ".join(f"{a}-{b}" for a, b in zip(way, way[1:], strict=False))
+    return " ".join(f"{a}-{b}" for a, b in pairwise(way))
 
 
 TOURS = (
@@ -302,7 +340,7 @@ TOURS = (
     ("w1 a1 a2 an a2 w2 a2 a1 w1", 5, 1250),
     ("bs b1 a1 a2 b2 b1 e1 b1 bs", 5, 1430),
 )
-"""Ways of the vehicles with receivers, how often each goes round, and after how many seconds the next follows."""
+"""Ways of the vehicles with receivers, how often each goes round, and seconds until the next one."""
 THROUGH = {
     "as a1 a2 an": 0.115, "an a2 a1 as": 0.115, "w1 a1 b1 e1": 0.03, "e2 b2 a2 w2": 0.03,
     "bs b1 b2 bn": 0.03, "bn b2 b1 bs": 0.03, "w2 a2 an": 0.02, "e1 b1 a1 as": 0.02,
@@ -313,40 +351,69 @@ DELIVERIES = {"as a1 a2 an": "a1-a2", "an a2 a1 as": "a2-a1"}
 STAYS_S = {60: 0.006, 150: 0.0035, 300: 0.001}
 """How long they stand, and how many of them come a second."""
 WALKS = ("as-a1 a2-an", "an-a2 a1-w1", "e2-b2 a1-as")
-TYPES = """    <vType id="car" vClass="passenger" length="4.5" width="1.8" height="1.6" minGap="2.0" speedFactor="normc(0.75,0.1,0.5,1.0)"/>
-    <vType id="van" vClass="delivery" length="5.9" width="2.0" height="2.6" minGap="2.0" accel="2.0" speedFactor="normc(0.70,0.1,0.5,1.0)"/>
-    <vType id="lorry" vClass="truck" length="9.0" width="2.5" height="3.6" minGap="2.5" accel="1.3" decel="4.0" speedFactor="normc(0.65,0.1,0.5,0.9)"/>
-    <vType id="bus" vClass="bus" length="12.0" width="2.5" height="3.2" minGap="2.5" accel="1.2" decel="4.0" speedFactor="0.65"/>
-    <vTypeDistribution id="traffic" vTypes="car van lorry bus" probabilities="0.57 0.18 0.16 0.09"/>
-    <vTypeDistribution id="delivery" vTypes="van lorry" probabilities="0.35 0.65"/>
-    <vTypeDistribution id="users" vTypes="car van lorry" probabilities="0.8 0.12 0.08"/>
-    <vType id="person" vClass="pedestrian" length="0.30" width="0.50" height="1.72" speedFactor="normc(1.0,0.1,0.7,1.3)"/>
-"""
+TYPES = {
+    "car": 'vClass="passenger" length="4.5" width="1.8" height="1.6" minGap="2.0" '
+    'speedFactor="normc(0.75,0.1,0.5,1.0)"',
+    "van": 'vClass="delivery" length="5.9" width="2.0" height="2.6" minGap="2.0" accel="2.0" '
+    'speedFactor="normc(0.70,0.1,0.5,1.0)"',
+    "lorry": 'vClass="truck" length="9.0" width="2.5" height="3.6" minGap="2.5" accel="1.3" decel="4.0" '
+    'speedFactor="normc(0.65,0.1,0.5,0.9)"',
+    "bus": 'vClass="bus" length="12.0" width="2.5" height="3.2" minGap="2.5" accel="1.2" decel="4.0" '
+    'speedFactor="0.65"',
+}
+MIXES = {
+    "traffic": ("car van lorry bus", "0.57 0.18 0.16 0.09"),
+    "delivery": ("van lorry", "0.35 0.65"),
+    "users": ("car van lorry", "0.8 0.12 0.08"),
+}
+PERSON = (
+    '    <vType id="person" vClass="pedestrian" length="0.30" width="0.50" height="1.72" '
+    'speedFactor="normc(1.0,0.1,0.7,1.3)"/>'
+)
+
+
+def flow(name: str, kind: str, begin: float, period: object, body: str) -> tuple[float, str]:
+    """Vehicles that come again and again, and when the first does [s]."""
+    return begin, (
+        f'    <flow id="{name}" type="{kind}" begin="{begin}" end="1000000" period="{period}" '
+        f'departLane="best" departSpeed="max">{body}</flow>'
+    )
+
 
 def traffic() -> bytes:
     """Types, tours, flows and people of SUMO, in the order of their departure."""
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<routes>", TYPES.rstrip()]
     flows = []
-    for k in range(10):
-        tour, rounds, period = TOURS[k % len(TOURS)]
-        flows.append((13.0 * k, f'    <flow id="user-{k}" type="users" begin="{13.0 * k}" end="1000000" period="{period}" '
-            f'departLane="best" departSpeed="max"><route edges="{edges_of(tour)}" repeat="{rounds}"/></flow>'))  # fmt: skip
+    for k, of in enumerate((0, 1, 2, 3, 0, 1, 2, 3, 1, 2)):
+        tour, rounds, period = TOURS[of]
+        route = f'<route edges="{edges_of(tour)}" repeat="{rounds}"/>'
+        flows.append(flow(f"user-{k}", "users", 13.0 * k, period, route))
     for k, (way, rate) in enumerate(THROUGH.items()):
-        flows.append((k * 0.5, f'    <flow id="flow-{k}" type="traffic" begin="{k * 0.5}" end="1000000" '
-            f'period="exp({rate})" departLane="best" departSpeed="max"><route edges="{edges_of(way)}"/></flow>'))  # fmt: skip
+        flows.append(
+            flow(f"flow-{k}", "traffic", k * 0.5, f"exp({rate})", f'<route edges="{edges_of(way)}"/>')
+        )
     for k, (way, kerb) in enumerate(DELIVERIES.items()):
         for stay, rate in STAYS_S.items():
             for area in "01":
-                flows.append((k * 0.5, f'    <flow id="delivery-{k}{area}-{stay}" type="delivery" begin="{k * 0.5}" '
-                    f'end="1000000" period="exp({rate / 2})" departLane="best" departSpeed="max"><route edges='
-                    f'"{edges_of(way)}"/><stop parkingArea="{kerb}-{area}" duration="{stay}"/></flow>'))  # fmt: skip
+                body = (
+                    f'<route edges="{edges_of(way)}"/><stop parkingArea="{kerb}-{area}" duration="{stay}"/>'
+                )
+                flows.append(
+                    flow(f"delivery-{k}{area}-{stay}", "delivery", k * 0.5, f"exp({rate / 2})", body)
+                )
     for k, way in enumerate(WALKS):
         first, last = way.split()
-        # SUMO makes all people of a flow when it reads it.
+        # SUMO makes all people of a flow when it reads it, so a flow is short.
         for begin in range(0, 66_000, 2000):
-            flows.append((begin, f'    <personFlow id="walk-{k}-{begin}" type="person" begin="{begin}" end="{begin + 2000}" '
-                f'period="exp(0.025)"><walk from="{first}" to="{last}"/></personFlow>'))  # fmt: skip
-    lines += [text for _, text in sorted(flows)]
+            people = f'id="walk-{k}-{begin}" type="person" begin="{begin}" end="{begin + 2000}"'
+            walk = f'<walk from="{first}" to="{last}"/>'
+            flows.append((begin, f'    <personFlow {people} period="exp(0.025)">{walk}</personFlow>'))
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<routes>"]
+    lines += [f'    <vType id="{name}" {of}/>' for name, of in TYPES.items()]
+    lines += [
+        f'    <vTypeDistribution id="{name}" vTypes="{of}" probabilities="{shares}"/>'
+        for name, (of, shares) in MIXES.items()
+    ]
+    lines += [PERSON, *(text for _, text in sorted(flows))]
     return "\n".join([*lines, "</routes>", ""]).encode()
 
 
@@ -433,7 +500,18 @@ position_m = $station
 pitch_deg = 3.0
 array = { columns = 64, pattern = "tr38901" }
 power_dbm = 30.0
-$devices"""
+$roofs$devices"""
+ROOF = """
+[[devices]]
+name = "roof-$k"
+kind = "antenna"
+role = "tx"
+position_m = $place
+yaw_deg = $yaw
+pitch_deg = 25.0
+array = { columns = 64, pattern = "tr38901" }
+power_dbm = 30.0
+"""
 LIDAR = """[services.lidar]
 role = "sensors"
 use = "lidar"
@@ -494,20 +572,44 @@ def main() -> None:
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
     plan = Plan(rng)
-    scene = scenery(plan, rng, args.name)
-    write_scene(scene, args.out / args.name, {"net.xml": network(plan), "traffic.rou.xml": traffic(), "kerbs.add.xml": kerbs(plan)})
+    scene, masts = scenery(plan, rng, args.name)
+    write_scene(
+        scene,
+        args.out / args.name,
+        {"net.xml": network(plan), "traffic.rou.xml": traffic(), "kerbs.add.xml": kerbs(plan)},
+    )
     y = plan.station[1]
     grid = filled(LIDAR, x0=-11.5, x1=11.5, y0=y - 125.0, y1=y + 125.0, cells=list(CELLS))
-    common = {"base": args.name, "seed": args.seed, "station": list(plan.station)}
-    places = [(side * (AVENUE_M - 1.5), y + d) for d, side in zip(range(-63, 77, 14), (1, 1, -1, 1, 1) * 2, strict=True)]
+    roofs = "\n# On roofs; presets keep the station in the street alone, as the paper's sets have one."
+    roofs += "".join(filled(ROOF, k=k, place=place, yaw=yaw) for k, (place, yaw) in enumerate(masts, 1))
+    common = {"roofs": roofs, "base": args.name, "seed": args.seed, "station": list(plan.station)}
+    places = [
+        (side * (AVENUE_M - 1.5), y + d)
+        for d, side in zip(range(-63, 77, 14), (1, 1, -1, 1, 1) * 2, strict=True)
+    ]
     fixed = "".join(
-        filled(FIXED, k=k, place=[round(px, 1), round(py, 1), 1.5], yaw=-90.0) for k, (px, py) in enumerate(places)
+        filled(FIXED, k=k, place=[round(px, 1), round(py, 1), 1.5], yaw=-90.0)
+        for k, (px, py) in enumerate(places)
     )
     for suffix, title, topic, lidar, devices in (
-        ("", "A district for data sets: ten vehicles with receivers and LIDARs of their own.", '"lidar.grid", ', grid, MOBILE),
+        (
+            "",
+            "A district for data sets: ten vehicles with receivers and LIDARs of their own.",
+            '"lidar.grid", ',
+            grid,
+            MOBILE,
+        ),
         ("-fixed", "A district for data sets: ten receivers that stand on its pavements.", "", "", fixed),
     ):
-        text = filled(SCENARIO, title=title, name=args.name + suffix, topic=topic, lidar=lidar, devices=devices, **common)
+        text = filled(
+            SCENARIO,
+            title=title,
+            name=args.name + suffix,
+            topic=topic,
+            lidar=lidar,
+            devices=devices,
+            **common,
+        )
         (args.out / f"{args.name}{suffix}.toml").write_text(text)
 
 

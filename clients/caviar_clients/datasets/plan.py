@@ -286,7 +286,7 @@ def apply_preset(preset: Preset, scenario: Scenario) -> Scenario:
 
     Args:
         preset: The columns.
-        scenario: Whose scenery, traffic, services and transmitters stay.
+        scenario: Whose scenery, traffic, services and first transmitter stay.
 
     Returns:
         The scenario of the dataset's episodes, of the preset's name.
@@ -312,9 +312,23 @@ def apply_preset(preset: Preset, scenario: Scenario) -> Scenario:
         scenario,
         run=run,
         carriers=_carriers(preset, scenario),
-        devices=tuple(_device(preset, device) for device in _with_receivers(preset, scenario)),
+        devices=tuple(
+            _device(preset, device)
+            for device in _with_receivers(preset, scenario)
+            if device.name not in further_transmitters(scenario)
+        ),
         services={name: _service(preset, spec) for name, spec in scenario.services.items()},
     )
+
+
+def further_transmitters(scenario: Scenario) -> list[str]:
+    """Transmitters that stand beside the first one: the sets of the table have one, and presets that alone.
+
+    Args:
+        scenario: That a preset is applied to.
+    """
+    standing = [d.name for d in scenario.devices if d.kind == "antenna" and d.role == "tx" and not d.on]
+    return standing[1:]
 
 
 def find_preset(name: str) -> Preset | None:
