@@ -216,6 +216,8 @@ def test_a_run_is_paused_stepped_and_stopped(browser: Any, tmp_path: Path) -> No
         page.until("s.live && s.shown.paths > 0")
         first = page.state["n"]
         page.until(f"s.n > {first}")
+        page.raw.get_by_label("LIDAR").check()
+        page.until("s.shown.points > 0")
         page.press("c")
         page.raw.get_by_role("button", name="Pause the run").click()
         page.raw.get_by_role("button", name="Let the run make one frame").wait_for()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import sqlite3
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from recording_builders import absent, frame, product, record
+from recording_builders import PERIOD_NS, absent, frame, product, record
 from typer.testing import CliRunner
 
 from caviar_clients.cli.main import app
@@ -29,8 +30,8 @@ from caviar_protocol.errors import RecordingError
 from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.scenario import load_scenario
-from caviar_protocol.topics import Channel, Link
+from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.topics import Channel, Lidar, Link
 from caviar_services.service import Frame
 
 pytestmark = pytest.mark.slow
@@ -40,9 +41,10 @@ AT = 1, 2
 """Episode and scene of a fault."""
 
 
-def generated(out: Path, scenario: str) -> Path:
+def generated(out: Path, scenario: str | Scenario) -> Path:
     directory = DatasetDirectory(out)
-    plan = plan_dataset(load_scenario(scenario), episodes=EPISODES, scenes=SCENES)
+    loaded = load_scenario(scenario) if isinstance(scenario, str) else scenario
+    plan = plan_dataset(loaded, episodes=EPISODES, scenes=SCENES)
     with writing_dataset(directory):
         catalogue = Catalogue(directory.catalogue, writable=True)
         catalogue.plan(plan.settings(), EPISODES)
@@ -72,7 +74,13 @@ Change = Callable[[Any], Payload | None]
 
 
 def rewritten(
-    data: Path, changes: dict[str, Change], scene: int = AT[1], *, seed: int = 1, stated: int = 1
+    data: Path,
+    changes: dict[str, Change],
+    scene: int = AT[1],
+    *,
+    seed: int = 1,
+    stated: int = 1,
+    of_episode: int = AT[0],
 ) -> None:
     """Record an episode anew, with other products in one scene, and list it: only its content can tell.
 
@@ -82,9 +90,9 @@ def rewritten(
         scene: In which they are.
         seed: Of all scenes.
         stated: Seed that the metadata have.
+        of_episode: Whose products it has.
     """
-    folder = DatasetDirectory(data).episode(AT[0])
-    recording = Recording(folder)
+    recording = Recording(DatasetDirectory(data).episode(of_episode))
     frames = []
     for one in recording.frames():
         inputs = []
@@ -97,7 +105,7 @@ def rewritten(
                 if payload is None
                 else product(topic, source, payload, one.number)
             )
-        frames.append(frame(one.number, *inputs, episode=one.episode, seed=seed))
+        frames.append(frame(one.number, *inputs, episode=AT[0], seed=seed))
     replaced(data, frames, stated)
 
 
@@ -559,6 +567,106 @@ def test_a_ray_traced_set_is_clean_and_a_wrong_line_of_sight_is_found(tmp_path: 
     rewritten(data, {"channel": of_channel(los=lambda c: changed(c.los, (0, 4), lambda los: not los))})
     findings = [f for f in found(data) if f.what == "line of sight"]
     assert [(f.episode, f.scene, f.user) for f in findings][:1] == [(*AT, "rx4")]
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Traffic in a street, with noisy LIDARs on ten vehicles; every second scan has its points."""
+    scenario = load_scenario("canyon-mobile")
+    services = dict(scenario.services)
+    services["channel"] = replace(services["channel"], use="free-space", settings={})
+    noise = {"use": "gaussian", "range_std_m": 0.05}
+    settings = {**services["lidar"].settings, "points_every": 2, "noise": noise}
+    services["lidar"] = replace(services["lidar"], settings=settings)
+    run = replace(scenario.run, sampling_period_ns=PERIOD_NS)  # that of `frame`
+    scenario = replace(scenario, run=run, services=services)
+    return generated(tmp_path_factory.mktemp("scanned") / "d", scenario)
+
+
+def cells(lidar: Lidar, sensor: int) -> Any:
+    grid = lidar.scans[sensor].grid
+    assert grid is not None
+    return grid.occupancy
+
+
+def mirrored_obstacles(lidar: Lidar, sensor: int, other: Lidar) -> Any:
+    """Antennas stay where they are."""
+    marks = np.minimum(cells(lidar, sensor), 0)
+    return np.where(marks < 0, marks, np.maximum(cells(lidar, sensor)[:, ::-1], 0))
+
+
+GRIDS: dict[str, tuple[Callable[[Lidar, int, Lidar], Any], str]] = {
+    "mirrored along the street": (lambda lidar, i, other: cells(lidar, i)[::-1], "TX in the LIDAR grid"),
+    "mirrored across it": (mirrored_obstacles, "obstacles of the LIDAR grid"),
+    "of another user": (lambda lidar, i, other: cells(lidar, i + 1), "RX in the LIDAR grid"),
+    "all zero": (lambda lidar, i, other: np.zeros_like(cells(lidar, i)), "TX in the LIDAR grid"),
+    "of another episode": (lambda lidar, i, other: cells(other, i), "RX in the LIDAR grid"),
+}
+"""Grid of a sensor from the scans of its scene and of another episode, and what is found."""
+
+
+def with_scan(lidar: Lidar, sensor: int, **fields: Any) -> Lidar:
+    scans = list(lidar.scans)
+    scans[sensor] = replace(scans[sensor], **fields)
+    return replace(lidar, scans=tuple(scans))
+
+
+@pytest.mark.sumo
+@pytest.mark.channel
+def test_scans_that_are_not_those_of_their_scene_are_found(scanned: Path, tmp_path: Path) -> None:
+    assert found(scanned) == []  # noise included
+    data = shutil.copytree(scanned, tmp_path / "d")
+    directory = DatasetDirectory(data)
+    (other,) = Recording(directory.episode(2)).frame(2, 3).payloads("lidar", Lidar).values()
+
+    def with_other_grids(lidar: Lidar) -> Lidar:
+        changed_ones = lidar
+        for sensor, (change, _) in enumerate(GRIDS.values()):
+            grid = lidar.scans[sensor].grid
+            assert grid is not None
+            occupancy = np.ascontiguousarray(change(lidar, sensor, other))
+            changed_ones = with_scan(changed_ones, sensor, grid=replace(grid, occupancy=occupancy))
+        return changed_ones
+
+    def with_mirrored_points(lidar: Lidar) -> Lidar:
+        return with_scan(lidar, 7, points=lidar.scans[7].points * np.array([1, -1, 1], np.float32))
+
+    rewritten(data, {"lidar": with_other_grids}, 3)
+    rewritten(data, {"lidar": with_mirrored_points}, 2)
+    frames = [Recording(directory.episode(1)).frame(1, scene) for scene in (2, 3)]
+    names = [[scan.sensor for scan in next(iter(f.payloads("lidar", Lidar).values())).scans] for f in frames]
+    findings = found(data)
+    assert [(f.episode, f.scene, f.user, f.what) for f in findings] == [
+        (1, 2, names[0][7], "points of the LIDAR"),
+        *((1, 3, names[1][sensor], what) for sensor, (_, what) in enumerate(GRIDS.values())),
+    ]
+    assert all(f.expected != f.found for f in findings)
+
+
+@pytest.mark.sumo
+@pytest.mark.channel
+def test_scans_are_said_to_be_unchecked_where_no_ray_tracer_is_installed(
+    scanned: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    notes: list[str] = []
+    assert list(verify(scanned, note=notes.append)) == []
+    assert [("LIDAR" in note, "Mitsuba" in note) for note in notes] == [(True, True)]
+
+
+@pytest.mark.sumo
+@pytest.mark.channel
+def test_an_episode_that_is_a_copy_of_another_is_found(scanned: Path, tmp_path: Path) -> None:
+    data = shutil.copytree(scanned, tmp_path / "d")
+    rewritten(data, {"lidar": lambda lidar: lidar}, of_episode=0)
+    content = [f for f in found(data) if f.what == "content"]
+    assert [(f.episode, f.found) for f in content] == [(1, "those of episode 0")]
+
+
+def test_episodes_that_are_all_equal_are_no_copies_and_a_note_says_so(clean: Path) -> None:
+    notes: list[str] = []
+    assert list(verify(clean, note=notes.append)) == []
+    assert ["episodes 1–2 (2)" in note for note in notes] == [True]
 
 
 def test_the_command_says_what_is_wrong_and_fails(data: Path, tmp_path: Path) -> None:

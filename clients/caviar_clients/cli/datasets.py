@@ -245,8 +245,13 @@ def verify_command(
     console = Console()
     with progress_bar(console, MofNCompleteColumn(), TimeRemainingColumn(), transient=True) as bar:
         task = bar.add_task("episodes", total=None)
-        findings = list(verify(dataset, lambda done, total: bar.update(task, completed=done, total=total)))
+        notes = list[str]()
+        findings = list(
+            verify(dataset, lambda done, total: bar.update(task, completed=done, total=total), notes.append)
+        )
     write_json(json, as_rows(findings))
+    for one_note in notes:
+        print_line(console, f"note: {one_note}")
     if not findings:
         print_line(console, f"{dataset}: nothing is wrong")
         return

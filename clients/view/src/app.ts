@@ -76,6 +76,7 @@ export class App {
     this.live = about.live
       ? new Live(
           runs[0].source,
+          this.pace.newsEvery,
           (news) => void this.hear(news),
           (reason) => {
             this.pace.setBusy(false);

@@ -11,6 +11,8 @@ export class Live {
 
   constructor(
     private readonly source: Source,
+    /** [s] between news at least. */
+    private readonly every: number,
     private readonly onNews: (news: News) => void,
     private readonly onEnd: (reason: string) => void,
     private readonly onError: (text: string) => void,
@@ -22,7 +24,7 @@ export class Live {
     let failures = 0;
     while (!signal.aborted) {
       try {
-        for await (const news of this.source.events<News>("news", signal)) {
+        for await (const news of this.source.events<News>("news", { every: this.every }, signal)) {
           failures = 0;
           if (news.ended !== undefined) {
             this.onEnd(news.ended);

@@ -3,6 +3,8 @@
 /** Time of rest after a picture, in times of the picture. */
 const REST = 30;
 const MOST_REST_MS = 5000;
+/** [s] between news of the run at least, each of which redraws parts of the page: where the processor draws, and else. */
+const NEWS_EVERY = { shared: 1, own: 0.1 };
 
 export class Pace {
   private wake = (): void => undefined;
@@ -10,6 +12,11 @@ export class Pace {
 
   /** @param sharesProcessor whether pictures take the time of a processor that the run may need */
   constructor(private readonly sharesProcessor: boolean) {}
+
+  /** [s] between news of the run at least. */
+  get newsEvery(): number {
+    return this.sharesProcessor ? NEWS_EVERY.shared : NEWS_EVERY.own;
+  }
 
   /** Whether a picture is followed by a rest. */
   get rests(): boolean {

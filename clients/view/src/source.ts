@@ -133,8 +133,8 @@ export class Source {
   }
 
   /** Events of the server as they come, until the signal. */
-  async *events<T>(path: string, signal: AbortSignal): AsyncGenerator<T> {
-    const answer = await this.request(path, {}, signal);
+  async *events<T>(path: string, query: Query, signal: AbortSignal): AsyncGenerator<T> {
+    const answer = await this.request(path, query, signal);
     const reader = answer.body?.pipeThrough(new TextDecoderStream()).getReader();
     let held = "";
     for (;;) {

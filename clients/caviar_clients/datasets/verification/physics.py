@@ -31,6 +31,7 @@ from caviar_clients.datasets.verification.channel_checks import (
     matrix_of,
     pair_of,
 )
+from caviar_clients.datasets.verification.lidar_checks import LidarChecks
 from caviar_protocol.arrays import Complex128Array, Float64Array
 from caviar_protocol.errors import AssetError, CaviarError
 from caviar_protocol.messages import Status
@@ -87,6 +88,7 @@ class PhysicsChecks:
             self._surfaces = Surfaces(triangles, outside=lambda number, normal: True)
         self._carriers = _carriers(settings)
         self._budget = _link_settings(settings)
+        self.lidar = LidarChecks(self.files, settings.get("scenario", {}).get("services", {}))
         add_codebook_files(file for name, file in self.files.items() if name.startswith(CODEBOOKS_FOLDER))
         self._patterns = Patterns()
         try:
@@ -107,6 +109,7 @@ class PhysicsChecks:
             RecordingError: A product cannot be read.
         """
         before: tuple[RecordedFrame, Scene] | None = None
+        meshes = recording.meshes
         assets = self.files.keys() | recording.assets.keys()
         said: set[tuple[str, str]] = set()
         for frame in recording.frames():
@@ -124,6 +127,7 @@ class PhysicsChecks:
                         frame.episode, frame.number, "", what, f"assets/{asset} in the dataset", "none"
                     )
             # A held product is that of an earlier scene, where it was looked at.
+            yield from self.lidar.frame(frame, meshes)
             for channel in _fresh(frame, "channel", Channel):
                 links = _fresh(frame, "link", Link)
                 yield from self._channel((frame.episode, frame.number), scene, channel, links)

@@ -28,12 +28,17 @@ _PLACES = ("x_m", "y_m", "z_m")
 _SIGNED = (*_PLACES, "gain_db", "snr_db")
 
 
-def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: None) -> Iterator[Finding]:
+def verify(
+    path: str | Path,
+    progress: Callable[[int, int], None] = lambda *_: None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Iterator[Finding]:
     """Verify a dataset.
 
     Args:
         path: Folder or address of the dataset.
         progress: Called after each episode with how many are verified, and how many there are.
+        note: Called with each thing that is no fault and worth knowing: what this machine cannot check.
 
     Yields:
         What is wrong: of the dataset as a whole, then episode by episode.
@@ -50,6 +55,7 @@ def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: N
         yield from _missing_episodes(catalogue, known)
         yield from _not_listed(directory.finished() if remote is None else remote.episodes(), known)
         yield from _orphans(catalogue)
+        yield from _copies(catalogue, note)
         checks = PhysicsChecks(directory.assets, settings)
         scenery = list(lacking_scenery(settings, checks.files))
         if checks.scenery_error and not scenery:
@@ -61,6 +67,8 @@ def verify(path: str | Path, progress: Callable[[int, int], None] = lambda *_: N
             else:
                 yield from _fetched(remote, catalogue, checks, settings, number)
             progress(done, len(known))
+        if checks.lidar.skipped:
+            note(f"LIDAR scans are not computed anew: {checks.lidar.skipped}")
     finally:
         catalogue.close()
 
@@ -260,6 +268,44 @@ def _orphans(catalogue: Catalogue) -> Iterator[Finding]:
             yield Finding(
                 episode, scene, rx[0] if rx else "", what, "a row of the episode in episodes", rows_of_it
             )
+
+
+def _copies(catalogue: Catalogue, note: Callable[[str], None]) -> Iterator[Finding]:
+    """Episodes whose scenes and channels are those of an earlier one: a leak from training into test.
+
+    A scenario without anything that depends on the seed has such episodes alone. It is told from one that
+    varies by its other episodes: none of them has other scenes, or other channels, from beginning to end.
+
+    Args:
+        catalogue: Of the dataset. Its digests are compared with the recordings episode by episode.
+        note: As for `verify`.
+    """
+    _, rows = catalogue.query(
+        "SELECT episode, topic, group_concat(substr(sha256, 1, 16), ' ') FROM (SELECT * FROM products "
+        "WHERE topic IN ('scene', 'channel') AND status = 'fresh' ORDER BY episode, scene, topic, source) "
+        "GROUP BY episode, topic ORDER BY episode, topic"
+    )
+    contents: dict[int, list[str]] = {}
+    first: dict[str, str] = {}
+    varies = False
+    for episode, topic, digests in rows:
+        contents.setdefault(episode, []).append(digests)
+        known = first.setdefault(topic, digests).split()
+        varies |= all(one != other for one, other in zip(known, digests.split(), strict=False))
+    originals: dict[tuple[str, ...], int] = {}
+    copies = {}
+    for episode, content in contents.items():
+        if (original := originals.setdefault(tuple(content), episode)) != episode:
+            copies[episode] = original
+    if not varies and copies:
+        note(
+            f"scenes and channels of {listed(runs(copies), 'episode')} are those of earlier ones: the "
+            "scenario does not change from episode to episode, and a split has the same data in both parts"
+        )
+        return
+    for episode, original in copies.items():
+        expected = "scenes and channels of its own"
+        yield Finding(episode, None, "", "content", expected, f"those of episode {original}")
 
 
 def _against_recording(catalogue: Catalogue, rows: EpisodeRows, number: int) -> Iterator[Finding]:
