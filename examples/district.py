@@ -11,8 +11,10 @@ import argparse
 import re
 import subprocess
 import tempfile
+from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
+from string import Template
 
 import numpy as np
 
@@ -24,7 +26,7 @@ LANE_M, AVENUE_LANES, SIDEWALK_M, KERB_M = 3.2, 2, 3.0, 2.6
 AVENUE_M = LANE_M * AVENUE_LANES + KERB_M + SIDEWALK_M
 """From the middle of the avenue to its façades."""
 STREET_M = LANE_M + SIDEWALK_M
-"""The same of a side street, on whose eastern or northern side vehicles stand, too."""
+"""From the middle of a side street to its façades."""
 END_M = 32.0
 """Roads go on so far beyond the blocks."""
 MATERIALS = {"brick": 0.4, "concrete": 0.3, "glass": 0.2, "metal": 0.1}
@@ -32,6 +34,10 @@ CELLS = (20, 200, 10)
 """Of the LIDAR's grid, as in the paper's s008."""
 
 Point = tuple[float, float]
+Solid = tuple[float, float, float]
+"""A point, the size of a body, or start, end and front of a part of a façade [m]."""
+Mast = tuple[list[float], float]
+"""Place [m] and direction [°] of a station on a roof."""
 
 
 class Shapes:
@@ -55,14 +61,14 @@ class Shapes:
         return made
 
 
-def soup(triangles: list) -> Mesh:
+def soup(triangles: list[tuple[Solid, Solid, Solid]]) -> Mesh:
     """A mesh of triangles whose common corners are one vertex."""
     corners = np.round(np.array(triangles, float).reshape(-1, 3), 3)
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32))
 
 
-def building(origin: Point, along: Point, bays: list, depth: float, height: float) -> Mesh:
+def building(origin: Point, along: Point, bays: list[Solid], depth: float, height: float) -> Mesh:
     """Walls and roof of a building.
 
     Args:
@@ -105,7 +111,7 @@ def building(origin: Point, along: Point, bays: list, depth: float, height: floa
     return soup(triangles)
 
 
-def facade(rng: np.random.Generator, length: float, deepest: float) -> list:
+def facade(rng: np.random.Generator, length: float, deepest: float) -> list[Solid]:
     """Parts of a façade of 3 to 9 m, each so far before its line or behind that they differ."""
     count = max(1, round(length / rng.uniform(4.5, 8.0)))
     cuts = np.round(np.linspace(0, length, count + 1), 2)
@@ -113,7 +119,9 @@ def facade(rng: np.random.Generator, length: float, deepest: float) -> list:
     return [(float(a), float(b), float(f)) for a, b, f in zip(cuts, cuts[1:], fronts, strict=False)]
 
 
-def block(shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high: Point, tall: Point) -> list:
+def block(
+    shapes: Shapes, rng: np.random.Generator, name: str, low: Point, high: Point, tall: Point
+) -> list[Mast]:
     """Buildings around a courtyard.
 
     Args:
@@ -160,12 +168,12 @@ def tree(rng: np.random.Generator, x: float, y: float) -> Mesh:
     return soup(triangles)
 
 
-def box(low: tuple, high: tuple) -> Mesh:
+def box(low: Solid, high: Solid) -> Mesh:
     (x0, y0, _), (x1, y1, z1) = low, high
     return building((x0, y0), (1.0, 0.0), [(0.0, x1 - x0, 0.0)], y1 - y0, z1)
 
 
-def standing(kind: str, size: tuple, x: float, y: float, yaw_deg: float) -> Mesh:
+def standing(kind: str, size: Solid, x: float, y: float, yaw_deg: float) -> Mesh:
     """A vehicle that stands."""
     mesh, c, s = SHAPES[kind](), np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     local = mesh.vertices * size
@@ -215,7 +223,11 @@ LINES = (
 """The avenue, the side street along it, and the streets across, by their nodes."""
 
 
-def scenery(plan: Plan, rng: np.random.Generator, name: str) -> tuple[ImportedScene, list]:
+PARKED = {0.4: (7.5, 2.3, 3.4), 0.5: (5.9, 2.0, 2.6), 0.65: (4.5, 1.8, 1.5)}
+"""Sizes of lorries, vans and cars that stand [m], below which draw."""
+
+
+def scenery(plan: Plan, rng: np.random.Generator, name: str) -> tuple[ImportedScene, list[Mast]]:
     """The scene, and the masts of two roofs beside the avenue."""
     shapes, masts = Shapes(), {}
     for i, (x0, x1) in enumerate(plan.columns):
@@ -224,12 +236,8 @@ def scenery(plan: Plan, rng: np.random.Generator, name: str) -> tuple[ImportedSc
             masts[i, j] = block(shapes, rng, f"block-{i + 1}{j + 1}", (x0, y0), (x1, y1), tall)
     x0, y0, x1, y1 = plan.box
     ground = [(x, y, 0.0) for x in (x0 - 60, x1 + 60) for y in (y0 - 60, y1 + 60)]
-    shapes.add(
-        "ground",
-        "asphalt",
-        soup([(ground[0], ground[2], ground[3]), (ground[0], ground[3], ground[1])]),
-        "ground",
-    )
+    a, b, c, d = ground
+    shapes.add("ground", "asphalt", soup([(a, c, d), (a, d, b)]), "ground")
     kerb = LANE_M * AVENUE_LANES + KERB_M / 2
     for side in (-1, 1):
         for low, high in plan.rows:
@@ -238,25 +246,16 @@ def scenery(plan: Plan, rng: np.random.Generator, name: str) -> tuple[ImportedSc
                 if side < 0 and abs(y - plan.station[1]) < 6:
                     continue  # nothing stands around the station
                 if draw < 0.3:
-                    shapes.add("foliage-trees", "wood", tree(rng, side * (kerb + 2.3), y), "foliage")
-                    trunk = side * (kerb + 2.3)
-                    shapes.add(
-                        "trunks", "wood", box((trunk - 0.15, y - 0.15, 0), (trunk + 0.15, y + 0.15, 2.3))
-                    )
+                    x = side * (kerb + 2.3)
+                    shapes.add("foliage-trees", "wood", tree(rng, x, y), "foliage")
+                    shapes.add("trunks", "wood", box((x - 0.15, y - 0.15, 0), (x + 0.15, y + 0.15, 2.3)))
                 elif low < 0 < high:
                     continue  # the kerb of the middle block is for deliveries
-                elif draw < 0.5:
-                    size = (7.5, 2.3, 3.4) if draw < 0.4 else (5.9, 2.0, 2.6)
-                    shapes.add(
-                        "parked", "metal", standing("truck", size, side * kerb, y, side * 90.0), "vehicle"
-                    )
                 elif draw < 0.65:
-                    shapes.add(
-                        "parked",
-                        "metal",
-                        standing("car", (4.5, 1.8, 1.5), side * kerb, y, side * 90.0),
-                        "vehicle",
-                    )
+                    kind = "truck" if draw < 0.5 else "car"
+                    size = next(size for below, size in PARKED.items() if draw < below)
+                    parked = standing(kind, size, side * kerb, y, side * 90.0)
+                    shapes.add("parked", "metal", parked, "vehicle")
     colours = {"brick": (0.45, 0.2, 0.13), "concrete": None, "glass": None, "metal": None, "wood": None}
     materials = {material: wall_material(material, colour) for material, colour in colours.items()}
     materials["asphalt"] = wall_material("concrete", (0.08, 0.08, 0.09))
@@ -417,90 +416,6 @@ def traffic() -> bytes:
     return "\n".join([*lines, "</routes>", ""]).encode()
 
 
-SCENARIO = """# $title
-#
-# Written by: python examples/district.py --name $base --seed $seed
-
-[run]
-name = "$name"
-frames = 1
-episodes = 10
-sampling_period_ns = 1_000_000_000
-record = ["scene", "channel", $topic"action", "link"]
-
-[[carriers]]
-name = "60GHz"
-frequency_hz = 60e9
-bandwidth_hz = 100e6
-
-[timeouts]
-connect_s = 120  # for every service to join, on machines that are busy with starting them
-rejoin_s = 60    # a service that died is started again, and the run goes on
-
-# --- services ------------------------------------------------------------------------------
-
-[services.traffic]
-role = "world"
-use = "sumo"
-budget_ms = 20
-
-[services.traffic.settings]
-scenery = "file:$base/scene.xml"
-net = "file:$base/net.xml"
-routes = "file:$base/traffic.rou.xml"
-additional = "file:$base/kerbs.add.xml"
-prefix = "vehicle."
-begin_s = 300.0                 # the roads are busy by then, and the tours spread
-between_episodes_s = 30.0       # all episodes are of one traffic
-meshes = ["bus", "car", "truck"]  # people are boxes
-
-[services.channel]
-role = "channel"
-use = "sionna-rt"
-budget_ms = 1000
-
-[services.channel.settings]  # paths by way of vehicles are enumerated, not launched (candidates)
-max_depth = 3
-los = true
-reflection = true
-refraction = false
-diffraction = false
-scattering = false
-outside_itu_range = "nearest"  # ITU-R P.2040 has no brick between 40 and 110 GHz
-object_materials = { pedestrian = "skin" }
-pool = { car = 40, truck = 28, bus = 10, box = 24 }  # bodies held ready for those who come
-
-[services.channel.settings.foliage."foliage-*"]
-attenuation_db_per_m = { "*" = 1.44 }
-source = "Weissberger's modified exponential decay, ESD-TR-81-101, 1982: 0.45 f^0.284 at 60 GHz, up to 14 m"
-
-$lidar[services.link]
-role = "link"
-use = "beams"
-budget_ms = 50
-
-[services.agent]
-role = "agent"
-use = "los-beam"
-budget_ms = 20
-
-[services.recorder]
-role = "recorder"
-use = "mcap"
-budget_ms = 100
-
-# --- devices -------------------------------------------------------------------------------
-
-# At the western kerb of the avenue, no higher than lorries are.
-[[devices]]
-name = "bs"
-kind = "antenna"
-role = "tx"
-position_m = $station
-pitch_deg = 3.0
-array = { columns = 64, pattern = "tr38901" }
-power_dbm = 30.0
-$roofs$devices"""
 ROOF = """
 [[devices]]
 name = "roof-$k"
@@ -559,9 +474,7 @@ array = { columns = 8 }
 
 
 def filled(text: str, **values: object) -> str:
-    for key, value in values.items():
-        text = text.replace(f"${key}", str(value))
-    return text
+    return Template(text).substitute(values)
 
 
 def main() -> None:
@@ -582,6 +495,9 @@ def main() -> None:
     grid = filled(LIDAR, x0=-11.5, x1=11.5, y0=y - 125.0, y1=y + 125.0, cells=list(CELLS))
     roofs = "\n# On roofs; presets keep the station in the street alone, as the paper's sets have one."
     roofs += "".join(filled(ROOF, k=k, place=place, yaw=yaw) for k, (place, yaw) in enumerate(masts, 1))
+    scenario = (
+        (files("caviar_scenarios") / "new" / "district.toml").read_text(encoding="utf-8").removesuffix("\n")
+    )
     common = {"roofs": roofs, "base": args.name, "seed": args.seed, "station": list(plan.station)}
     places = [
         (side * (AVENUE_M - 1.5), y + d)
@@ -602,7 +518,7 @@ def main() -> None:
         ("-fixed", "A district for data sets: ten receivers that stand on its pavements.", "", "", fixed),
     ):
         text = filled(
-            SCENARIO,
+            scenario,
             title=title,
             name=args.name + suffix,
             topic=topic,
