@@ -387,18 +387,14 @@ def traffic() -> bytes:
         route = f'<route edges="{edges_of(tour)}" repeat="{rounds}"/>'
         flows.append(flow(f"user-{k}", "users", 13.0 * k, period, route))
     for k, (way, rate) in enumerate(THROUGH.items()):
-        flows.append(
-            flow(f"flow-{k}", "traffic", k * 0.5, f"exp({rate})", f'<route edges="{edges_of(way)}"/>')
-        )
+        route = f'<route edges="{edges_of(way)}"/>'
+        flows.append(flow(f"flow-{k}", "traffic", k * 0.5, f"exp({rate})", route))
     for k, (way, kerb) in enumerate(DELIVERIES.items()):
         for stay, rate in STAYS_S.items():
             for area in "01":
-                body = (
-                    f'<route edges="{edges_of(way)}"/><stop parkingArea="{kerb}-{area}" duration="{stay}"/>'
-                )
-                flows.append(
-                    flow(f"delivery-{k}{area}-{stay}", "delivery", k * 0.5, f"exp({rate / 2})", body)
-                )
+                stop = f'<stop parkingArea="{kerb}-{area}" duration="{stay}"/>'
+                name, body = f"delivery-{k}{area}-{stay}", f'<route edges="{edges_of(way)}"/>{stop}'
+                flows.append(flow(name, "delivery", k * 0.5, f"exp({rate / 2})", body))
     for k, way in enumerate(WALKS):
         first, last = way.split()
         # SUMO makes all people of a flow when it reads it, so a flow is short.
@@ -486,46 +482,23 @@ def main() -> None:
     rng = np.random.default_rng(args.seed)
     plan = Plan(rng)
     scene, masts = scenery(plan, rng, args.name)
-    write_scene(
-        scene,
-        args.out / args.name,
-        {"net.xml": network(plan), "traffic.rou.xml": traffic(), "kerbs.add.xml": kerbs(plan)},
-    )
+    roads = {"net.xml": network(plan), "traffic.rou.xml": traffic(), "kerbs.add.xml": kerbs(plan)}
+    write_scene(scene, args.out / args.name, roads)
     y = plan.station[1]
     grid = filled(LIDAR, x0=-11.5, x1=11.5, y0=y - 125.0, y1=y + 125.0, cells=list(CELLS))
     roofs = "\n# On roofs; presets keep the station in the street alone, as the paper's sets have one."
     roofs += "".join(filled(ROOF, k=k, place=place, yaw=yaw) for k, (place, yaw) in enumerate(masts, 1))
-    scenario = (
-        (files("caviar_scenarios") / "new" / "district.toml").read_text(encoding="utf-8").removesuffix("\n")
-    )
+    scenario = (files("caviar_scenarios") / "new" / "district.toml").read_text(encoding="utf-8").rstrip()
     common = {"roofs": roofs, "base": args.name, "seed": args.seed, "station": list(plan.station)}
-    places = [
-        (side * (AVENUE_M - 1.5), y + d)
-        for d, side in zip(range(-63, 77, 14), (1, 1, -1, 1, 1) * 2, strict=True)
-    ]
-    fixed = "".join(
-        filled(FIXED, k=k, place=[round(px, 1), round(py, 1), 1.5], yaw=-90.0)
-        for k, (px, py) in enumerate(places)
-    )
-    for suffix, title, topic, lidar, devices in (
-        (
-            "",
-            "A district for data sets: ten vehicles with receivers and LIDARs of their own.",
-            '"lidar.grid", ',
-            grid,
-            MOBILE,
-        ),
-        ("-fixed", "A district for data sets: ten receivers that stand on its pavements.", "", "", fixed),
-    ):
-        text = filled(
-            scenario,
-            title=title,
-            name=args.name + suffix,
-            topic=topic,
-            lidar=lidar,
-            devices=devices,
-            **common,
-        )
+    # At the façades opposite, where nobody walks; rows of elements lie along the avenue.
+    places = [[AVENUE_M - 0.15, round(y - 36.0 + 8 * k, 1), 1.5] for k in range(10)]
+    fixed = "".join(filled(FIXED, k=k, place=place, yaw=180.0) for k, place in enumerate(places))
+    on_vehicles = "ten vehicles with receivers and LIDARs of their own", '"lidar.grid", ', grid, MOBILE
+    standing_still = "ten receivers that stand on its pavements", "", "", fixed
+    for suffix, parts in (("", on_vehicles), ("-fixed", standing_still)):
+        who, topic, lidar, devices = parts
+        title, name = f"A district for data sets: {who}.", args.name + suffix
+        text = filled(scenario, title=title, name=name, topic=topic, lidar=lidar, devices=devices, **common)
         (args.out / f"{args.name}{suffix}.toml").write_text(text)
 
 
