@@ -490,11 +490,11 @@ def main() -> None:
     roofs += "".join(filled(ROOF, k=k, place=place, yaw=yaw) for k, (place, yaw) in enumerate(masts, 1))
     scenario = (files("caviar_scenarios") / "new" / "district.toml").read_text(encoding="utf-8").rstrip()
     common = {"roofs": roofs, "base": args.name, "seed": args.seed, "station": list(plan.station)}
-    # At the façades opposite, where nobody walks; rows of elements lie along the avenue.
-    places = [[AVENUE_M - 0.15, round(y - 36.0 + 8 * k, 1), 1.5] for k in range(10)]
+    # Above the heads, at the façades opposite; rows of elements lie along the avenue.
+    places = [[AVENUE_M - 0.15, round(y - 36.0 + 8 * k, 1), 3.4] for k in range(10)]
     fixed = "".join(filled(FIXED, k=k, place=place, yaw=180.0) for k, place in enumerate(places))
     on_vehicles = "ten vehicles with receivers and LIDARs of their own", '"lidar.grid", ', grid, MOBILE
-    standing_still = "ten receivers that stand on its pavements", "", "", fixed
+    standing_still = "ten receivers at the façades of its avenue", "", "", fixed
     for suffix, parts in (("", on_vehicles), ("-fixed", standing_still)):
         who, topic, lidar, devices = parts
         title, name = f"A district for data sets: {who}.", args.name + suffix
