@@ -264,7 +264,7 @@ def evaluate_command(
         typer.Option(help="dataset of the training, which baselines learn from; by default that of --on"),
     ] = None,
     outage_db: Annotated[
-        float, typer.Option(help="on a dataset: SNR below which a user is out of service [dB]")
+        float, typer.Option(help="on a dataset: SNR below which a user is out of service, in dB")
     ] = 0.0,
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:

@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 try:
     import torch
     from torch import nn
-    from torch.nn.functional import adaptive_avg_pool2d, max_pool2d
+    from torch.nn.functional import avg_pool2d, max_pool2d
 except ImportError:  # `supervised.train_classifier` says what is missing, before this module is needed
     nn = None
 
@@ -39,7 +39,7 @@ SMALL = ("lidar",)
 WAVES = {"position": 32, "last_beam": 16, "aod": 16, "aoa": 16, "departure": 16}
 """Sines and cosines of a part, as of an encoding (`caviar_clients.learning.experiment.Encoding`)."""
 PICTURE = (36, 64)
-"""Rows and columns that pictures are reduced to."""
+"""Rows and columns that pictures are reduced to, or a few more, by means of whole pixels."""
 LINE = 24
 """Points of the straight line from TX to RX at which a LIDAR grid is looked at."""
 MARKED = {"tx": -1, "rx": -2}
@@ -194,7 +194,11 @@ class _Grid(_Module):  # type: ignore[misc]
     def __init__(self, shape: tuple[int, ...], small: bool) -> None:
         super().__init__()
         self._shape = shape
-        self._pool = tuple(max(1, size // most) for size, most in zip(shape, (100, 20, 5), strict=True))
+        # The longer axis of the ground first, whichever of x and y it is.
+        self._swap = shape[1] > shape[0]
+        ground = (shape[1], shape[0]) if self._swap else shape[:2]
+        most = (100, 20, 5)
+        self._pool = tuple(max(1, size // top) for size, top in zip((*ground, shape[2]), most, strict=True))
         layers = -(-shape[2] // self._pool[2])
         first, second, units = (4, 8, 16) if small else (8, 16, 64)
         self.cells = nn.Sequential(
@@ -221,7 +225,8 @@ class _Grid(_Module):  # type: ignore[misc]
         line = (torch.gather(flat, 1, index) > 0).float() * has_tx
         kx, ky, kz = self._pool
         heights = [(rows[..., low : low + kz] > 0).float().amax(dim=-1) for low in range(0, z, kz)]
-        cells = max_pool2d(torch.stack(heights, dim=1), (kx, ky), ceil_mode=True)
+        layers = torch.stack(heights, dim=1)
+        cells = max_pool2d(layers.transpose(2, 3) if self._swap else layers, (kx, ky), ceil_mode=True)
         return {
             "cells": cells.to(torch.uint8),
             "rx": ends["rx"],
@@ -257,15 +262,17 @@ class _Picture(_Module):  # type: ignore[misc]
             nn.Conv2d(8, 16, 3, 2, 1), nn.ReLU(),
             nn.Conv2d(16, 16, 3, 2, 1), nn.ReLU(), nn.Flatten(),
         )  # fmt: skip
+        self._pool = tuple(max(1, size // most) for size, most in zip(shape, PICTURE, strict=False))
         with torch.no_grad():
-            flat = self.layers(torch.zeros(1, channels, *PICTURE)).shape[1]
+            blank = self.reduce(torch.zeros((1, *shape), dtype=torch.uint8))["picture"]
+            flat = self.layers(blank).shape[1]
         self.width = 64
         self.dense = nn.Sequential(nn.Linear(flat, self.width), nn.ReLU())
 
     def reduce(self, rows: Any) -> dict[str, Any]:
         picture = rows.float()
         picture = picture.permute(0, 3, 1, 2) if picture.dim() == 4 else picture[:, None]
-        return {"picture": adaptive_avg_pool2d(picture, PICTURE)}
+        return {"picture": avg_pool2d(picture, self._pool)}
 
     def fit(self, rows: Tensors) -> None:
         self.offset.copy_(rows["picture"].mean((0, 2, 3))[:, None, None])

@@ -21,9 +21,10 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.observations.users import KnownScenario, Users, spec_name
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
-from caviar_protocol.topics import Camera, Depth, Lidar, Scene
+from caviar_protocol.topics import Camera, Channel, Depth, Lidar, Scene
 
 P = TypeVar("P", bound=Payload)
 
@@ -351,6 +352,40 @@ class LastThroughput(_OfPackets):
     field, unit = "throughput", 1e6
 
 
+class Spectrum(Part):
+    """Spatial spectrum of the lowest carrier: |y| of each pair of beams of the codebooks there over the
+    greatest, by ``tx_beam·Nr + rx_beam``; zeros without a path. It tells where to look on a carrier that is
+    higher, as for the agent ``out-of-band``. Shape ``[U·Nt·Nr]``."""
+
+    inputs = (Input(topic="channel", parts=("h",)),)
+    per_user = True
+
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
+        super().__init__(scenario, users, sensor)
+        sizes = {place.beams for place in users.places}
+        if len(sizes) > 1:
+            shown = ", ".join(f"{tx} × {rx}" for tx, rx in sorted(sizes))
+            raise ScenarioError(f"observation 'spectrum' is of users with the same codebooks, not of {shown}")
+        self._pairs = users.places[0].beam_pairs
+
+    @property
+    def bounds(self) -> Bounds:
+        return Bounds(0, 1, (len(self.users) * self._pairs,), np.float32)
+
+    def read(self, moment: Moment) -> NDArray[np.float32]:
+        values = np.zeros((len(self.users), self._pairs), np.float32)
+        for channel in moment.frame.payloads("channel", Channel).values():
+            frequencies = [carrier.frequency_hz for carrier in channel.carriers]
+            lowest = frequencies.index(min(frequencies))
+            h = {(channel.tx[m.tx], channel.rx[m.rx]): m.h for m in channel.h if m.carrier == lowest}
+            for place, pair in moment.users:
+                if (matrix := h.get((pair.tx.name, pair.rx.name))) is not None:
+                    gains = beam_gains(matrix, pair.tx.array, pair.rx.array).reshape(-1)
+                    if (most := gains.max()) > 0:
+                        values[place] = gains / most
+        return values.reshape(-1)
+
+
 class _OfSensor(Part):
     """Product of one sensor; of a sensor that is on several objects, that of each user's object, and
     zeros for a user without."""
@@ -471,6 +506,7 @@ OBSERVATION_PARTS: Mapping[str, type[Part]] = {
     "last_throughput": LastThroughput,
     "buffered": Buffered,
     "waiting": Waiting,
+    "spectrum": Spectrum,
     "lidar_grid": LidarGrid,
     "depth": DepthImage,
     "camera": CameraImage,

@@ -279,7 +279,7 @@ class PolicyAgent(PilotAgent[PolicySettings]):
         other = self.settings.others
         self._baseline: Any = load("agent", other)(AgentSettings(), self.run) if other else None
         path = Path(self.settings.file.removeprefix("file:"))
-        self._served = served = self._load(
+        self._served = served = self.load(
             self._paths.get(self.settings.sha256, path), f"policy {path.name}", self.settings.sha256
         )
         model, card = served.model, served.model.card
@@ -293,9 +293,20 @@ class PolicyAgent(PilotAgent[PolicySettings]):
         note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
         return dataclasses.replace(prepared, notes=(*prepared.notes, note))
 
-    def _load(self, path: Path, called: str, digest: str = "") -> Served:
-        """Load a policy, hold it against the scenario, and run it once."""
-        key = self.run.settings_place.at("file").key
+    def load(self, path: Path, called: str, digest: str = "", setting: str = "file") -> Served:
+        """Load a policy, hold it against the scenario, and run it once.
+
+        Args:
+            path: Of the ONNX file.
+            called: What errors call it.
+            digest: SHA-256 that it has; empty: any.
+            setting: Key that named it, for errors.
+
+        Raises:
+            AssetError: It has another digest.
+            ScenarioError: It is no policy, or does not fit the scenario.
+        """
+        key = self.run.settings_place.at(setting).key
         try:
             model = PolicyModel(path, called)
         except ScenarioError as error:
@@ -368,7 +379,7 @@ class PolicyAgent(PilotAgent[PolicySettings]):
     def _load_beside(self, digest: str, path: Path) -> None:
         called = f"policy {digest[:12]}…"
         try:
-            served = self._load(path, called, digest)
+            served = self.load(path, called, digest)
         except Exception as error:  # whatever a strange file brings about: the run goes on with what it has
             self._refused[digest] = _reason(str(error) or type(error).__name__)
         else:
@@ -380,7 +391,7 @@ class PolicyAgent(PilotAgent[PolicySettings]):
         if imposed:
             # The policy that decided a frame that is computed again.
             if imposed not in self._loaded and imposed in self._paths:
-                self._loaded[imposed] = self._load(self._paths[imposed], f"policy {imposed[:12]}…", imposed)
+                self._loaded[imposed] = self.load(self._paths[imposed], f"policy {imposed[:12]}…", imposed)
             if imposed not in self._loaded:
                 raise ScenarioError(
                     f"frame {frame.number} was decided by the policy of SHA-256 {imposed}, and this file has "
