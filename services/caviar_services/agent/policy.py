@@ -454,7 +454,7 @@ class PolicyAgent(PilotAgent[PolicySettings]):
 
 def _check_action(action: NDArray[np.int64], places: Sequence[Place], called: str, key: str) -> None:
     """Refuse a model whose action is none: before it serves, while the run still has another."""
-    if len(action) < len(places):
+    if len(action) != len(places):
         raise ScenarioError(
             f"{called} gives {len(action)} index(es), and the scenario has {len(places)} user(s); give "
             "one for each",
