@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from caviar_protocol.arrays import Float64Array
 from caviar_protocol.errors import AssetError, SetupError
 from caviar_protocol.host import install_command
+from caviar_space.materials import ObjectMaterials
 from caviar_space.mitsuba_xml import read_scenery, world_mesh
 
 
@@ -111,11 +112,12 @@ SOURCES: Mapping[str, Callable[[str], Path]] = {
 """Finds the description by what follows the name of the source and a colon."""
 
 
-def scenery_triangles(assets: Mapping[str, Path]) -> Float64Array:
+def scenery_triangles(assets: Mapping[str, Path], foliage: Iterable[str] = ()) -> Float64Array:
     """Read all triangles of a world's scenery.
 
     Args:
         assets: What `scenery_assets` gives.
+        foliage: Names of pieces, or patterns of names with ``*``, that are left out.
 
     Returns:
         Corners in world coordinates [m], Shape ``[T, 3, 3]``.
@@ -130,5 +132,7 @@ def scenery_triangles(assets: Mapping[str, Path]) -> Float64Array:
     descriptions = [
         file for name, file in sorted(assets.items()) if PurePosixPath(name).match("scenery/*.xml")
     ]
-    meshes = [world_mesh(shape) for xml in descriptions for shape in read_scenery(xml).shapes]
+    leaves = ObjectMaterials({key: key for key in foliage})
+    shapes = (shape for xml in descriptions for shape in read_scenery(xml).shapes)
+    meshes = [world_mesh(shape) for shape in shapes if not leaves.key_for(shape.name)]
     return np.concatenate([np.zeros((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])

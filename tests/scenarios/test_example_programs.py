@@ -212,3 +212,15 @@ def test_materials_of_streets(tmp_path: Path) -> None:
         r"error \[dB\], from pictures \d", started(tmp_path, "street_materials.py", "m.onnx", *short)
     )
     assert len(list((tmp_path / "made").glob("fig*.png"))) == 4
+
+
+@pytest.mark.parametrize(("name", "seed"), [("district", 1), ("district-b", 2)])
+def test_district_writes_what_ships(tmp_path: Path, name: str, seed: int) -> None:
+    pytest.importorskip("sumo", reason="eclipse-sumo is not installed")
+    started(tmp_path, "district.py", "--out", ".", "--seed", str(seed), "--name", name)
+    shipped = [SCENARIOS / f"{name}.toml", *filter(Path.is_file, (SCENARIOS / name).rglob("*"))]
+    assert len(shipped) > 20
+    for file in shipped:
+        assert (tmp_path / file.relative_to(SCENARIOS)).read_bytes() == file.read_bytes(), file
+    made = {file.name for file in (tmp_path / name).rglob("*") if file.is_file()}
+    assert made == {file.name for file in shipped[1:]}

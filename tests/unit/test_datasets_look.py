@@ -20,12 +20,14 @@ from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.look import data as look_data
 from caviar_clients.datasets.look import figures, maps
+from caviar_clients.datasets.look import page as look_page
 from caviar_clients.datasets.look.data import Scan, UserColumns, read_throughput, read_users
 from caviar_clients.datasets.look.figures import draw_beams, picture
 from caviar_clients.datasets.look.maps import cell_m, draw_gain, draw_scans, map_of, scans_height
 from caviar_clients.datasets.look.page import write_page
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.shares import UserCounts, count_users, paper_counts
 from caviar_protocol.errors import RecordingError, SetupError
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import load_scenario
@@ -147,6 +149,25 @@ def test_a_dataset_of_scenes_alone_says_what_is_missing(tmp_path: Path) -> None:
         "lidar": "No LIDAR is recorded",
     }.items():
         assert words in page.texts[name], name
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_shares_of_users_stand_beside_those_of_the_paper(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(folder, tmp_path / "d")
+    with sqlite3.connect(tmp_path / "d" / "catalogue.sqlite") as base:
+        base.execute("UPDATE users SET los = 0 WHERE episode = 1")
+    users = Dataset(tmp_path / "d").users()
+    los = int((users["los"] & users["valid"]).sum())
+    counts = count_users(Dataset(tmp_path / "d"))
+    assert counts == UserCounts(len(users), int(users["valid"].sum()), los)
+    assert 0 < los < counts.valid
+    monkeypatch.setattr(
+        look_page, "paper_counts", lambda name: paper_counts("s001") if name == "smoke" else ""
+    )
+    text = Page(write_page(tmp_path / "d")).texts["sight"]
+    assert f"{counts}. s001 of the paper: 58,000 users, 41,000 valid (71 %)." in text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -5,19 +5,26 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from caviar_clients.datasets.plan import PRESETS, apply_preset, find_preset, with_cameras, with_own_traffic
+from caviar_clients.datasets.plan import (
+    PRESETS,
+    apply_preset,
+    find_preset,
+    further_transmitters,
+    with_cameras,
+    with_own_traffic,
+)
 from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import ScenarioError
 from caviar_protocol.scenario import Scenario, load_scenario
 
-# Table 2 of the paper: GHz, receivers, ms between scenes, s between episodes, episodes, scenes.
+# Table 2 of the paper: GHz, receivers, ms between scenes, s between episodes, episodes, scenes, valid / 1000.
 TABLE = {
-    "s001": ((60,), "mobile", 100, 30, 116, 50),
-    "s005": ((2.8, 5), "fixed", 10, 35, 125, 80),
-    "s006": ((28, 60), "fixed", 1, 35, 200, 10),
-    "s008": ((60,), "mobile", None, 30, 2086, 1),
-    "s011": ((60,), "mobile", 500, 6, 76, 20),
-    "s012": ((60,), "fixed", 500, 6, 105, 20),
+    "s001": ((60,), "mobile", 100, 30, 116, 50, 41),
+    "s005": ((2.8, 5), "fixed", 10, 35, 125, 80, 100),
+    "s006": ((28, 60), "fixed", 1, 35, 200, 10, 20),
+    "s008": ((60,), "mobile", None, 30, 2086, 1, 11),
+    "s011": ((60,), "mobile", 500, 6, 76, 20, 13),
+    "s012": ((60,), "fixed", 500, 6, 105, 20, 21),
 }
 
 
@@ -28,12 +35,14 @@ def receivers(scenario: Scenario) -> list[tuple[bool, int]]:
 
 @pytest.mark.parametrize("name", TABLE)
 def test_a_preset_has_the_columns_of_the_table(name: str) -> None:
-    ghz, kind, between_ms, between_s, episodes, scenes = TABLE[name]
+    ghz, kind, between_ms, between_s, episodes, scenes, valid = TABLE[name]
     preset = PRESETS[name]
+    assert preset.valid_channels == valid * 1000
     scenario = prepare(apply_preset(preset, load_scenario(preset.scenario))).scenario
     assert [carrier.frequency_hz / 1e9 for carrier in scenario.carriers] == pytest.approx(ghz)
     assert receivers(scenario) == ([(True, 10)] if kind == "mobile" else [(False, 1)] * 10)
     assert (scenario.run.episodes, scenario.run.frames) == (episodes, scenes)
+    assert [device.name for device in scenario.devices if device.role == "tx"] == ["bs"]
     if between_ms is not None:
         assert scenario.run.sampling_period_ns == between_ms * 1_000_000
     assert scenario.services["traffic"].settings["between_episodes_s"] == between_s
@@ -47,6 +56,11 @@ def test_a_preset_keeps_the_scene_it_is_applied_to() -> None:
     scenario = apply_preset(PRESETS["s011"], base)
     assert scenario.services["traffic"].settings["net"] == base.services["traffic"].settings["net"]
     assert scenario.carriers[0].bandwidth_hz == base.carriers[0].bandwidth_hz
+
+
+def test_of_several_transmitters_a_preset_keeps_the_first_that_stands() -> None:
+    assert further_transmitters(load_scenario("district-b")) == ["roof-1", "roof-2"]
+    assert further_transmitters(load_scenario("canyon-mobile")) == []
 
 
 @pytest.mark.parametrize(

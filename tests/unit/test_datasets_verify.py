@@ -24,6 +24,7 @@ from caviar_clients.datasets.estimate import try_worker
 from caviar_clients.datasets.plan import plan_dataset
 from caviar_clients.datasets.rows import rows_of
 from caviar_clients.datasets.verification import Finding, gaps
+from caviar_clients.datasets.verification.physics import PhysicsChecks
 from caviar_clients.datasets.verification.verify import lacking_scenery, verify
 from caviar_protocol.arrays import Payload
 from caviar_protocol.errors import RecordingError
@@ -31,6 +32,7 @@ from caviar_protocol.messages import Status
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario, load_scenario
+from caviar_protocol.space.ply import read_ply
 from caviar_protocol.topics import Channel, Lidar, Link
 from caviar_services.service import Frame
 
@@ -55,6 +57,20 @@ def generated(out: Path, scenario: str | Scenario) -> Path:
             catalogue.add(result.rows, result.measured)
         catalogue.close()
     return out
+
+
+def test_foliage_does_not_hide_a_line_of_sight(tmp_path: Path) -> None:
+    scenario = load_scenario("district")
+    scenery = Path(str(scenario.services["traffic"].settings["scenery"]).removeprefix("file:"))
+    shutil.copytree(scenery.parent / "meshes", tmp_path / "scenery" / "meshes")
+    shutil.copy(scenery, tmp_path / "scenery")
+    services = {"channel": {"role": "channel", "settings": scenario.services["channel"].settings}}
+    crown = read_ply(scenery.parent / "meshes" / "foliage-trees.ply")[0][:8].mean(0)
+    along = np.array([0.0, 3.0, 0.0])
+    for known, is_hidden in ((services, False), ({}, True)):
+        checks = PhysicsChecks(tmp_path, {"scenario": {"services": known}})
+        assert checks._surfaces is not None
+        assert checks._surfaces.between(crown - along, crown + along) is is_hidden
 
 
 @pytest.fixture(scope="module")
@@ -283,6 +299,11 @@ CONTENT: dict[str, tuple[dict[str, Change], str, str]] = {
         },
         "car/rx",
         "H, mmwave",
+    ),
+    "an object that jumps ahead by the width of a lane": (
+        {"scene": lambda scene: replace(scene, position=changed(scene.position, (0, 0), lambda x: x + 3.7))},
+        "car",
+        "movement since the scene before",
     ),
     "an object that jumps": (
         {"scene": lambda scene: replace(scene, position=changed(scene.position, (0, 1), lambda y: y + 30.0))},

@@ -70,7 +70,7 @@ def generate_command(
     scene: Annotated[
         Path | None,
         typer.Option(
-            help="what a preset is applied to, instead of a street canyon: scenario, by name or file, or "
+            help="what a preset is applied to, instead of the district: scenario, by name or file, or "
             "folder of an imported scene"
         ),
     ] = None,
@@ -102,19 +102,24 @@ def generate_command(
         PRESETS,
         apply_preset,
         find_preset,
+        further_transmitters,
         plan_dataset,
         with_cameras,
         with_own_traffic,
     )
+    from caviar_clients.datasets.reader import Dataset
+    from caviar_clients.datasets.shares import count_users, paper_counts
     from caviar_protocol.scenario import load_scenario
 
     require_known("--traffic", traffic, ("shared", "independent"))
     settings = keys_set(set_, record)
+    left_out: list[str] = []
     preset = None if scenario.is_file() else find_preset(str(scenario))
     if preset is not None:
         if scene is not None and scene.is_dir():
             scene /= f"{preset.receivers}.toml"
-        loaded = apply_preset(preset, load_scenario(scene or preset.scenario, settings))
+        base = load_scenario(scene or preset.scenario, settings)
+        loaded, left_out = apply_preset(preset, base), further_transmitters(base)
     elif scene is not None:
         raise RunError(f"--scene goes with a preset, {scenario} is none; presets: {', '.join(PRESETS)}")
     else:
@@ -131,6 +136,8 @@ def generate_command(
     console = Console()
     shape = f"{counted(plan.episodes, 'episode')} of {counted(plan.scenes, 'scene')}"
     print_line(console, f"{loaded.run.name}: {shape} into {out}")
+    if left_out:
+        print_line(console, f"{loaded.run.name} has one transmitter; left out: {', '.join(left_out)}")
     with _Screen(console) as screen:
         try:
             outcome = generate(plan, out, screen, workers=workers, scheduler=scheduler)
@@ -145,6 +152,10 @@ def generate_command(
         f"{counted(outcome.episodes, 'episode')}, {counted(outcome.scenes, 'scene')}, "
         f"{bytes_text(outcome.bytes)} in {duration_text(outcome.wall_s)}: {rate:.2f} scenes/s",
     )
+    if outcome.episodes or outcome.before:
+        print_line(console, str(count_users(Dataset(out))))
+        if words := paper_counts(loaded.run.name):
+            print_line(console, words)
     if outcome.failed:
         for number, error in list(outcome.failed.items())[:SHOWN_FAILURES]:
             print_line(console, f"episode {number} failed: {printable(one_line(error))}", "red")

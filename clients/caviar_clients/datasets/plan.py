@@ -255,6 +255,8 @@ class Preset:
     """Whether arrays on vehicles turn with them; else their rows of elements lie north–south in the world."""
     rung: Literal["siso-rt", "spherical"]
     """Paths between reference points and plane waves over the arrays, or a path for each antenna pair."""
+    valid_channels: int
+    """On a carrier, as the table rounds them."""
 
     count: int = 10
     """Receivers."""
@@ -262,18 +264,18 @@ class Preset:
     @property
     def scenario(self) -> str:
         """Name of the shipped scenario that it is applied to where no other is given."""
-        return f"canyon-{self.receivers}"
+        return "district" if self.receivers == "mobile" else "district-fixed"
 
 
 PRESETS: Mapping[str, Preset] = {
     preset.name: preset
     for preset in (
-        Preset("s001", (60e9,), "mobile", 100, 30.0, 116, 50, False, "siso-rt"),
-        Preset("s005", (2.8e9, 5e9), "fixed", 10, 35.0, 125, 80, False, "siso-rt"),
-        Preset("s006", (28e9, 60e9), "fixed", 1, 35.0, 200, 10, False, "siso-rt"),
-        Preset("s008", (60e9,), "mobile", NO_TIME_MS, 30.0, 2086, 1, False, "siso-rt"),
-        Preset("s011", (60e9,), "mobile", 500, 6.0, 76, 20, True, "siso-rt"),
-        Preset("s012", (60e9,), "fixed", 500, 6.0, 105, 20, True, "spherical"),
+        Preset("s001", (60e9,), "mobile", 100, 30.0, 116, 50, False, "siso-rt", 41_000),
+        Preset("s005", (2.8e9, 5e9), "fixed", 10, 35.0, 125, 80, False, "siso-rt", 100_000),
+        Preset("s006", (28e9, 60e9), "fixed", 1, 35.0, 200, 10, False, "siso-rt", 20_000),
+        Preset("s008", (60e9,), "mobile", NO_TIME_MS, 30.0, 2086, 1, False, "siso-rt", 11_000),
+        Preset("s011", (60e9,), "mobile", 500, 6.0, 76, 20, True, "siso-rt", 13_000),
+        Preset("s012", (60e9,), "fixed", 500, 6.0, 105, 20, True, "spherical", 21_000),
     )
 }
 """The presets, by name."""
@@ -284,7 +286,7 @@ def apply_preset(preset: Preset, scenario: Scenario) -> Scenario:
 
     Args:
         preset: The columns.
-        scenario: Whose scenery, traffic, services and transmitters stay.
+        scenario: Whose scenery, traffic, services and first transmitter stay.
 
     Returns:
         The scenario of the dataset's episodes, of the preset's name.
@@ -310,9 +312,23 @@ def apply_preset(preset: Preset, scenario: Scenario) -> Scenario:
         scenario,
         run=run,
         carriers=_carriers(preset, scenario),
-        devices=tuple(_device(preset, device) for device in _with_receivers(preset, scenario)),
+        devices=tuple(
+            _device(preset, device)
+            for device in _with_receivers(preset, scenario)
+            if device.name not in further_transmitters(scenario)
+        ),
         services={name: _service(preset, spec) for name, spec in scenario.services.items()},
     )
+
+
+def further_transmitters(scenario: Scenario) -> list[str]:
+    """Transmitters that stand beside the first one: the sets of the table have one, and presets that alone.
+
+    Args:
+        scenario: That a preset is applied to.
+    """
+    standing = [d.name for d in scenario.devices if d.kind == "antenna" and d.role == "tx" and not d.on]
+    return standing[1:]
 
 
 def find_preset(name: str) -> Preset | None:

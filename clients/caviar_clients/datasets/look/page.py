@@ -27,6 +27,7 @@ from caviar_clients.datasets.look.data import (
 )
 from caviar_clients.datasets.look.figures import picture, pixels
 from caviar_clients.datasets.reader import Dataset
+from caviar_clients.datasets.shares import count_users, paper_counts
 from caviar_clients.datasets.texts import (
     bytes_text,
     counted,
@@ -326,6 +327,8 @@ def _sight(content: Content) -> dict[str, Any]:
     return {
         "rows": table, "valid": valid, "sight": sight, "hidden": hidden, "none": none,
         "others": max(len(rows) - CLASSES, 0),
+        "shares": str(count_users(content.data)),
+        "paper": paper_counts(str(_scenario_of(content.data).get("run", {}).get("name", ""))),
         "bars": picture(figures.draw_shares(names, *parts), 0.9 + 0.42 * len(bars)),
         "each": each,
         "paths": users.paths,
