@@ -131,6 +131,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "tradeoff.md",
         {"tradeoff-keyframes": "keyframes"},
     ),
+    "learner": Measurement(
+        "python tests/bench/bench_learner.py --markdown {out}/learner.md",
+        "python tests/bench/bench_learner.py --markdown {out}/learner.md",
+        "learner.md",
+        {"learner": ""},
+    ),
     "panda3d": Measurement(
         "python tests/bench/bench_panda3d.py --frames 60 --wall --markdown {out}/panda3d.md",
         "python tests/bench/bench_panda3d.py --wall --markdown {out}/panda3d.md",

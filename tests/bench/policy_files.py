@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 from onnx import TensorProto, helper
 
-from caviar_services.agent.policy import ACTION, CARD_KEY, PolicyCard, write_card
+from caviar_services.agent.policy import ACTION, CARD_KEY, SCORES, PolicyCard, write_card
 
 
 def constant_policy(file: Path, pair: int, beams: tuple[int, int] = (64, 1)) -> Path:
@@ -23,6 +24,36 @@ def constant_policy(file: Path, pair: int, beams: tuple[int, int] = (64, 1)) -> 
     graph = helper.make_graph(nodes, "constant", [observed], [chosen], numbers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     card = PolicyCard(observe=("aod",), codebooks=(beams,), algorithm="constant", seeds=(1,))
+    helper.set_model_props(model, {CARD_KEY: write_card(card)})
+    file.write_bytes(model.SerializeToString())
+    return file
+
+
+def ranking_policy(file: Path, scores: Sequence[float], *, with_scores: bool = True) -> Path:
+    """A policy that ranks pairs of beams in the same way whatever it observes (``aod`` of one user).
+
+    Args:
+        file: Is written.
+        scores: Of each pair.
+        with_scores: Whether the model gives them, and not its choice alone.
+    """
+    count = len(scores)
+    outputs = [helper.make_tensor_value_info(ACTION, TensorProto.INT64, [1, 1])]
+    if with_scores:
+        outputs.append(helper.make_tensor_value_info(SCORES, TensorProto.FLOAT, [1, 1, count]))
+    nodes = [
+        helper.make_node("Mul", ["aod", "zero"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "constants"], [SCORES]),
+        helper.make_node("ArgMax", [SCORES], [ACTION], axis=2, keepdims=0),
+    ]
+    numbers = [
+        helper.make_tensor("zero", TensorProto.FLOAT, [1], [0.0]),
+        helper.make_tensor("constants", TensorProto.FLOAT, [1, 1, count], list(scores)),
+    ]
+    observed = helper.make_tensor_value_info("aod", TensorProto.FLOAT, [1, 1])
+    graph = helper.make_graph(nodes, "ranking", [observed], outputs, numbers)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    card = PolicyCard(observe=("aod",), codebooks=((count, 1),), algorithm="constant", seeds=(1,))
     helper.set_model_props(model, {CARD_KEY: write_card(card)})
     file.write_bytes(model.SerializeToString())
     return file

@@ -208,7 +208,7 @@ def test_a_user_of_another_array_is_served_along_the_straight_line() -> None:
     agent = FingerprintAgent(
         FingerprintSettings(file="none"), RunInfo(name="agent", carriers=(HIGH,), devices=devices)
     )
-    agent._table = table
+    agent.table = table
     channel = channel_of(("bs",), ("rx",), {("mmwave", "bs", "rx"): random_h(1, 2, 16)}, (HIGH,))
     made = agent.step(frame_of(given("scene", scene), given("channel", channel), service="agent"))
     assert beams(made) == {("mmwave", "rx"): (0, 0)}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from link_builders import CARRIER, antenna, channel_of, frame_of, given, scene_of
+from msgspec.structs import replace
 
 from caviar_clients.session.prepared import prepare
 from caviar_protocol.errors import CaviarError, ScenarioError
-from caviar_protocol.messages import Status
 from caviar_protocol.scenario import DeviceSpec, find_scenario
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.space.antenna_arrays import dft_codebook
@@ -30,7 +31,7 @@ RUN = RunInfo(
         DeviceSpec(name="rx", kind="antenna", role="rx"),
     ),
 )
-QUICK = LearnerSettings(explore_frames=150, updates=4, hidden=(32,), waves=4)
+QUICK = LearnerSettings(candidates=3, explore_frames=100, explore_least=0.1, updates=4, hidden=(32,), waves=4)
 
 
 def seen_from(number: int) -> Scene:
@@ -40,59 +41,111 @@ def seen_from(number: int) -> Scene:
     return scene_of(antenna("bs", "tx", (1, 8)), antenna("rx", "rx", (1, 1), place))
 
 
-class Player:
-    """A learner and its link, with a mirror: the best beam is not the straight one, but the one opposite."""
+class Played(NamedTuple):
+    """A frame of a `Player`."""
 
-    def __init__(self, settings: LearnerSettings = QUICK) -> None:
+    tx_beam: int
+    share: float
+    """|y| over that of the best pair."""
+    straight: float
+    """The same of the pair along the straight line."""
+    pilots: int
+
+
+class Player:
+    """A learner in front of a mirror: the best beam is the one opposite to the straight one, which has a
+    third of its |y|."""
+
+    def __init__(self, settings: LearnerSettings = QUICK, run: RunInfo = RUN) -> None:
         self.agent, self.link = (
-            LearnerAgent(settings, RUN),
+            LearnerAgent(settings, run),
             BeamLink(BeamLinkSettings(), RunInfo(name="link")),
         )
         self.agent.prepare(Preparation(demand={}))
         self.agent.reset(0, 1, 0)
-        self.last: Link | None = None
 
-    def step(self, number: int, status: Status = Status.FRESH) -> tuple[int, float]:
-        """The beam that was chosen, and |y| over the best."""
+    def step(self, number: int) -> Played:
         scene = seen_from(number)
         (pair,) = pairs_of(scene)
         at_tx, at_rx = directions(scene, [pair])
         straight = straight_beams(pair.tx.array, at_tx[0], pair.rx.array, at_rx[0])[0]
-        inputs = [given("scene", scene)]
-        if self.last is not None:
-            inputs.append(given("link", self.last, status=status))
-        action = self.agent.step(frame_of(*inputs, number=number, service="agent")).products["action"]
-        h = 1e-5 * dft_codebook(ARRAY)[(8 - straight) % 8][None]
+        beams = dft_codebook(ARRAY)
+        # Where both are one beam its |y| is that of the sum.
+        h = (beams[(8 - straight) % 8] + beams[straight] / 3)[None] * 1e-5
         channel = channel_of(("bs",), ("rx",), {("mmwave", "bs", "rx"): h})
-        seen = [given("scene", scene), given("channel", channel), given("action", action)]
-        link = self.link.step(frame_of(*seen, number=number)).products["link"]
+        seen = [given("scene", scene), given("channel", channel)]
+        made = self.agent.step(frame_of(*seen, number=number, service="agent"))
+        action = made.products["action"]
+        link = self.link.step(frame_of(*seen, given("action", action), number=number)).products["link"]
         assert isinstance(link, Link)
         assert isinstance(action, Action)
-        self.last = link
         (choice,) = action.commands
         assert isinstance(choice, BeamChoice)
-        return choice.tx_beam, float(link.abs_y[0] / link.top_abs_y[0, 0])
+        best = link.top_abs_y[0, 0]
+        shares = float(link.abs_y[0] / best), float(link.baseline_abs_y[0] / best)
+        return Played(choice.tx_beam, *shares, made.counts["pilots"])
 
 
-def test_it_learns_where_paths_leave_while_it_serves() -> None:
+def test_it_learns_where_paths_leave_and_is_never_below_the_straight_line() -> None:
     player = Player()
-    reached = np.array([player.step(number)[1] for number in range(600)])
-    assert reached[:100].mean() < 0.35
-    assert reached[-150:].mean() > 0.8
+    played = [player.step(number) for number in range(400)]
+    assert all(one.share >= one.straight * (1 - 1e-12) for one in played)
+    assert {one.pilots for one in played} == {3}
+    reached = np.array([one.share for one in played])
+    assert reached[:60].mean() < 0.75
+    assert reached[-100:].mean() > 0.95
+
+
+def test_with_noise_another_pair_serves_where_it_is_better_for_sure() -> None:
+    """With pilots that the noise drowns the straight pair serves, with others the best one."""
+    drowned = replace(QUICK, noise_figure_db=60.0, pilot_us=1e-6)
+    heard = replace(QUICK, noise_figure_db=9.0)
+    noisy = [Player(drowned).step(number) for number in range(40)]
+    assert np.mean([one.share > one.straight for one in noisy]) < 0.2
+    player = Player(heard)
+    assert np.mean([player.step(number).share for number in range(300)][-80:]) > 0.9
 
 
 def test_one_that_is_restored_chooses_on_as_before() -> None:
-    player = Player(LearnerSettings(memory=30, explore_frames=60))
+    settings = replace(QUICK, memory=30, explore_frames=60)
+    player = Player(settings)
     for number in range(70):
         player.step(number)
-    state, last = player.agent.checkpoint(), player.last
+    state = player.agent.checkpoint()
     expected = [player.step(number) for number in range(70, 110)]
-    again = Player(LearnerSettings(memory=30, explore_frames=60))
+    again = Player(settings)
     again.agent.restore(state)
     assert again.agent.checkpoint() == state
-    again.last = last
     assert [again.step(number) for number in range(70, 110)] == expected
     assert again.agent.checkpoint() == player.agent.checkpoint(), "bit by bit"
+
+
+SCORES_OF_ONE = [float(beam == 5) for beam in range(8)]
+
+
+def test_it_begins_from_the_ranking_of_a_policy_and_learns_what_is_different(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="needs the extra `policy`")
+    policy_files = pytest.importorskip("policy_files", reason="needs onnx")
+    file = policy_files.ranking_policy(tmp_path / "p.onnx", SCORES_OF_ONE)
+    settings = replace(QUICK, policy=f"file:{file}", candidates=2, explore_least=0.0)
+    shares = [Player(settings).step(number).share for number in range(60)]
+    without = [Player(replace(settings, policy="")).step(number).share for number in range(60)]
+    best = [Player(replace(settings, candidates=8)).step(number) for number in range(60)]
+    opposite = [number for number, one in enumerate(best) if one.tx_beam == 5 and one.straight < 1]
+    assert len(opposite) > 3
+    assert [shares[number] for number in opposite] == [1.0] * len(opposite)
+    assert np.mean([without[number] for number in opposite]) < 0.9
+    learning = Player(replace(settings, candidates=3, explore_least=0.3))
+    reached = [learning.step(number).share for number in range(400)]
+    assert np.mean(reached[-100:]) > np.mean(reached[:60]) + 0.1
+
+
+def test_a_policy_that_ranks_nothing_is_refused_with_its_key(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="needs the extra `policy`")
+    policy_files = pytest.importorskip("policy_files", reason="needs onnx")
+    file = policy_files.ranking_policy(tmp_path / "p.onnx", SCORES_OF_ONE, with_scores=False)
+    with pytest.raises(ScenarioError, match=r"settings\.policy.*p\.onnx gives action and no 'scores'"):
+        Player(replace(QUICK, policy=f"file:{file}"))
 
 
 def test_a_seed_leads_to_the_same_weights_and_another_one_elsewhere() -> None:
@@ -104,17 +157,6 @@ def test_a_seed_leads_to_the_same_weights_and_another_one_elsewhere() -> None:
             player.step(number)
         states.append(player.agent.checkpoint())
     assert states[0] == states[1] != states[2]
-
-
-def test_a_held_link_teaches_nothing_new() -> None:
-    player = Player(LearnerSettings(explore_frames=1, explore_least=0.0))
-    for number in range(5):
-        player.step(number)
-    (model,) = player.agent._models.values()
-    player.step(5, Status.HELD)
-    assert model.seen == 4
-    player.step(6)
-    assert model.seen == 5
 
 
 @pytest.mark.parametrize("hidden", [(), (5,), (5, 4)])

@@ -73,6 +73,16 @@ def test_exits_and_commands_outside_of_a_geofence_and_refused_meshes_are_warned_
     ]
 
 
+def test_an_snr_that_no_receiver_has_is_warned_of_once_with_its_keys() -> None:
+    seen = ReportTally()
+    for number in (4, 5):
+        seen.add(1, [Report(source="radio", counts={"snr-above-60-db": 3})], number)
+    (warning,) = seen.warnings()
+    assert "in 2 frames, first in frame 4 of episode 1" in warning
+    for key in ("power_dbm", "bandwidth_hz", "services.radio.settings.noise_figure_db", "normalization"):
+        assert key in warning
+
+
 def test_warnings_that_differ_in_a_name_alone_are_a_few() -> None:
     seen = ReportTally()
     seen.add(0, [Report(source="world", counts={f"mesh-refused/{n:02}": 1 for n in range(SHOWN_ALIKE + 3)})])

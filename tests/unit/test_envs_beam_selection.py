@@ -260,10 +260,10 @@ def test_reward_normalised_is_the_share_of_the_best_pair(tmp_path: Path) -> None
 
 
 def test_reward_snr_is_power_over_thermal_noise() -> None:
-    """0 dBm over k·T·B with T = 290 K, B = 100 MHz and the link's noise figure, which is one factor."""
+    """−75 dBm over k·T·B with T = 290 K, B = 100 MHz and the link's noise figure, which is one factor."""
     factors = [reward / info["abs_y"][0] ** 2 for reward, info in rewards_of("snr")]
     assert factors == pytest.approx([factors[0]] * len(factors), rel=1e-9)
-    noise_figure_db = 10 * math.log10(1e-3 / (1.380649e-23 * 290.0 * 100e6) / factors[0])
+    noise_figure_db = 10 * math.log10(10**-10.5 / (1.380649e-23 * 290.0 * 100e6) / factors[0])
     assert noise_figure_db == pytest.approx(NOISE_FIGURE_DB, abs=0.05)
 
 

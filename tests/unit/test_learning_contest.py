@@ -160,7 +160,7 @@ def test_settings_of_what_is_always_compared_with_are_refused(tmp_path: Path) ->
 
 def test_figures_that_cannot_be_written_are_known_before_the_first_episode(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"cannot write .*: Is a directory"):
-        evaluate_command(tmp_path / "none.onnx", "geometric", json=tmp_path)
+        evaluate_command([tmp_path / "none.onnx"], "geometric", json=tmp_path)
 
 
 def test_the_tables_of_an_evaluation_are_whole_at_80_columns() -> None:

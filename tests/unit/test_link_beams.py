@@ -110,6 +110,18 @@ def test_transmit_power_moves_the_snr_and_not_abs_y() -> None:
     assert strong.snr[0] / weak.snr[0] == pytest.approx(10**1.3)
 
 
+def test_users_whose_best_beams_have_more_than_60_db_are_counted() -> None:
+    best = 10 * np.log10(linked().snr_best)  # at 30 dBm
+    assert best[1] > best[0] + 1
+
+    def counts(over_db: float) -> dict[str, int]:
+        power = 30.0 + 60.0 + over_db - float(best[1])
+        return dict(stepped(devices=(msgspec.structs.replace(BS, power_dbm=power), NEAR, FAR)).counts)
+
+    assert counts(-0.01) == {}
+    assert counts(0.01) == {"snr-above-60-db": 1}
+
+
 def test_spectral_efficiency_is_capped_where_set() -> None:
     act = choices("agent", ("bs", "near", 1, 1))
     free = linked(act)

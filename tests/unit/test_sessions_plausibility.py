@@ -85,7 +85,7 @@ def test_a_carrier_that_can_only_be_of_another_unit_is_refused(
         ("carriers[0].bandwidth_hz", "100e6", "100e9", "is 100 GHz, more than half of the frequency, 28 GHz"),
         ("carriers[0].frequency_hz", "28e9", "50e6", "is 50 MHz; radio carriers are from 100 MHz to 1 THz$"),
         ("devices[0].power_dbm", "30.0", "150.0", "is 150 dBm, .*; 150 mW would be 21.8 dBm"),
-        ("devices[0].power_dbm", "30.0", "-130.0", "is -130 dBm, beyond any transmitter's -60 to 90 dBm"),
+        ("devices[0].power_dbm", "30.0", "-130.0", "is -130 dBm, beyond any transmitter's -100 to 90 dBm"),
     ],
 )
 def test_an_implausible_value_is_named_with_line_and_what_may_be_meant(
@@ -308,7 +308,7 @@ def test_scenery_that_cannot_be_read_is_for_its_world_to_tell(tmp_path: Path) ->
 
 
 def test_a_run_with_a_warning_prints_it_keeps_it_and_ends_with_status_0(tmp_path: Path) -> None:
-    path = scenario(tmp_path, ("28e9", "50e6"))
+    path = scenario(tmp_path, ("28e9", "50e6"), ("power_dbm = 30.0", "power_dbm = -30.0"))
     console = Console(record=True, width=300)
     report = tmp_path / "summary.json"
     ended = run_scenario(path, tmp_path / "runs", console, frames=3, json_file=report, embedded=True)

@@ -19,6 +19,7 @@ from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 
 if TYPE_CHECKING:
+    from caviar_clients.learning.classification import Classification
     from caviar_clients.learning.evaluate import Evaluation, Interval
     from caviar_clients.learning.experiment import Experiment
     from caviar_clients.learning.training import Progress, SeedResult
@@ -39,9 +40,9 @@ def train_command(
 ) -> None:
     """Train the seeds of an experiment, or go on with what was interrupted: policies, curves, checkpoints."""
     from caviar_clients.learning.campaign import check_folder, reached, train_experiment
-    from caviar_clients.learning.experiment import load_experiment
+    from caviar_clients.learning.classification import Classification, load_any_experiment
 
-    console, loaded = Console(), load_experiment(experiment)
+    console, loaded = Console(), load_any_experiment(experiment)
     folder = check_folder(loaded, out)
     if any(reached(loaded, out).values()):
         print_line(console, f"{folder} goes on: {_steps_of(loaded, out)}")
@@ -54,6 +55,11 @@ def train_command(
             f"stopped; caviar policy train {experiment} --out {out} goes on: {_steps_of(loaded, out)}",
         )
         raise
+    if isinstance(loaded, Classification):
+        from caviar_clients.cli.rankings import training_table
+
+        console.print(training_table(loaded, folder, results))
+        return
     console.print(_results_table(loaded, folder, results))
     if any(result.steps != loaded.experiment.steps for result in results):
         print_line(console, _rollouts(loaded))
@@ -65,7 +71,9 @@ def cores() -> int:
 
 
 @contextmanager
-def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable[[Progress], None]]:
+def training_bars(
+    console: Console, experiment: Experiment | Classification
+) -> Iterator[Callable[[Progress], None]]:
     """Show a bar with the time left for each seed, and one for all of them.
 
     Args:
@@ -77,8 +85,11 @@ def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable
     """
     from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
+    from caviar_clients.learning.classification import Classification
+
     subject, tasks = experiment.experiment, dict[int, Any]()
-    columns = (MofNCompleteColumn(), "steps", TimeRemainingColumn(), "{task.fields[reward]}")
+    unit = "epochs" if isinstance(experiment, Classification) else "steps"
+    columns = (MofNCompleteColumn(), unit, TimeRemainingColumn(), "{task.fields[reward]}")
     with progress_bar(console, *columns) as bar:
         together: list[Any] = []
         done = dict.fromkeys(subject.seeds, 0)
@@ -87,13 +98,19 @@ def training_bars(console: Console, experiment: Experiment) -> Iterator[Callable
             seed, steps, total = progress.seed, progress.steps, progress.total
             if not together:
                 together.append(bar.add_task(subject.name, total=total * len(subject.seeds), reward=""))
-                if progress.rollout and total != subject.steps:
+                if (
+                    progress.rollout
+                    and not isinstance(experiment, Classification)
+                    and total != experiment.experiment.steps
+                ):
                     print_line(console, f"{total:,} steps a seed: {_rollouts(experiment, progress.rollout)}")
             if seed not in tasks:
                 tasks[seed] = bar.add_task(f"seed {seed}", total=total, completed=steps, reward="")
                 # What an earlier call has trained says nothing about the time left.
                 bar.reset(together[0], completed=sum(done.values()) + steps)
             reward = "" if progress.mean_reward is None else f"reward {progress.mean_reward:.4g}"
+            if progress.figures:
+                reward = f"top-10 {progress.figures['top_10']:.1%}"
             bar.update(tasks[seed], completed=steps, reward=reward)
             done[seed] = steps
             bar.update(together[0], completed=sum(done.values()))
@@ -112,14 +129,16 @@ def _rollouts(experiment: Experiment, rollout: int = 0) -> str:
     )
 
 
-def _steps_of(experiment: Experiment, root: Path) -> str:
+def _steps_of(experiment: Experiment | Classification, root: Path) -> str:
     """Rest of each seed, in words."""
     from caviar_clients.learning.campaign import reached
+    from caviar_clients.learning.classification import Classification
     from caviar_clients.learning.training import read_result
 
     folder = root / experiment.experiment.name
+    unit = "epoch" if isinstance(experiment, Classification) else "step"
     return ", ".join(
-        f"seed {seed} is done" if read_result(folder, seed) else f"seed {seed} from step {steps:,}"
+        f"seed {seed} is done" if read_result(folder, seed) else f"seed {seed} from {unit} {steps:,}"
         for seed, steps in reached(experiment, root).items()
     )
 
@@ -219,8 +238,15 @@ def _spaces(space: Any) -> str:
 
 @app.command("evaluate")
 def evaluate_command(
-    policy: Annotated[Path, typer.Argument(help="ONNX file with a card", show_default=False)],
-    on: Annotated[str, typer.Option("--on", help="scenario, by name or file")],
+    policies: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="POLICY...",
+            help="ONNX file with a card; on a dataset several, or folders of trainings",
+            show_default=False,
+        ),
+    ],
+    on: Annotated[str, typer.Option("--on", help="scenario, by name or file; or folder of a dataset")],
     seeds: Annotated[int, typer.Option(min=1, help="number of seeds")] = 5,
     first_seed: Annotated[int, typer.Option(min=0, help="the first; none of training's")] = 1000,
     episodes: Annotated[int, typer.Option(min=1, help="of each seed")] = 1,
@@ -233,11 +259,34 @@ def evaluate_command(
         list[str] | None,
         typer.Option("--set", help="AGENT.SETTING=VALUE, as in --set fingerprint.file=runs/RUN"),
     ] = None,
+    trained_on: Annotated[
+        Path | None,
+        typer.Option(help="dataset of the training, which baselines learn from; by default that of --on"),
+    ] = None,
+    outage_db: Annotated[
+        float, typer.Option(help="on a dataset: SNR below which a user is out of service, in dB")
+    ] = 0.0,
     json: Annotated[Path | None, typer.Option(help="write the figures there too")] = None,
 ) -> None:
-    """Hold a policy against los-beam, random, the optimum and other agents, LOS and NLOS apart."""
+    """Hold policies against los-beam, the optimum and other agents, LOS and NLOS apart.
+
+    In a scenario policies play episodes; on a dataset they rank the beams of its recorded users."""
+    from caviar_clients.cli.rankings import evaluate_rankings, is_dataset
     from caviar_clients.learning.evaluate import BASELINES, evaluate
 
+    if is_dataset(on):
+        given = {"--against": against, "--set": settings}
+        if wrong := [name for name, value in given.items() if value]:
+            raise ScenarioError(
+                f"{wrong[0]}: on a dataset, {on}, all baselines are compared with; leave it out"
+            )
+        evaluate_rankings(Console(), policies, on, trained_on, users, outage_db, json)
+        return
+    if len(policies) > 1:
+        raise ScenarioError(
+            f"{len(policies)} policies: in a scenario, {on}, one is evaluated; --on DATASET takes more"
+        )
+    (policy,) = policies
     rivals: dict[str, dict[str, Any]] = {name: {} for name in (BASELINES if against is None else against)}
     rivals |= _settings_of(settings or [])
     require_writable(json)

@@ -52,6 +52,9 @@ _EVER: Mapping[str, str] = {
     "computes is wrong there",
     "persons-put-elsewhere": "{source} shows people elsewhere at once {times}: SUMO put them farther away "
     "than they walk; see its option --pedestrian.model",
+    "snr-above-60-db": "{source}: SNR above 60 dB in {frames}, first in {first}, where beams hardly matter; "
+    "see power_dbm of the transmitters, bandwidth_hz of the carriers, "
+    "services.{source}.settings.noise_figure_db and the channel's normalization",
     LEFT_GEOFENCE_PREFIX: "{rest!r} of {source} left its geofence {times}, first in {first}",
     OUTSIDE_GEOFENCE_PREFIX: "{rest!r} of {source} was commanded to places outside of its geofence in "
     "{frames}, first in {first}, and kept within",
@@ -271,7 +274,8 @@ class ReportTally:
     def warnings(self) -> list[str]:
         """Warn of what the user probably did not mean: a policy that an agent refused, an agent without users
         in any frame, a device without an object, paths that were dropped for values that are not finite, an
-        object outside of its geofence, a mesh that was refused, a key without effect."""
+        object outside of its geofence, a mesh that was refused, a key without effect, an SNR that no receiver
+        has."""
         never, unmatched = [], []
         for (source, name), frames in sorted(self._frames_with.items()):
             never_prefix = next(filter(name.startswith, _NEVER), "")

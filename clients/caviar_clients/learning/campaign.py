@@ -18,13 +18,15 @@ from difflib import get_close_matches
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 
 from caviar_clients.files import writing
 from caviar_clients.learning.checkpoints import locked, newest_checkpoint
+from caviar_clients.learning.classification import Classification
 from caviar_clients.learning.experiment import Experiment
+from caviar_clients.learning.supervised import train_classifier
 from caviar_clients.learning.training import (
     CHECKPOINTS,
     Progress,
@@ -37,6 +39,7 @@ from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import start_process
 
+AnyExperiment: TypeAlias = Experiment | Classification
 RECORD = "experiment.json"
 """What the folder was begun with."""
 _LOCK = "lock"
@@ -49,7 +52,7 @@ class _Record(msgspec.Struct, frozen=True):
 
 
 def train_experiment(
-    experiment: Experiment,
+    experiment: AnyExperiment,
     root: Path,
     jobs: int = 1,
     report: Callable[[Progress], None] = lambda progress: None,
@@ -75,7 +78,7 @@ def train_experiment(
 
 
 def train_experiments(
-    experiments: Sequence[Experiment],
+    experiments: Sequence[AnyExperiment],
     root: Path,
     jobs: int = 1,
     report: Callable[[str, Progress], None] = lambda name, progress: None,
@@ -125,7 +128,7 @@ def train_experiments(
         left.sort(key=lambda training: training.turn)
         if jobs == 1 or len(left) < 2:
             for one in left:
-                train_seed(one.experiment, one.seed, one.folder, partial(tell, one.name))
+                _train(one.experiment, one.seed, one.folder, partial(tell, one.name))
                 done(one)
         else:
             _train_in_processes(left, jobs, tell, done)
@@ -138,7 +141,7 @@ def train_experiments(
 
 
 @contextmanager
-def _held(experiment: Experiment, root: Path, stepped: Container[str]) -> Iterator[Path]:
+def _held(experiment: AnyExperiment, root: Path, stepped: Container[str]) -> Iterator[Path]:
     """Keep the folder of an experiment from other commands while it is trained, and make it where it lacks.
 
     Where the block fails before a seed has taken a step, what was made is removed.
@@ -168,7 +171,7 @@ def _held(experiment: Experiment, root: Path, stepped: Container[str]) -> Iterat
             raise
 
 
-def check_folder(experiment: Experiment, root: Path) -> Path:
+def check_folder(experiment: AnyExperiment, root: Path) -> Path:
     """Find the folder of an experiment, and check that it was begun with the same values, or is not there.
 
     Args:
@@ -204,7 +207,7 @@ def check_folder(experiment: Experiment, root: Path) -> Path:
     return folder
 
 
-def reached(experiment: Experiment, root: Path) -> dict[int, int]:
+def reached(experiment: AnyExperiment, root: Path) -> dict[int, int]:
     """Steps from which the training of each seed goes on; 0: from its beginning.
 
     Args:
@@ -218,7 +221,7 @@ def reached(experiment: Experiment, root: Path) -> dict[int, int]:
     return found
 
 
-def _values(experiment: Experiment) -> dict[str, Any]:
+def _values(experiment: AnyExperiment) -> dict[str, Any]:
     """The values of an experiment without its seeds, as plain tables."""
     # Through JSON, as the file has them: tuples are lists there.
     made: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(experiment.recorded()))
@@ -246,7 +249,7 @@ def _differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
 class _Training(NamedTuple):
     """The training of a seed."""
 
-    experiment: Experiment
+    experiment: AnyExperiment
     seed: int
     folder: Path
     turn: int
@@ -255,6 +258,14 @@ class _Training(NamedTuple):
     @property
     def name(self) -> str:
         return self.experiment.experiment.name
+
+
+def _train(
+    experiment: AnyExperiment, seed: int, folder: Path, report: Callable[[Progress], None]
+) -> SeedResult:
+    if isinstance(experiment, Classification):
+        return train_classifier(experiment, seed, folder, report)
+    return train_seed(experiment, seed, folder, report)
 
 
 def _train_in_processes(
@@ -319,12 +330,12 @@ def _cause(code: int) -> str:
     return f"the process of a seed ended with status {code}; what it printed says why"
 
 
-def _serve(pipe: Connection, experiment: Experiment, seed: int, folder: Path) -> None:
+def _serve(pipe: Connection, experiment: AnyExperiment, seed: int, folder: Path) -> None:
     """Train a seed, and tell the parent; where the parent is gone, the next report ends this process."""
     os.environ["PYTHONSAFEPATH"] = ""  # of scripts that an environment starts, Python searches the folder
     warnings.showwarning = lambda message, *_, **__: pipe.send(str(message))
     try:
-        train_seed(experiment, seed, folder, pipe.send)
+        _train(experiment, seed, folder, pipe.send)
     except CaviarError as error:
         pipe.send(error)
     except BrokenPipeError:

@@ -52,18 +52,37 @@ def save_checkpoint(folder: Path, model: Any) -> Path:
     Raises:
         RunError: The disk refuses; the checkpoint before is still there.
     """
-    done = folder / f"{model.num_timesteps:012d}"
-    draft = done.with_name(done.name + _PARTIAL)
     import torch
 
-    with writing(draft / _WEIGHTS):
-        shutil.rmtree(draft, ignore_errors=True)
-        draft.mkdir(parents=True)
+    with written_checkpoint(folder, model.num_timesteps) as draft:
         torch.save(model.get_parameters(), draft / _WEIGHTS)
         (draft / _STATE).write_bytes(msgspec.json.encode(_numbers(model)))
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None:
             np.savez(draft / _BUFFER, **_content(buffer))
+    return folder / f"{model.num_timesteps:012d}"
+
+
+@contextmanager
+def written_checkpoint(folder: Path, number: int) -> Iterator[Path]:
+    """Make the folder of a checkpoint, which gets its name when the block has ended; then those before go.
+
+    Args:
+        folder: Of the checkpoints of one seed; it is made where it lacks.
+        number: Of steps, or of epochs.
+
+    Yields:
+        A folder to write files into.
+
+    Raises:
+        RunError: The disk refuses; the checkpoint before is still there.
+    """
+    done = folder / f"{number:012d}"
+    draft = done.with_name(done.name + _PARTIAL)
+    with writing(draft / _WEIGHTS):
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+        yield draft
         for file in draft.iterdir():
             sync_file(file)
         sync_file(draft)
@@ -74,7 +93,6 @@ def save_checkpoint(folder: Path, model: Any) -> Path:
     for path in folder.iterdir():
         if path != done:
             shutil.rmtree(path, ignore_errors=True)
-    return done
 
 
 def load_checkpoint(path: Path, model: Any) -> Any:

@@ -78,10 +78,22 @@ class Subject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     after each, so that a training that goes on from there is the same as one that was never interrupted."""
 
     def __post_init__(self) -> None:
-        if not self.seeds:
-            raise ValueError("seeds is empty; write at least one: seeds = [1]")
-        if len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(f"seeds {list(self.seeds)} has one twice; each is trained once")
+        check_seeds(self.seeds)
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Check the seeds of an experiment.
+
+    Args:
+        seeds: In the order of the file.
+
+    Raises:
+        ValueError: There is none, or one twice.
+    """
+    if not seeds:
+        raise ValueError("seeds is empty; write at least one: seeds = [1]")
+    if len(set(seeds)) != len(seeds):
+        raise ValueError(f"seeds {list(seeds)} has one twice; each is trained once")
 
 
 class EnvironmentSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -285,8 +297,24 @@ def _texts(value: object) -> Iterator[str]:
             yield from _texts(item)
 
 
+def experiment_text(path: Path | str) -> str:
+    """Text of the file of an experiment.
+
+    Args:
+        path: TOML file.
+
+    Raises:
+        ScenarioError: It cannot be read.
+    """
+    try:
+        return Path(path).read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ScenarioError(f"cannot be read: {why}; give a TOML file of an experiment", str(path)) from error
+
+
 def load_experiment(path: Path | str) -> Experiment:
-    """Read and check the file of an experiment.
+    """Read and check the file of an experiment of reinforcement learning.
 
     Args:
         path: TOML file.
@@ -295,13 +323,7 @@ def load_experiment(path: Path | str) -> Experiment:
         ScenarioError: The file cannot be read or breaks a rule; the text has file, line, key, value and what
             to write instead.
     """
-    path = Path(path)
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ScenarioError(f"cannot be read: {why}; give a TOML file of an experiment", str(path)) from error
-    return parse_experiment(text, str(path), path.parent)
+    return parse_experiment(experiment_text(path), str(path), Path(path).parent)
 
 
 def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> Experiment:
@@ -324,6 +346,10 @@ def parse_experiment(text: str, file: str = "", folder: Path | None = None) -> E
         my.toml:2: network.layer: unknown key 'layer'; did you mean 'layers'?
     """
     table, source = read_toml(text, file)
+    subject = table.get("experiment")
+    if isinstance(subject, dict) and (kind := subject.pop("kind", "reinforcement")) != "reinforcement":
+        known = 'write "reinforcement" or "classification"'
+        raise Place("experiment", source).at("kind").error(f"is {kind!r}, {known}")
     made = convert_table(Experiment, table, Place("", source))
     place = Place("environment", source).at("options")
     options = absolute_paths(dict(made.environment.options), folder or Path(), place)

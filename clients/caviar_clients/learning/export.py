@@ -7,7 +7,7 @@ hold the exported file against the original before they are done.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from itertools import zip_longest
 from pathlib import Path
@@ -48,21 +48,26 @@ def card_of(env: BeamEnv, **facts: Any) -> PolicyCard:
         >>> card_of(BeamSelectionEnv("geometric"), algorithm="DQN", steps=20_000).codebooks
         ((64, 1),)
     """
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
     made = PolicyCard(
         observe=tuple(env.observation_space.spaces),
         codebooks=tuple(place.beams for place in env.users.places),
         transmitters=getattr(env, "transmitters", ("*",)),  # a recorded user has one
         environment=f"caviar/{type(env).__name__.removesuffix('Env')}-v0",
         scenario=env.scenario.run.name,
-        versions=versions,
+        versions=versions(),
     )
     return replace(made, **facts)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that policies are trained with."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
 
 
 def export_policy(model: Any, env: BeamEnv, file: Path, **facts: Any) -> PolicyCard:
@@ -170,6 +175,8 @@ def export_module(
     card: PolicyCard,
     choose: Callable[[Observation], NDArray[np.int64]] | None = None,
     usual: Mapping[str, tuple[Any, Any]] | None = None,
+    outputs: Sequence[str] = (ACTION,),
+    any_size: Mapping[str, Sequence[int]] | None = None,
 ) -> PolicyCard:
     """Export a PyTorch module.
 
@@ -183,6 +190,8 @@ def export_module(
         choose: What the exported policy is held against; None: the module itself.
         usual: Mean and standard deviation of parts as the policy sees them, about which they are drawn to
             hold it against the original; of others values are drawn over their bounds, within ±10.
+        outputs: Names of what the module returns, a tuple of several.
+        any_size: By input or output, axes of any size.
 
     Returns:
         The card.
@@ -213,7 +222,8 @@ def export_module(
             example,
             str(traced),
             input_names=list(blank),
-            output_names=[ACTION],
+            output_names=list(outputs),
+            dynamic_axes={n: {a: f"{n}_{a}" for a in axes} for n, axes in (any_size or {}).items()},
             opset_version=OPSET,
             dynamo=False,
         )

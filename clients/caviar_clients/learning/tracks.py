@@ -173,7 +173,7 @@ class _Reader:
         recording = Recording(path)
         scenario = msgspec.convert(recording.metadata.scenario, Scenario)
         self._scenario = self._scenario or scenario
-        settings, episode = _link_settings(scenario), -1
+        settings, episode = link_settings(scenario), -1
         for frame in recording.frames():
             if frame.episode != episode:
                 episode = frame.episode
@@ -277,13 +277,13 @@ class _Reader:
             scene=self._scene,
             bounds=everything.bounds,
             feedback=Observer(known, self._users, [n for n in self._observe if is_feedback(n)]),
-            settings=_link_settings(self._scenario),
+            settings=link_settings(self._scenario),
             seen={name: columns.pop(name) for name in self._static},
             **columns,
         )
 
 
-def _link_settings(scenario: Scenario) -> BeamLinkSettings:
+def link_settings(scenario: Scenario) -> BeamLinkSettings:
     """Settings of the scenario's link ``beams``; the default ones of another."""
     found = (
         spec.settings for spec in scenario.services.values() if (spec.role, spec.use) == ("link", "beams")

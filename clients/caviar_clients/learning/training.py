@@ -67,6 +67,8 @@ class SeedResult(msgspec.Struct, frozen=True, kw_only=True):
     policy: str | None = None
     """SHA-256 of `POLICY`; None: the environment's actions are no beams, or it observes what no agent of a
     run can, and there is none."""
+    figures: Mapping[str, float] = {}
+    """Of a classifier on the episodes of validation, by name; ``steps`` are then epochs."""
 
 
 class Progress(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,6 +81,8 @@ class Progress(msgspec.Struct, frozen=True, kw_only=True):
     rollout: int = 0
     """Steps of all members together from which an algorithm learns at once; 0: not known, as all is done."""
     mean_reward: float | None = None
+    figures: Mapping[str, float] = {}
+    """As of `SeedResult`."""
 
 
 def seed_folder(folder: Path, seed: int) -> Path:
@@ -224,7 +228,7 @@ def _train(experiment: Experiment, seed: int, mine: Path, report: Callable[[Prog
         if newest is not None:
             load_checkpoint(newest, model)
         report(_progress(model, seed, total))
-        with _curves(mine / CURVES, purge_step=model.num_timesteps or None) as logger:
+        with curves(mine / CURVES, purge_step=model.num_timesteps or None) as logger:
             model.set_logger(logger)
             callback = _reporting(lambda: report(_progress(model, seed, total)))
             while model.num_timesteps < total:
@@ -429,7 +433,7 @@ def _mean_reward(model: Any) -> float | None:
 
 
 @contextmanager
-def _curves(folder: Path, purge_step: int | None) -> Iterator[Any]:
+def curves(folder: Path, purge_step: int | None) -> Iterator[Any]:
     """Make a logger of Stable-Baselines3 that writes a file of events, which TensorBoard shows as curves.
 
     Args:

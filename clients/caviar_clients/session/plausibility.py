@@ -28,8 +28,8 @@ FREQUENCY_HZ = (100e6, 1e12)
 """The lower end of mobile radio; the upper end of Recommendation ITU-R P.676."""
 NARROWEST_HZ = 1e3
 """Bandwidth below that of any carrier of NB-IoT (3.75 kHz)."""
-POWER_DBM = (-60.0, 90.0)
-"""From a femtocell's uplink to a long-range radar."""
+POWER_DBM = (-100.0, 90.0)
+"""From what an uplink leaves at a receiver, for channels of mean power 1, to a long-range radar."""
 MOST_ELEMENTS = 2**16
 """Elements of one device: the channel of a pair of such is 64 GiB for each subcarrier."""
 # Values beyond this are written in a larger unit: 2400 MHz, not 60,000 MHz.

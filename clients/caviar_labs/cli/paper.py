@@ -262,3 +262,59 @@ def pizza(
     title = "Pizzas by drone" + (": a trial, whose figures say nothing" if quick else "")
     print_line(console, title, "yellow" if quick else "bold")
     report(console, title, comparisons(found), pictures, name, out, figures_of(found))
+
+
+@app.command("beams")
+def beams(
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="dataset to learn from, with LIDAR grids; by default s008 of district is generated"
+        ),
+    ] = None,
+    other: Annotated[
+        Path | None, typer.Option(help="dataset of another city; by default generated where --data is")
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=10, help="of each dataset that is generated; by default 2086")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="of each training: 1, 2, …")] = 5,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="two seeds, few epochs and data: to see that it works")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="trainings at a time; by default as many as there are cores")
+    ] = None,
+    out: Out = FOLDER,
+) -> None:
+    """Beams learnt from position and LIDAR: benchmark, learning curve, and what each sensor is worth."""
+    from dataclasses import replace
+
+    from caviar_clients.cli.learning import cores
+    from caviar_clients.cli.shared import print_line, require_installed
+    from caviar_clients.files import require_folder, reserved
+
+    require_folder("--out", out, "pictures, tables and figures")
+    generating = () if data else ("datasets", "channel", "world")
+    require_installed("the experiment", ("learning", "plot", *generating))
+    from caviar_labs.paper.beams import Settings, experiment
+    from caviar_labs.paper.beams_figure import draw
+    from caviar_labs.paper.beams_tables import comparisons, figures_of
+
+    name = "beams-quick" if quick else "beams"
+    settings = Settings(folder=out / name, data=data, other=other, seeds=seeds, jobs=jobs or cores())
+    settings = replace(settings, episodes=episodes or settings.episodes)
+    settings = settings.quick() if quick else settings
+    console = Console()
+    with reserved(out / f"{name}.md", out / f"{name}.json"):
+        try:
+            with _time_left(console) as show:
+                found = experiment(settings, show)
+        except KeyboardInterrupt:
+            print_line(console, "stopped; the same command goes on")
+            raise
+        label = "quick form, of which little can be concluded" if quick else ""
+        picture = draw(found, out / f"{name}.png", label)
+    title = "Beam selection from position and LIDAR" + (f": {label}" if label else "")
+    print_line(console, title, "yellow" if quick else "bold")
+    report(console, title, comparisons(found), [picture], name, out, figures_of(found))

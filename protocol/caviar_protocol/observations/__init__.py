@@ -153,7 +153,19 @@ class Observer:
         self._parts: dict[str, Part] = {name: part(scenario, users, name) for name in names}
         self.bounds: Mapping[str, Bounds] = {name: found.bounds for name, found in self._parts.items()}
         """Of each part, by name."""
+        self._places = len(users)
         self._blank = {name: np.zeros(of.shape, of.dtype) for name, of in self.bounds.items()}
+
+    def row_shape(self, name: str) -> tuple[int, ...] | None:
+        """Shape of one place's values of a part; None: all users share the values.
+
+        Args:
+            name: Of the part.
+        """
+        if not self._parts[name].per_user:
+            return None
+        first, *others = self.bounds[name].shape
+        return tuple(others) or (first // self._places,)
 
     @property
     def inputs(self) -> tuple[Input, ...]:

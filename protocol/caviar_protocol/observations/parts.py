@@ -21,9 +21,10 @@ from caviar_protocol.errors import PayloadError, ScenarioError
 from caviar_protocol.messages import Input
 from caviar_protocol.observations.users import KnownScenario, Users, spec_name
 from caviar_protocol.scenario import DeviceSpec
+from caviar_protocol.space.beams import beam_gains
 from caviar_protocol.space.coordinates import Vector
 from caviar_protocol.space.scene import Pair, device_pose, device_velocity, directions
-from caviar_protocol.topics import Camera, Depth, Lidar, Scene
+from caviar_protocol.topics import Camera, Channel, Depth, Lidar, Scene
 
 P = TypeVar("P", bound=Payload)
 
@@ -102,6 +103,8 @@ class Part(ABC):
     """What it needs beside the scene and the link of the frame before."""
     needs_sensor: ClassVar[str] = ""
     """Kind of the device that it is of; empty: none."""
+    per_user: bool = False
+    """Whether axis 0 of its values holds the places one after the other; else all users share them."""
 
     def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         self.users, self.sensor = users, sensor
@@ -123,6 +126,7 @@ class Part(ABC):
 class _PerUser(Part):
     """Numbers for each place; zeros for an empty one."""
 
+    per_user = True
     width: ClassVar[int] = 1
     bound: ClassVar[float] = FAR
 
@@ -208,6 +212,7 @@ class Velocity(_PerUser):
 class OfLink(Part):
     """A number for each place out of the link of the frame before; 0 in frame 0 and for an empty place."""
 
+    per_user = True
     low: ClassVar[float] = 0.0
     high: ClassVar[float] = FAR
     _known: tuple[Any, Any, Any] | None = None  # what `_taken` was found for
@@ -347,6 +352,40 @@ class LastThroughput(_OfPackets):
     field, unit = "throughput", 1e6
 
 
+class Spectrum(Part):
+    """Spatial spectrum of the lowest carrier: |y| of each pair of beams of the codebooks there over the
+    greatest, by ``tx_beam·Nr + rx_beam``; zeros without a path. It tells where to look on a carrier that is
+    higher, as for the agent ``out-of-band``. Shape ``[U·Nt·Nr]``."""
+
+    inputs = (Input(topic="channel", parts=("h",)),)
+    per_user = True
+
+    def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
+        super().__init__(scenario, users, sensor)
+        sizes = {place.beams for place in users.places}
+        if len(sizes) > 1:
+            shown = ", ".join(f"{tx} × {rx}" for tx, rx in sorted(sizes))
+            raise ScenarioError(f"observation 'spectrum' is of users with the same codebooks, not of {shown}")
+        self._pairs = users.places[0].beam_pairs
+
+    @property
+    def bounds(self) -> Bounds:
+        return Bounds(0, 1, (len(self.users) * self._pairs,), np.float32)
+
+    def read(self, moment: Moment) -> NDArray[np.float32]:
+        values = np.zeros((len(self.users), self._pairs), np.float32)
+        for channel in moment.frame.payloads("channel", Channel).values():
+            frequencies = [carrier.frequency_hz for carrier in channel.carriers]
+            lowest = frequencies.index(min(frequencies))
+            h = {(channel.tx[m.tx], channel.rx[m.rx]): m.h for m in channel.h if m.carrier == lowest}
+            for place, pair in moment.users:
+                if (matrix := h.get((pair.tx.name, pair.rx.name))) is not None:
+                    gains = beam_gains(matrix, pair.tx.array, pair.rx.array).reshape(-1)
+                    if (most := gains.max()) > 0:
+                        values[place] = gains / most
+        return values.reshape(-1)
+
+
 class _OfSensor(Part):
     """Product of one sensor; of a sensor that is on several objects, that of each user's object, and
     zeros for a user without."""
@@ -354,8 +393,8 @@ class _OfSensor(Part):
     def __init__(self, scenario: KnownScenario, users: Users, sensor: str) -> None:
         super().__init__(scenario, users, sensor)
         spec = next(d for d in scenario.devices if d.name == sensor)
-        self._is_per_user = spec.count > 1
-        if self._is_per_user and not users.on_objects_of(spec):
+        self.per_user = spec.count > 1
+        if self.per_user and not users.on_objects_of(spec):
             raise ScenarioError(
                 f"{spec.kind} {sensor!r} is on up to {spec.count} objects {spec.on!r}, of which none carries "
                 f"a receiver that is served: {', '.join(users.receivers)}; observe one that is on one object"
@@ -365,7 +404,7 @@ class _OfSensor(Part):
     @property
     def bounds(self) -> Bounds:
         shape = self._one.shape
-        return self._one._replace(shape=(len(self.users), *shape)) if self._is_per_user else self._one
+        return self._one._replace(shape=(len(self.users), *shape)) if self.per_user else self._one
 
     def read(self, moment: Moment) -> NDArray[Any] | None:
         seen = {name: value for name, value in self._seen(moment) if spec_name(name) == self.sensor}
@@ -375,7 +414,7 @@ class _OfSensor(Part):
                     f"{name} shows {list(value.shape)}, and the policy observes {list(self._one.shape)}; use "
                     "the grid, or the size of the picture, that it was trained with"
                 )
-        if not self._is_per_user:
+        if not self.per_user:
             return next(iter(seen.values()), None)
         found = np.zeros(self.bounds.shape, self._one.dtype)
         for place, pair in moment.users:
@@ -467,6 +506,7 @@ OBSERVATION_PARTS: Mapping[str, type[Part]] = {
     "last_throughput": LastThroughput,
     "buffered": Buffered,
     "waiting": Waiting,
+    "spectrum": Spectrum,
     "lidar_grid": LidarGrid,
     "depth": DepthImage,
     "camera": CameraImage,

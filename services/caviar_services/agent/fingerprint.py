@@ -183,7 +183,8 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
     """
 
     Settings = FingerprintSettings
-    _table: Fingerprints
+    table: Fingerprints
+    """What `prepare` learnt from the recording."""
 
     @classmethod
     def check_settings(cls, settings: FingerprintSettings, place: Place) -> None:
@@ -198,7 +199,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         key = self.run.settings_place.at("file").key
         self.run.progress(f"learning from {path.name}", LOADING_S)
         try:
-            self._table = table = learnt(path, self.settings.cell_m)
+            self.table = table = learnt(path, self.settings.cell_m)
         except RecordingError as error:
             raise ScenarioError(str(error), key=key) from error
         self.run.progress("prepared", 0.0)
@@ -231,7 +232,7 @@ class FingerprintAgent(PilotAgent[FingerprintSettings]):
         """The best of the first few pairs of each user's cell."""
         for index, user in enumerate(sounding.users):
             position = device_pose(sounding.scene, user.rx).position
-            pairs = self._table.pairs(Codebooks.for_pair(user, user.carrier.name), position)
+            pairs = self.table.pairs(Codebooks.for_pair(user, user.carrier.name), position)
             if not pairs:
                 sounding.note(UNKNOWN)
                 at_tx, at_rx = directions(sounding.scene, [user])

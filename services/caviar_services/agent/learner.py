@@ -1,12 +1,18 @@
 """Agent ``learner``: online learning, as in the paper (section 2): a model that trains while it serves.
 
 A perceptron estimates what each beam pair is worth to a user, from parts of the observation. In every frame
-it learns from the feedback of the frame before and from what it remembers, then chooses the best pair for
-each user; now and then it tries one at random. All users with equal codebooks share a perceptron, and learn
+pilots try the pair along the straight line, the pairs that the perceptron deems best and some at random; the
+best of them as measured serves the user, and all of them are learnt from. So users are never served worse
+than by ``los-beam``, but for the air time of the pilots, which counts as that of a sweep does
+(`caviar_services.agent.pilots`); with noise another pair serves only where its lower bound is above what was
+measured along the straight line. All users with equal codebooks of a carrier share a perceptron, and learn
 from each other.
 
-Weights, memory and what is asked are state: checkpointed, so that an agent that is killed goes on with the
-same bytes. Draws are seeded by frame. As all state of a service it ends with the episode.
+With ``policy`` the ranking begins as that of a trained policy, and the perceptron learns what is different
+where it serves.
+
+Weights and memory are state: checkpointed, so that an agent that is killed goes on with the same bytes. Draws
+are seeded by frame. As all state of a service it ends with the episode.
 
 A perceptron in NumPy that learns what each of several choices is worth, quick enough for every frame.
 """
@@ -16,7 +22,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -24,15 +31,19 @@ from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float64Array, Int64Array, quantity
 from caviar_protocol.errors import ScenarioError, suggestion
+from caviar_protocol.messages import Input
 from caviar_protocol.observations import FAR, KnownDevices, KnownScenario, Moment, Observer, Users
 from caviar_protocol.scenario import Scenario
 from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
-from caviar_protocol.space.scene import Pair
-from caviar_protocol.topics import BeamChoice, Link, Scene
-from caviar_services.agent.bandits import Feedback, Feedbacks
-from caviar_services.agent.base import Agent, AgentSettings
+from caviar_protocol.space.beams import straight_beams
+from caviar_protocol.space.scene import directions
+from caviar_protocol.topics import Link
+from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
+from caviar_services.agent.policy import SCORES, PolicyAgent, PolicySettings, Served
 from caviar_services.checkpoint import Packed, restored, saved
+from caviar_services.link.base import User
+from caviar_services.registry import with_inputs
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo
 
 _DECAY = 0.9, 0.999
@@ -160,13 +171,22 @@ Units = Annotated[int, quantity("1", "units of a hidden layer", ge=1, le=4096)]
 Scale = Annotated[float, quantity("1", "what a part is divided by, in its unit", gt=0)]
 
 
+_SURE = 2.0
+"""Standard deviations of a measured |y| by which a pair has to exceed the straight one, to serve."""
 MOST_WEIGHTS = 2**22
 """Between hidden layers: with more, an update takes longer than frames are apart."""
 
 
-class LearnerSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnerSettings(PilotSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the agent ``learner``."""
 
+    candidates: Annotated[
+        int, quantity("1", "pairs that are tried for a user in a frame, the straight one too", ge=2, le=4096)
+    ] = 8
+    policy: str = ""
+    """``file:`` and the path of a policy with the output ``scores`` (`caviar_services.agent.policy`) from
+    whose ranking the agent begins, relative to the folder of the scenario; empty: from none. It is read on
+    the machine of the agent."""
     observe: tuple[str, ...] = ("aod",)
     """Parts of the observation (`caviar_protocol.observations.PARTS`) that come from scene and link."""
     scale: dict[str, Scale] = msgspec.field(default_factory=dict)
@@ -175,89 +195,78 @@ class LearnerSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_f
         int, quantity("1", "sines and cosines of each number, up to this multiple", ge=0, le=64)
     ] = 8
     """Of π times the scaled number: of an angle those of its multiples."""
-    feedback: Feedback = "abs_y"
-    """What a receiver feeds back of the frame before: ``abs_y`` or ``spectral_efficiency``."""
     hidden: tuple[Units, ...] = (64, 64)
     """Units of each hidden layer; none: a linear model."""
     learning_rate: Annotated[float, quantity("1", "of Adam", gt=0, le=1)] = 2e-3
-    batch: Annotated[int, quantity("1", "choices that an update learns from", ge=1, le=4096)] = 32
+    batch: Annotated[int, quantity("1", "pairs that an update learns from", ge=1, le=4096)] = 32
     updates: Annotated[int, quantity("1", "of each perceptron in a frame", ge=0, le=100)] = 2
-    memory: Annotated[int, quantity("1", "choices that are remembered", ge=1, le=1_000_000)] = 2000
+    memory: Annotated[int, quantity("1", "pairs that are remembered", ge=1, le=1_000_000)] = 2000
     explore_frames: Annotated[
-        int, quantity("frame", "until choices at random become as rare as they stay", ge=1, le=10**9)
-    ] = 300
-    explore_least: Annotated[float, quantity("1", "share of choices at random then", ge=0, le=1)] = 0.05
+        int, quantity("frame", "until candidates at random become as rare as they stay", ge=1, le=10**9)
+    ] = 100
+    """With a policy they are as rare from the beginning."""
+    explore_least: Annotated[float, quantity("1", "share of candidates at random then", ge=0, le=1)] = 0.2
 
 
-class _Asked(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A choice that no feedback came to yet."""
+class ModelKey(NamedTuple):
+    """Users that share a perceptron: those of a carrier with equal codebooks."""
 
-    tx: str
-    rx: str
+    carrier: str
     beams: tuple[int, int]
     """Sizes of both codebooks."""
-    pair: int
-    features: Packed
 
 
 class _ModelState(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    beams: tuple[int, int]
+    key: ModelKey
     network: PerceptronState
     features: Packed
     pairs: Packed
     worth: Packed
     seen: int
-    highest: float
 
 
 class _LearnerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     models: tuple[_ModelState, ...]
-    asked: tuple[_Asked, ...]
 
 
 class Model:
-    """The perceptron of all users with equal codebooks, and the choices that it remembers.
+    """The perceptron of all users with equal codebooks, and the pairs that it remembers.
 
     Args:
         network: The perceptron.
         features: How many numbers it takes.
-        size: Choices that are remembered; then the oldest make room.
+        size: Pairs that are remembered; then the oldest make room.
     """
 
     def __init__(self, network: Perceptron, features: int, size: int) -> None:
         self.network = network
         self.seen = 0
-        """Choices so far."""
-        self.highest = 0.0
-        """Highest feedback so far, by which feedback is divided."""
+        """Pairs so far."""
         self._features: Float64Array = np.zeros((size, features))
         self._pairs: Int64Array = np.zeros(size, np.int64)
         self._worth: Float64Array = np.zeros(size)
 
     def remember(self, features: Float64Array, pair: int, worth: float) -> None:
-        """Keep a choice and its feedback."""
+        """Keep a pair and what it was worth."""
         place = self.seen % len(self._pairs)
         self._features[place], self._pairs[place], self._worth[place] = features, pair, worth
         self.seen += 1
-        self.highest = max(self.highest, worth)
 
     def learn(self, draws: np.random.Generator, batch: int, rate: float) -> None:
         """Learn from some of what is remembered."""
         rows = draws.integers(min(self.seen, len(self._pairs)), size=batch)
-        scale = self.highest or 1.0
-        self.network.learn(self._features[rows], self._pairs[rows], self._worth[rows] / scale, rate)
+        self.network.learn(self._features[rows], self._pairs[rows], self._worth[rows], rate)
 
-    def state(self, beams: tuple[int, int]) -> _ModelState:
+    def state(self, key: ModelKey) -> _ModelState:
         """State of all of it, to be saved."""
         count = min(self.seen, len(self._pairs))
         return _ModelState(
-            beams=beams,
+            key=key,
             network=self.network.state(),
             features=Packed.pack(self._features[:count], "<f8"),
             pairs=Packed.pack(self._pairs[:count], "<i8"),
             worth=Packed.pack(self._worth[:count], "<f8"),
             seen=self.seen,
-            highest=self.highest,
         )
 
     @classmethod
@@ -267,16 +276,15 @@ class Model:
         model = cls(Perceptron.restored(state.network), features.shape[1], size)
         count = len(features)
         model._features[:count], model._pairs[:count] = features, state.pairs.array(np.int64)
-        model._worth[:count] = state.worth.array(np.float64)
-        model.seen, model.highest = state.seen, state.highest
+        model._worth[:count], model.seen = state.worth.array(np.float64), state.seen
         return model
 
 
-class LearnerAgent(Agent[LearnerSettings]):
+class LearnerAgent(PilotAgent[LearnerSettings]):
     """Learns which beams are worth most while it serves.
 
     Args:
-        settings: Users, observation, perceptron and exploration.
+        settings: Users, pilots, observation, perceptron and exploration.
         run: What the agent knows about the run.
 
     Raises:
@@ -287,11 +295,11 @@ class LearnerAgent(Agent[LearnerSettings]):
     checkpoints: ClassVar[bool] = True
     _observer: Observer
     _places: Users
+    _policy: Served | None = None
 
     def __init__(self, settings: LearnerSettings, run: RunInfo) -> None:
         super().__init__(settings, run)
-        self._models: dict[tuple[int, int], Model] = {}
-        self._asked: tuple[_Asked, ...] = ()
+        self._models: dict[ModelKey, Model] = {}
         self._episode = 0, 0
 
     @classmethod
@@ -309,71 +317,104 @@ class LearnerAgent(Agent[LearnerSettings]):
         """Refuse an observation that the scenario does not have, as of packets where its link sends none."""
         _observed(settings, scenario, place)
 
+    @classmethod
+    def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
+        """Inputs that the sensors of the policy need, which the agent begins from."""
+        policy = settings.get("policy")
+        return PolicyAgent.inputs_with({"file": policy}) if policy else ()
+
     def prepare(self, preparation: Preparation) -> Prepared:
-        """Look the parts of the observation up."""
+        """Look the parts of the observation up, and load the policy."""
         known = KnownDevices(self.run.devices)
         self._places, self._observer = _observed(self.settings, known, self.run.settings_place)
+        if self.settings.policy:
+            self._policy = self._load_policy()
         return super().prepare(preparation)
 
+    def _load_policy(self) -> Served:
+        settings = self.settings
+        served_by = PolicySettings(
+            file=settings.policy, users=settings.users, except_users=settings.except_users
+        )
+        agent = cast(PolicyAgent, with_inputs(PolicyAgent, tuple(self.inputs))(served_by, self.run))
+        path = Path(settings.policy.removeprefix("file:"))
+        served = agent.load(path, f"policy {path.name}", setting="policy")
+        if SCORES not in served.model.outputs:
+            raise self.run.settings_place.at("policy").error(
+                f"policy {path.name} gives {', '.join(served.model.outputs)} and no {SCORES!r}; train "
+                "one that ranks pairs of beams"
+            )
+        return served
+
     def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Every episode begins without knowledge."""
-        self._models, self._asked, self._episode = {}, (), (seed, episode)
+        """Every episode begins without knowledge, or with that of the policy."""
+        self._models, self._episode = {}, (seed, episode)
 
     def checkpoint(self) -> bytes:
-        """Weights, memories, and the choices that no feedback came to yet."""
-        models = tuple(model.state(beams) for beams, model in sorted(self._models.items()))
-        return saved(self, 1, _LearnerState(models, self._asked))
+        """Weights and memories."""
+        models = tuple(model.state(key) for key, model in sorted(self._models.items()))
+        return saved(self, 2, _LearnerState(models))
 
     def restore(self, state: bytes) -> None:
         """See `checkpoint`."""
-        found = restored(self, 1, _LearnerState, state)
-        self._asked = found.asked
-        self._models = {of.beams: Model.restored(of, self.settings.memory) for of in found.models}
+        found = restored(self, 2, _LearnerState, state)
+        self._models = {of.key: Model.restored(of, self.settings.memory) for of in found.models}
 
-    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
-        """Learn from the frame before, then choose for each user, the same on every carrier."""
-        self._learn(frame)
-        users = self._places.present(scene)
-        seen = self._observer.read(Moment(frame, scene, frame.only("link", Link), users))
-        settings, asked = self.settings, []
-        share = max(settings.explore_least, 1.0 - frame.number / settings.explore_frames)
-        for place, pair in users:
+    def select(self, sounding: Sounding) -> Iterator[Measured]:
+        """Try the candidates of each user, take the best, then learn from all."""
+        frame, scene, settings = sounding.frame, sounding.scene, self.settings
+        present = self._places.present(scene)
+        moment = Moment(frame, scene, frame.only("link", Link), present)
+        seen = self._observer.read(moment)
+        ranking = None if self._policy is None else _ranking(self._policy, moment)
+        places = {(pair.tx.name, pair.rx.name): place for place, pair in present}
+        for index, (user, at_tx, at_rx) in enumerate(
+            zip(sounding.users, *directions(scene, sounding.users), strict=True)
+        ):
+            place = places[user.tx.name, user.rx.name]
             features = self._features(seen, place)
-            beams = pair.beams
-            # A stream of its own for each user: who else is there does not move its draws.
-            draws = frame.generator(f"{pair.tx.name}/{pair.rx.name}")
-            if draws.random() < share:
-                chosen = int(draws.integers(beams[0] * beams[1]))
-            else:
-                chosen = int(self._model(beams, len(features)).network.values(features[None])[0].argmax())
-            asked.append(_Asked(pair.tx.name, pair.rx.name, beams, chosen, Packed.pack(features, "<f8")))
-            tx_beam, rx_beam = divmod(chosen, beams[1])
-            yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
-        self._asked = tuple(asked)
-
-    def _learn(self, frame: Frame) -> None:
-        settings = self.settings
-        feedbacks = Feedbacks(frame, settings.feedback)
-        for asked in self._asked:
-            found = [feedbacks.feedback(carrier.name, asked.tx, asked.rx) for carrier in self.run.carriers]
-            # A pair that served is not always the one that was chosen: an agent may have come late.
-            worth = [f[2] for f in found if f and f[0] * asked.beams[1] + f[1] == asked.pair]
-            if worth:
-                features = asked.features.array(np.float64)
-                model = self._model(asked.beams, len(features))
-                model.remember(features, asked.pair, math.fsum(worth) / len(worth))
-        for beams, model in sorted(self._models.items()):
-            draws = frame.generator(f"memory/{beams[0]}/{beams[1]}")
+            model = self._model(ModelKey(user.carrier.name, user.beams), len(features))
+            known = np.zeros(user.beam_pairs) if ranking is None else ranking[place]
+            straight_tx, straight_rx = straight_beams(user.tx.array, at_tx, user.rx.array, at_rx)
+            straight = straight_tx * user.beams[1] + straight_rx
+            tried = self._candidates(frame, user, straight, model.network.values(features[None])[0] + known)
+            measured = sounding.measure(index, [divmod(pair, user.beams[1]) for pair in tried])
+            best = 0
+            if measured is not None:
+                best = int(measured.argmax())
+                if measured[best] - _SURE * sounding.error_of(user) < measured[0]:
+                    best = 0
+                # By the best of the frame: far from the transmitter all magnitudes are small.
+                scale = float(measured.max()) or 1.0
+                for pair, abs_y in zip(tried, measured.tolist(), strict=True):
+                    model.remember(features, pair, abs_y / scale - float(known[pair]))
+            yield Measured(index, *divmod(tried[best], user.beams[1]))
+        for key, model in sorted(self._models.items()):
+            draws = frame.generator(f"memory/{key.carrier}/{key.beams[0]}/{key.beams[1]}")
             for _ in range(settings.updates if model.seen else 0):
                 model.learn(draws, settings.batch, settings.learning_rate)
 
-    def _model(self, beams: tuple[int, int], features: int) -> Model:
-        model = self._models.get(beams)
+    def _candidates(self, frame: Frame, user: User, straight: int, values: Float64Array) -> list[int]:
+        """Pairs to try for a user: the straight one first, some at random, the others by their values."""
+        settings = self.settings
+        count = min(settings.candidates, len(values))
+        share = settings.explore_least
+        if self._policy is None:
+            share = max(share, 1.0 - frame.number / settings.explore_frames)
+        # A stream of its own for each user: who else is there does not move its draws.
+        draws = frame.generator(f"{user.carrier.name}/{user.tx.name}/{user.rx.name}")
+        random = draws.choice(len(values), size=int(draws.binomial(count - 1, share)), replace=False)
+        ranked = np.argsort(-values, kind="stable")[:count]
+        return list(dict.fromkeys([straight, *random.tolist(), *ranked.tolist()]))[:count]
+
+    def _model(self, key: ModelKey, features: int) -> Model:
+        model = self._models.get(key)
         if model is None:
             seed, episode = self._episode
-            draws = generator(seed, episode, f"{self.run.name}/weights/{beams[0]}/{beams[1]}")
-            network = Perceptron((features, *self.settings.hidden, beams[0] * beams[1]), draws)
-            model = self._models[beams] = Model(network, features, self.settings.memory)
+            stream = f"{self.run.name}/weights/{key.carrier}/{key.beams[0]}/{key.beams[1]}"
+            sizes = features, *self.settings.hidden, key.beams[0] * key.beams[1]
+            network = Perceptron(sizes, generator(seed, episode, stream))
+            model = self._models[key] = Model(network, features, self.settings.memory)
         return model
 
     def _features(self, seen: Mapping[str, NDArray[Any]], place: int) -> Float64Array:
@@ -388,6 +429,14 @@ class LearnerAgent(Agent[LearnerSettings]):
         scaled = np.concatenate(found)
         phases = np.outer(np.arange(1, self.settings.waves + 1), math.pi * scaled).reshape(-1)
         return np.concatenate([scaled, np.sin(phases), np.cos(phases)])
+
+
+def _ranking(policy: Served, moment: Moment) -> Float64Array:
+    """Worth of the pairs of each place by their rank r in a policy, 1/(1 + r); Shape ``[U, Nt·Nr]``."""
+    order = policy.model.ranked(policy.observer.read(moment))
+    worth = np.empty(order.shape)
+    np.put_along_axis(worth, order, 1.0 / np.arange(1, order.shape[1] + 1)[None], axis=1)
+    return worth
 
 
 def _observed(settings: LearnerSettings, known: KnownScenario, place: Place) -> tuple[Users, Observer]:

@@ -9,6 +9,7 @@ a frame of length T_sam, n pilots of length τ leave the share 1 − n·τ/T_sam
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -132,6 +133,28 @@ class Sounding:
         noisy: Float64Array = np.abs(abs_y + real + 1j * imaginary)
         return noisy
 
+    def error_of(self, user: User) -> float:
+        """Standard deviation of a measured |y| that is well above it; 0: measurements are exact."""
+        return math.sqrt(self.noise_energy / (transmit_power(user) * self.pilot_s) / 2)
+
+    def measure(self, index: int, pairs: Sequence[tuple[int, int]]) -> Float64Array | None:
+        """Send a pilot for each of some pairs of a user.
+
+        Args:
+            index: The user.
+            pairs: TX and RX beam of each.
+
+        Returns:
+            |y| of each pair as measured; None for a user without a path.
+        """
+        user, matrix = self.users[index], self.h[index]
+        self.count(user, len(pairs))
+        if matrix is None or not pairs:
+            return None
+        tx_beams, rx_beams = zip(*pairs, strict=True)
+        gains = beam_gains(matrix, user.tx.array, user.rx.array)
+        return self.measured(user, gains[list(tx_beams), list(rx_beams)])
+
     def best_of(self, index: int, pairs: Sequence[tuple[int, int]]) -> Measured | None:
         """Try some pairs of a user, and count their pilots; one pair alone is taken untried.
 
@@ -142,18 +165,10 @@ class Sounding:
         Returns:
             The best pair as measured, of equal ones the first; None for a user without a path.
         """
-        user, matrix = self.users[index], self.h[index]
         if len(pairs) > 1:
-            self.count(user, len(pairs))
-        if matrix is None or not pairs:
-            return None
-        tx_beams, rx_beams = zip(*pairs, strict=True)
-        if len(pairs) > 1:
-            abs_y = beam_gains(matrix, user.tx.array, user.rx.array)[list(tx_beams), list(rx_beams)]
-            best = int(self.measured(user, abs_y).argmax())
-        else:
-            best = 0
-        return Measured(index, tx_beams[best], rx_beams[best])
+            abs_y = self.measure(index, pairs)
+            return None if abs_y is None else Measured(index, *pairs[int(abs_y.argmax())])
+        return None if self.h[index] is None or not pairs else Measured(index, *pairs[0])
 
     @property
     def pilots(self) -> int:

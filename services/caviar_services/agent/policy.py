@@ -37,8 +37,22 @@ CARD_KEY = "caviar.card"
 """Key of the card in the metadata of an ONNX file."""
 ACTION = "action"
 """Name of the output with the action."""
+SCORES = "scores"
+"""Name of the output of a policy that ranks pairs of beams: a score for each pair of each place, float32,
+Shape ``[1, U, Nt·Nr]`` by the index of the pair."""
 MAX_REASON = 500
 """Characters of the reason for which a policy is refused: it travels in the header of a DONE."""
+
+
+class TrainedOn(msgspec.Struct, frozen=True, kw_only=True):
+    """Dataset, and episodes of it, that a policy was trained on."""
+
+    dataset: str
+    """Name of its folder."""
+    fingerprint: str
+    """Digest of its settings (`caviar_clients.datasets.settings.fingerprint`)."""
+    episodes: tuple[tuple[int, int], ...]
+    """First and last number of each range of episodes, those of validation too."""
 
 
 class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,6 +68,9 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Parts of the observation, as in `caviar_protocol.observations.PARTS`."""
     codebooks: tuple[tuple[int, int], ...]
     """Beams of the transmitter and of the receiver, of each place."""
+    per_user: bool = False
+    """Whether each user is decided for by itself: ``codebooks`` has one entry, which holds for all places,
+    and the model takes any number of them."""
     transmitters: tuple[str, ...] = ("*",)
     """Those that it chooses for, as names with ``*`` and ``?``."""
     environment: str = ""
@@ -66,6 +83,8 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Of training."""
     figures: Mapping[str, float] = {}
     """What was measured of it, by name."""
+    trained_on: TrainedOn | None = None
+    """Of a policy that was trained on a dataset."""
     versions: Mapping[str, str] = {}
     """Of the packages that it was trained with."""
 
@@ -154,6 +173,20 @@ class PolicyModel:
         (found,) = self._session.run([ACTION], rows)
         return np.asarray(found).reshape(-1)
 
+    def ranked(self, observation: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """Rank the pairs of beams of each place; the model has the output `SCORES`.
+
+        Args:
+            observation: Parts by name, without the axis of the batch.
+
+        Returns:
+            Indices of pairs, best first, Shape ``[U, Nt·Nr]``; of equal ones that of lower index is first.
+        """
+        rows = {name: observation[name][None] for name in self.inputs}
+        (scores,) = self._session.run([SCORES], rows)
+        order: NDArray[np.int64] = np.argsort(-np.asarray(scores)[0], axis=1, kind="stable")
+        return order
+
 
 class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of ``policy``."""
@@ -232,7 +265,7 @@ class PolicyAgent(Agent[PolicySettings]):
         other = self.settings.others
         self._baseline: Any = load("agent", other)(AgentSettings(), self.run) if other else None
         path = Path(self.settings.file.removeprefix("file:"))
-        self._served = served = self._load(
+        self._served = served = self.load(
             self._paths.get(self.settings.sha256, path), f"policy {path.name}", self.settings.sha256
         )
         model, card = served.model, served.model.card
@@ -246,9 +279,20 @@ class PolicyAgent(Agent[PolicySettings]):
         note = f"policy {path.name}, SHA-256 {model.digest[:12]}…{made}"
         return dataclasses.replace(prepared, notes=(*prepared.notes, note))
 
-    def _load(self, path: Path, called: str, digest: str = "") -> Served:
-        """Load a policy, hold it against the scenario, and run it once."""
-        key = self.run.settings_place.at("file").key
+    def load(self, path: Path, called: str, digest: str = "", setting: str = "file") -> Served:
+        """Load a policy, hold it against the scenario, and run it once.
+
+        Args:
+            path: Of the ONNX file.
+            called: What errors call it.
+            digest: SHA-256 that it has; empty: any.
+            setting: Key that named it, for errors.
+
+        Raises:
+            AssetError: It has another digest.
+            ScenarioError: It is no policy, or does not fit the scenario.
+        """
+        key = self.run.settings_place.at(setting).key
         try:
             model = PolicyModel(path, called)
         except ScenarioError as error:
@@ -267,7 +311,8 @@ class PolicyAgent(Agent[PolicySettings]):
         transmitters = card.transmitters if card else ("*",)
         places = Users(known, self.settings.users, self.settings.except_users, transmitters)
         sizes = tuple(place.beams for place in places.places)
-        if card is not None and card.codebooks != sizes:
+        trained = card.codebooks if card else ()
+        if card is not None and (set(trained) != set(sizes) if card.per_user else trained != sizes):
             raise ScenarioError(
                 f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
@@ -314,7 +359,7 @@ class PolicyAgent(Agent[PolicySettings]):
     def _load_beside(self, digest: str, path: Path) -> None:
         called = f"policy {digest[:12]}…"
         try:
-            served = self._load(path, called, digest)
+            served = self.load(path, called, digest)
         except Exception as error:  # whatever a strange file brings about: the run goes on with what it has
             self._refused[digest] = _reason(str(error) or type(error).__name__)
         else:
@@ -326,7 +371,7 @@ class PolicyAgent(Agent[PolicySettings]):
         if imposed:
             # The policy that decided a frame that is computed again.
             if imposed not in self._loaded and imposed in self._paths:
-                self._loaded[imposed] = self._load(self._paths[imposed], f"policy {imposed[:12]}…", imposed)
+                self._loaded[imposed] = self.load(self._paths[imposed], f"policy {imposed[:12]}…", imposed)
             if imposed not in self._loaded:
                 raise ScenarioError(
                     f"frame {frame.number} was decided by the policy of SHA-256 {imposed}, and this file has "

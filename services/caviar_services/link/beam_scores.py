@@ -184,6 +184,10 @@ def _gains(
     return gains
 
 
+HIGHEST_SNR_DB = 60.0
+"""Beyond it receivers are not linear, error vectors of transmitters hide the noise, and all beams carry the
+highest rate: powers, losses or noise are not those of the field."""
+
 RewardKind = Literal["abs_y", "normalised", "snr", "spectral_efficiency"]
 
 
@@ -244,10 +248,12 @@ class SweepingLink(LinkModel[B]):
     def counts(self, scored: Scored) -> dict[str, int]:
         """Events of a frame by name, those that did not happen too."""
         unknown = scored.channels.unknown
+        snr_best = scored.budget.power_over_noise[:, None] * scored.scores.top_abs_y[:, :1] ** 2
         return {
             "users-without-path": scored.without_path - unknown,  # what is unknown has no path either
             "users-without-channel": unknown,
             "commands-for-absent-users": scored.choices.outdated,
+            "snr-above-60-db": int((snr_best > 10 ** (HIGHEST_SNR_DB / 10)).sum()),
         }
 
     def fields(self, scored: Scored, reward_kind: str) -> dict[str, Any]:
