@@ -95,16 +95,16 @@ def test_a_setting_is_written_as_agent_setting_and_value() -> None:
     assert "write agent, setting and value" in str(ended.exception)
 
 
-def model_of(
-    file: Path, name: str, kind: int, shape: list[int], nodes: list[Any], output: str = "action"
-) -> Path:
-    """Write a model with a card for `geometric`."""
+def model_of(file: Path, name: str, kind: int, shape: list[int], nodes: list[Any]) -> Path:
+    """Write a model with a card for `geometric`; each node has an output."""
     onnx = pytest.importorskip("onnx")
+    kinds = {"scores": onnx.TensorProto.FLOAT}
+    outputs = [(of, kinds.get(of, onnx.TensorProto.INT64)) for node in nodes for of in node.output]
     made = onnx.helper.make_graph(
         nodes,
         "policy",
         [onnx.helper.make_tensor_value_info(name, kind, shape)],
-        [onnx.helper.make_tensor_value_info(output, onnx.TensorProto.INT64, None)],
+        [onnx.helper.make_tensor_value_info(*output, None) for output in outputs],
     )
     model = onnx.helper.make_model(made, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
     card = PolicyCard(observe=("aod",), codebooks=((64, 1),))
@@ -116,10 +116,16 @@ def model_of(
 @pytest.mark.parametrize(
     ("name", "kind", "shape", "output", "expected"),
     [
-        ("aod", "DOUBLE", [1, 1], "action", "Unexpected input data type"),
-        ("aod", "FLOAT", [1, 7], "action", r"takes aod \[1, 7\] .* observed is aod \[1, 1\]"),
-        ("aoa", "FLOAT", [1, 1], "action", r"takes aoa \[1, 1\] .* observed is aod"),
-        ("aod", "FLOAT", [1, 1], "beams", "gives beams; .* the output has to be called 'action'"),
+        (
+            "aod",
+            "DOUBLE",
+            [1, 1],
+            "action",
+            r"takes 'aod' as tensor\(double\), and it is observed as float32",
+        ),
+        ("aod", "FLOAT", [1, 7], "action", r"takes 'aod' of shape \[1, 7\], and the scenario's is \[1, 1\]"),
+        ("aoa", "FLOAT", [1, 1], "action", "takes aoa, and aod is observed"),
+        ("aod", "FLOAT", [1, 1], "beams", "gives beams and no 'action'"),
     ],
 )
 def test_a_model_that_does_not_fit_what_is_observed_is_refused(
@@ -127,19 +133,19 @@ def test_a_model_that_does_not_fit_what_is_observed_is_refused(
 ) -> None:
     onnx = pytest.importorskip("onnx")
     node = onnx.helper.make_node("Cast", [name], [output], to=onnx.TensorProto.INT64)
-    file = model_of(tmp_path / "p.onnx", name, getattr(onnx.TensorProto, kind), shape, [node], output)
-    with pytest.raises(ScenarioError, match=rf"policy p\.onnx .*{expected}.*exported for another scenario\?"):
+    file = model_of(tmp_path / "p.onnx", name, getattr(onnx.TensorProto, kind), shape, [node])
+    with pytest.raises(ScenarioError, match=rf"policy p\.onnx {expected}"):
         evaluate(file, "geometric", [1000])
 
 
 @pytest.mark.parametrize(
     ("kind", "values", "expected"),
     [
-        ("INT64", [], "gives 0 numbers of type int64 as 'action', and needed are 1 whole numbers"),
-        ("INT64", [1, 2], "gives 2 numbers of type int64"),
-        ("FLOAT", [math.nan], "gives 1 numbers of type float32"),
-        ("INT64", [-5], "chose pair -5 for uav/rx in frame 0; .* an index from 0 to 63: export it again"),
-        ("INT64", [64], "chose pair 64 for uav/rx in frame 0; .* an index from 0 to 63: export it again"),
+        ("INT64", [], r"gives 0 index\(es\), and the scenario has 1 user"),
+        ("INT64", [1, 2], r"gives 2 index\(es\), and the scenario has 1 user"),
+        ("FLOAT", [math.nan], "chooses pair nan of 64 for place 0"),
+        ("INT64", [-5], "chooses pair -5 of 64 for place 0"),
+        ("INT64", [64], "chooses pair 64 of 64 for place 0"),
     ],
 )
 def test_a_model_that_gives_no_pair_of_beams_is_refused(
@@ -151,6 +157,36 @@ def test_a_model_that_gives_no_pair_of_beams_is_refused(
     file = model_of(tmp_path / "p.onnx", "aod", onnx.TensorProto.FLOAT, [1, 1], [node])
     with pytest.raises(CaviarError, match=expected):
         evaluate(file, "geometric", [1000])
+
+
+def test_candidates_of_a_policy_are_tried_by_pilots(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    scores = onnx.helper.make_tensor(
+        "v", onnx.TensorProto.FLOAT, [1, 1, 64], [float(i % 7) for i in range(64)]
+    )
+    chosen = onnx.helper.make_tensor("w", onnx.TensorProto.INT64, [1], [6])
+    constants = [
+        onnx.helper.make_node("Constant", [], [name], value=value)
+        for name, value in (("scores", scores), ("action", chosen))
+    ]
+    file = model_of(tmp_path / "p.onnx", "aod", onnx.TensorProto.FLOAT, [1, 1], constants)
+    bare = model_of(tmp_path / "q.onnx", "aod", onnx.TensorProto.FLOAT, [1, 1], constants[1:])
+    with pytest.raises(ScenarioError, match=r"gives action and no 'scores'.*candidates = 1"):
+        evaluate(bare, "geometric", [1], against={"policy": {"candidates": 2}})
+    scenario = prepare("geometric", frames=20).scenario
+    players = {
+        str(k): made_player(scenario, "policy", {"file": str(file), "candidates": k, "pilot_us": 100.0})
+        for k in (1, 5, 64)
+    }
+    with Contest(scenario, players | {"oracle": made_player(scenario, "oracle")}) as contest:
+        found = contest.play(seed=1)
+    assert [found[k].pilots for k in ("1", "5", "64", "oracle")] == [0, 5, 64, 0]
+    assert np.array_equal(found["64"].abs_y, found["oracle"].abs_y)
+    # Pairs 6, 13, 20, 27, 34; 6 alone without pilots.
+    assert (found["5"].abs_y >= found["1"].abs_y).all()
+    assert (found["5"].abs_y > found["1"].abs_y).any()
+    left = 1 - 64 * 100e-6 / (scenario.run.sampling_period_ns / 1e9)
+    assert np.allclose(found["64"].net_efficiency, left * found["oracle"].net_efficiency)
 
 
 def test_settings_of_what_is_always_compared_with_are_refused(tmp_path: Path) -> None:

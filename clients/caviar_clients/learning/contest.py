@@ -9,127 +9,23 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from caviar_clients.session.connected import agent_of, open_session
 from caviar_protocol.arrays import BoolArray, Float64Array
-from caviar_protocol.errors import PayloadError, ScenarioError
+from caviar_protocol.errors import ScenarioError
 from caviar_protocol.messages import GrantInput, Input, Status
-from caviar_protocol.observations import Moment, Observer, Users
+from caviar_protocol.observations import Users
 from caviar_protocol.scenario import Scenario, ServiceSpec
 from caviar_protocol.scenario.conversion import Place, convert_settings
 from caviar_protocol.scenario.rules import settings_place
-from caviar_protocol.topics import Action, BeamChoice, Link
+from caviar_protocol.topics import Action, Link
 from caviar_services.agent.pilots import PILOT_TIME, PILOTS
-from caviar_services.agent.policy import PolicyModel
-from caviar_services.registry import load
-from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, Service, StepResult
-
-
-class Player(Protocol):
-    """An agent as a contest drives it: a `Service` of role agent, or what does as one."""
-
-    @property
-    def inputs(self) -> Iterable[Input]:
-        """Topics that it consumes."""
-
-    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """Begin an episode."""
-
-    def step(self, frame: Frame) -> StepResult:
-        """Decide a frame."""
-
-
-class PolicyPlayer:
-    """A policy that chooses beams. It may observe sensors too, which the agent ``policy`` does not take.
-
-    Args:
-        model: The policy, with a card.
-        scenario: In which it plays.
-        users: Receivers that it serves, as names with ``*`` and ``?``.
-        called: What errors call it.
-
-    Raises:
-        ScenarioError: It was trained for other codebooks, observes what the scenario does not have, or is
-            a model that takes or gives something else.
-    """
-
-    def __init__(
-        self, model: PolicyModel, scenario: Scenario, users: Sequence[str], called: str = "the policy"
-    ) -> None:
-        card = model.card
-        if card is None:
-            raise ScenarioError(f"{called} has no card; export it with caviar policy export")
-        self._model, self._users = model, Users(scenario, users, transmitters=card.transmitters)
-        sizes = tuple(place.beams for place in self._users.places)
-        if sizes != card.codebooks:
-            raise ScenarioError(
-                f"{called} was trained for {list(card.codebooks)}, TX × RX beams of each user, and "
-                f"{scenario.run.name!r} has {list(sizes)}; evaluate it where it was trained, or train it "
-                "there"
-            )
-        self._observer = Observer(scenario, self._users, card.observe)
-        self._called = called
-        self._act({name: np.zeros(b.shape, b.dtype) for name, b in self._observer.bounds.items()})
-        self.inputs = (
-            Input(topic="scene"),
-            Input(topic="link", lag=1, required=False),
-            *self._observer.inputs,
-        )
-
-    def reset(self, episode: int, seed: int, t0_ns: int) -> None:
-        """A policy keeps nothing."""
-
-    def step(self, frame: Frame) -> StepResult:
-        """Its choice for each user, the same on all carriers."""
-        scene = frame.scene()
-        present = self._users.present(scene)
-        chosen = self._act(self._observer.read(Moment(frame, scene, frame.only("link", Link), present)))
-        commands = []
-        for place, pair in present:
-            count = self._users.places[place].beam_pairs
-            if not 0 <= chosen[place] < count:
-                raise PayloadError(
-                    f"{self._called} chose pair {chosen[place]} for {pair.rx.name} in frame {frame.number}; "
-                    f"its output 'action' has to be an index from 0 to {count - 1}: export it again"
-                )
-            tx_beam, rx_beam = divmod(chosen[place], pair.beams[1])
-            commands.append(BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam))
-        commands.sort(key=lambda choice: (choice.rx, choice.tx))
-        return StepResult(products={"action": Action(commands=tuple(commands))})
-
-    def _act(self, observation: Mapping[str, NDArray[Any]]) -> list[int]:
-        """Index of a beam pair for each place.
-
-        Raises:
-            ScenarioError: The model cannot be run on what is observed, or gives something else.
-        """
-        try:
-            action = self._model.act(observation)
-        except Exception as error:  # those of ONNX Runtime have no common base
-            takes = (
-                ", ".join(f"{name} {list(shape)}" for name, shape in self._model.inputs.items()) or "nothing"
-            )
-            seen = ", ".join(f"{name} {[1, *value.shape]}" for name, value in observation.items())
-            reason = str(error).partition("\n")[0]
-            raise ScenarioError(
-                f"{self._called} takes {takes} and gives {', '.join(self._model.outputs)}; observed is "
-                f"{seen}, and the output has to be called 'action' ({reason}); was it exported for another "
-                "scenario?"
-            ) from error
-        places = len(self._users)
-        if len(action) != places or not np.issubdtype(action.dtype, np.integer):
-            raise ScenarioError(
-                f"{self._called} gives {len(action)} numbers of type {action.dtype} as 'action', and "
-                f"needed are {places} whole numbers, one for each place of a user; was it exported for "
-                "another scenario?"
-            )
-        chosen: list[int] = action.tolist()
-        return chosen
+from caviar_services.registry import load, with_inputs
+from caviar_services.service import Frame, FrameInput, Preparation, RunInfo, Service
 
 
 @dataclass(frozen=True)
@@ -166,7 +62,7 @@ class EpisodeScore:
 class _Seat:
     """An agent of a contest, its link, and what was measured in the present episode."""
 
-    player: Player
+    player: Service[Any]
     link: Service[Any]
     last: Link | None = None
     rows: list[Float64Array] = field(default_factory=list)
@@ -201,7 +97,7 @@ class Contest:
     def __init__(
         self,
         scenario: Scenario,
-        players: Mapping[str, Player],
+        players: Mapping[str, Service[Any]],
         users: Sequence[str] = ("*",),
         agent: str | None = None,
         transmitters: Sequence[str] = ("*",),
@@ -331,6 +227,7 @@ def made_player(
 
 def _prepared(scenario: Scenario, name: str, spec: ServiceSpec) -> Service[Any]:
     cls = load(spec.role, spec.use)
+    cls = with_inputs(cls, cls.inputs_with(spec.settings))
     place = Place(spec.use) if spec.role == "agent" else settings_place(scenario, name)
     settings = convert_settings(cls.Settings, spec.settings, place)
     cls.check_settings(settings, place)

@@ -17,8 +17,6 @@ import numpy as np
 from caviar_clients.learning.contest import (
     Contest,
     EpisodeScore,
-    Player,
-    PolicyPlayer,
     episodes_of,
     made_player,
 )
@@ -147,7 +145,8 @@ def evaluate(
         seeds: Of the episodes; none of them should be one of training.
         episodes: That follow each other from each seed on.
         progress: Called with the number of episodes that are done.
-        against: Agents to compare with, beside those of `METHODS`, with their settings as in a scenario;
+        against: Agents to compare with, beside those of `METHODS`, with their settings as in a scenario, and
+            settings of the agent ``policy``;
             ``dict.fromkeys(BASELINES, {})`` for those that need none.
         users: Receivers that are served, and count, as names with ``*`` and ``?``.
         agent: Of the scenario, whose place is taken; None: the only one.
@@ -158,14 +157,15 @@ def evaluate(
     """
     called = f"policy {file.name or file}"
     for name, settings in (against or {}).items():
-        if name in METHODS and settings:
+        if name in METHODS and name != "policy" and settings:
             raise ScenarioError(
                 f"{name!r} is compared with as it is, without {', '.join(settings)}; name another agent"
             )
     model = PolicyModel(file, called)
     known = prepare(Path(scenario)).scenario
     served = (users,) if isinstance(users, str) else tuple(users)
-    players: dict[str, Player] = {"policy": PolicyPlayer(model, known, served, called)}
+    settings = {**(against or {}).get("policy", {}), "file": str(file)}
+    players = {"policy": made_player(known, "policy", settings, served, agent)}
     for name, use in _AGENTS.items():
         players[name] = made_player(known, use, {}, served, agent)
     for name, settings in (against or {}).items():

@@ -48,6 +48,9 @@ class PilotSettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 P = TypeVar("P", bound=PilotSettings)
+CHANNEL = Input(topic="channel", parts=("h",))
+"""The channel of the frame itself: pilots are sent at its beginning. An agent looks at the pairs alone that
+it counts pilots for."""
 
 
 def share_left(pilots: int, pilot_us: float, sampling_period_ns: int) -> float:
@@ -202,9 +205,7 @@ class PilotAgent(Agent[P]):
     """
 
     Settings: ClassVar[type[msgspec.Struct]] = PilotSettings
-    # The channel of the frame itself: pilots are sent at its beginning. An agent looks at the pairs alone
-    # that it counts pilots for.
-    inputs: ClassVar[tuple[Input, ...]] = (*Agent.inputs, Input(topic="channel", parts=("h",)))
+    inputs: ClassVar[tuple[Input, ...]] = (*Agent.inputs, CHANNEL)
     _sounding: Sounding | None = None
 
     def step(self, frame: Frame) -> StepResult:

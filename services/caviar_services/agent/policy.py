@@ -11,15 +11,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from caviar_protocol.arrays import quantity
 from caviar_protocol.errors import AssetError, CaviarError, PayloadError, ScenarioError, SetupError
 from caviar_protocol.fields import DigestOrNone as Digest
 from caviar_protocol.host import install_command
@@ -30,6 +31,7 @@ from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
+from caviar_services.agent.pilots import CHANNEL, Measured, PilotAgent, PilotSettings, Sounding
 from caviar_services.registry import load
 from caviar_services.service import Frame, Preparation, Prepared, RunInfo, StepResult
 
@@ -188,7 +190,7 @@ class PolicyModel:
         return order
 
 
-class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PolicySettings(PilotSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of ``policy``."""
 
     file: str
@@ -197,6 +199,9 @@ class PolicySettings(AgentSettings, frozen=True, kw_only=True, forbid_unknown_fi
     observe: tuple[str, ...] = ()
     """Parts of the observation; empty: those of the policy's card. For a file without a card, for one that
     only the agent's own machine has, and for parts that a policy to come observes (``caviar swap``)."""
+    candidates: Annotated[int, quantity("1", "best ranked pairs of a user that are tried", ge=1, le=4096)] = 1
+    """1: the policy's choice is taken without a pilot. More: the best of them as measured by pilots, of a
+    policy that ranks pairs (output ``scores``)."""
     others: Literal["", "los-beam", "random"] = ""
     """Agent that chooses for the users of transmitters that the policy was not trained for; empty: they have
     no beams."""
@@ -214,7 +219,7 @@ class Served(NamedTuple):
     places: Users
 
 
-class PolicyAgent(Agent[PolicySettings]):
+class PolicyAgent(PilotAgent[PolicySettings]):
     """Serves a trained policy: `caviar_services.agent.policy` says what its file holds.
 
     The digest of the file stands in the decisions of every frame, and a replay takes the files that decided.
@@ -227,8 +232,12 @@ class PolicyAgent(Agent[PolicySettings]):
 
     Settings: ClassVar[type[msgspec.Struct]] = PolicySettings
     packages: ClassVar[tuple[str, ...]] = ("onnxruntime",)
+    # The channel, which pilots measure, is asked for by `inputs_with`.
+    inputs: ClassVar[tuple[Input, ...]] = Agent.inputs
     _served: Served
     _producers: Mapping[str, tuple[str, ...]]
+    # Pairs of beams that are tried in this frame, by transmitter and receiver.
+    _tried: Mapping[tuple[str, str], Sequence[tuple[int, int]]]
 
     def __init__(self, settings: PolicySettings, run: RunInfo) -> None:
         super().__init__(settings, run)
@@ -241,7 +250,12 @@ class PolicyAgent(Agent[PolicySettings]):
     @classmethod
     def inputs_with(cls, settings: Mapping[str, object]) -> Sequence[Input]:
         """Inputs that the policy's sensors need, where its file is on this machine or ``observe`` names
-        them."""
+        them; with several ``candidates`` the channel."""
+        measured = (CHANNEL,) if settings.get("candidates", 1) != 1 else ()
+        return (*cls._observed(settings), *measured)
+
+    @staticmethod
+    def _observed(settings: Mapping[str, object]) -> Sequence[Input]:
         observe = settings.get("observe")
         file = Path(str(settings.get("file", "")).removeprefix("file:"))
         if not observe and file.is_file():
@@ -330,6 +344,12 @@ class PolicyAgent(Agent[PolicySettings]):
                     key=key,
                 )
         _check_shapes(model, observer, called, key)
+        if self.settings.candidates > 1 and SCORES not in model.outputs:
+            raise ScenarioError(
+                f"{called} gives {', '.join(model.outputs)} and no {SCORES!r}: it ranks no pairs; write "
+                'candidates = 1, or train one that does (kind = "classification")',
+                key=key,
+            )
         # Buffers are made at the first run, which would else be late.
         try:
             action = model.act({name: np.zeros(b.shape, b.dtype) for name, b in observer.bounds.items()})
@@ -391,8 +411,11 @@ class PolicyAgent(Agent[PolicySettings]):
             decisions[REFUSED] = f"{wanted} {self._refused.pop(wanted)}"
         return replace(made, decisions=decisions)
 
-    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterable[BeamChoice]:
-        """The policy's choice for each user, the same on every carrier, and that of ``others``."""
+    def choose(self, frame: Frame, scene: Scene, pairs: Sequence[Pair]) -> Iterator[BeamChoice]:
+        """The policy's choice for each user, and that of ``others``.
+
+        Without pilots it is the same on every carrier; with several ``candidates`` the best of them on each.
+        """
         model, observer, places = self._served
         users = places.present(scene)
         moment = Moment(frame, scene, frame.only("link", Link), users)
@@ -400,7 +423,16 @@ class PolicyAgent(Agent[PolicySettings]):
             served = {(pair.tx.name, pair.rx.name) for _, pair in users}
             left = [pair for pair in pairs if (pair.tx.name, pair.rx.name) not in served]
             yield from self._baseline.choose(frame, scene, left)
-        action = model.act(observer.read(moment)).tolist()
+        observation, most = observer.read(moment), self.settings.candidates
+        if most > 1:
+            ranked = model.ranked(observation)[:, :most].tolist()
+            self._tried = {
+                (pair.tx.name, pair.rx.name): [divmod(index, pair.beams[1]) for index in ranked[place]]
+                for place, pair in users
+            }
+            yield from super().choose(frame, scene, [pair for _, pair in users])
+            return
+        action = model.act(observation).tolist()
         for place, pair in users:
             size = places.places[place].beam_pairs
             index = action[place] if place < len(action) else -1
@@ -412,10 +444,17 @@ class PolicyAgent(Agent[PolicySettings]):
             tx_beam, rx_beam = divmod(int(index), pair.beams[1])
             yield BeamChoice(tx=pair.tx.name, rx=pair.rx.name, tx_beam=tx_beam, rx_beam=rx_beam)
 
+    def select(self, sounding: Sounding) -> Iterator[Measured]:
+        """The best of the pairs that the policy ranks first, as measured."""
+        for index, user in enumerate(sounding.users):
+            found = sounding.best_of(index, self._tried[user.tx.name, user.rx.name])
+            if found is not None:
+                yield found
+
 
 def _check_action(action: NDArray[np.int64], places: Sequence[Place], called: str, key: str) -> None:
     """Refuse a model whose action is none: before it serves, while the run still has another."""
-    if len(action) < len(places):
+    if len(action) != len(places):
         raise ScenarioError(
             f"{called} gives {len(action)} index(es), and the scenario has {len(places)} user(s); give "
             "one for each",
