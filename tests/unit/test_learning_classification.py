@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ from caviar_clients.cli.main import app
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
+from caviar_clients.learning.networks import AROUND, LINE, OBSERVED, STEPS, BeamModel, BeamNetwork
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
-from caviar_clients.learning.samples import read_samples
+from caviar_clients.learning.samples import Samples, read_samples
 from caviar_clients.learning.supervised import Rows, export_classifier, make_model, train_classifier
 from caviar_clients.learning.training import POLICY, Progress, seed_folder
-from caviar_protocol.errors import ScenarioError
+from caviar_protocol.errors import ScenarioError, SetupError
+from caviar_protocol.topics import AntennaArray
 from caviar_services.agent.policy import PolicyModel
 
 pytest.importorskip("stable_baselines3", reason="needs the extra `learning`")
@@ -82,7 +84,7 @@ def test_an_agent_chooses_what_was_judged(policy: Path, tmp_path: Path) -> None:
     dataset = Dataset(generated(played, tmp_path / "served", 3))
     users = dataset.users()
     served = np.stack([users["link.tx_beam"], users["link.rx_beam"]], axis=1)
-    samples = read_samples(dataset, ("position",))
+    samples = read_samples(dataset, OBSERVED["position"])
     order = ranked_by_policy(PolicyModel(policy), samples, "policy").order
     assert len(samples) == 3 * SCENES * 2
     np.testing.assert_array_equal(order[:, 0], served[:, 0] * RX + served[:, 1])
@@ -92,7 +94,7 @@ def test_an_agent_chooses_what_was_judged(policy: Path, tmp_path: Path) -> None:
 
 def test_both_orders_of_pairs_are_served_as_one(data: Path, policy: Path, tmp_path: Path) -> None:
     other = trained(experiment(data, 'model = { name = "position" }\nlabel = { order = "rx-tx" }'), tmp_path)
-    samples = read_samples(Dataset(data), ("position",))
+    samples = read_samples(Dataset(data), OBSERVED["position"])
     for file in (policy, other):
         order = ranked_by_policy(PolicyModel(file), samples, "policy").order
         chosen = np.take_along_axis(samples.abs_y, order[:, :4], axis=1).max(1)
@@ -174,6 +176,26 @@ def test_what_cannot_be_trained_is_refused(
     assert all(word in str(caught.value) for word in words), caught.value
 
 
+def test_a_network_that_mixes_users_is_not_exported(data: Path, tmp_path: Path) -> None:
+    samples = read_samples(Dataset(data), ("departure",))
+    made = experiment(data, 'model = { name = "position", observe = ["departure"] }')
+
+    class Mixed(BeamModel):
+        def forward(self, rows: Any) -> Any:
+            z = rows["departure"].flip(0)[:, 1:2] * 16 + 16  # of another user
+            return -((torch.arange(TX * RX) - z) ** 2)
+
+    class Constant(BeamModel):
+        def forward(self, rows: Any) -> Any:
+            of_each = rows["departure"].sum(1, keepdim=True).expand(len(rows["departure"]), 1)
+            return of_each + torch.zeros(TX * RX)
+
+    for model, words in ((Mixed(), "by itself"), (Constant(), "x.shape[0]")):
+        with pytest.raises(SetupError) as caught:
+            export_classifier(made, model, samples, tmp_path / "mixed.onnx", 1, 1, {})
+        assert words in str(caught.value)
+
+
 def test_a_network_of_the_users_own_is_trained_from_a_file(data: Path, tmp_path: Path) -> None:
     (tmp_path / "my_network.py").write_text(
         "import torch\n"
@@ -218,7 +240,7 @@ def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_p
         observed={"camera": pictures, "position": samples.observed["position"]},
         row_shapes={"camera": None, "position": (3,)},
     )
-    made = experiment(data, 'model = { name = "image" }')
+    made = experiment(data, 'model = { name = "image", observe = ["camera", "position"] }')
     model = make_model(made, seen)
     rows = Rows.read(model, seen, np.arange(len(seen)), made)
     model.fit(rows.reduced)
@@ -230,29 +252,51 @@ def test_pictures_that_users_share_and_a_spectrum_are_observed(data: Path, tmp_p
     assert np.mean(order[:, 0] == wanted) > 0.95  # pictures of training are rounded to 16 bits
 
 
-def test_a_grid_tells_where_receiver_and_obstacles_are() -> None:
-    from caviar_clients.learning.networks import LINE, BeamNetwork
-
+@pytest.mark.parametrize("shape", [(40, 12, 6), (12, 40, 10)])
+def test_a_grid_tells_what_stands_on_the_line_and_around(
+    data: Path, tmp_path: Path, shape: tuple[int, int, int]
+) -> None:
+    """Held against loops over cells; halves are rounded either way, so that a few points may differ."""
     rng = np.random.default_rng(3)
-    grid = (rng.random((5, 40, 12, 6)) < 0.05).astype(np.int8)
+    grid = (rng.random((5, *shape)) < 0.05).astype(np.int8)
     ends: list[Any] = []
     for cells in grid:
         tx, rx = rng.integers(0, cells.shape, (2, 3))
         cells[tuple(tx)], cells[tuple(rx)] = -1, -2
         ends.append((tx, rx))
-    model = BeamNetwork({"lidar_grid": grid.shape[1:]}, (8, 4), small=True)
-    rows = {
-        name: value.numpy() for name, value in model.reduce({"lidar_grid": torch.from_numpy(grid)}).items()
-    }
-    np.testing.assert_array_equal(rows["lidar_grid/rx"], [rx for _, rx in ends])
+    model = BeamNetwork({"lidar_grid": shape}, (8, 4), small=True)
+    reduced = model.reduce({"lidar_grid": torch.from_numpy(grid)})
+    rows = {name.partition("/")[2]: value.numpy() for name, value in reduced.items()}
+    np.testing.assert_array_equal(rows["rx"], [rx for _, rx in ends])
+    length, width = AROUND
     for n, (tx, rx) in enumerate(ends):
-        points = [
-            np.round(np.float32(tx + (rx - tx) * i / (LINE + 1))).astype(int) for i in range(1, LINE + 1)
-        ]
-        wanted = [grid[(n, *point)] > 0 for point in points]
-        found = rows["lidar_grid/line"][n, :-1] > 0
-        assert np.count_nonzero(found != wanted) <= 1  # halves are rounded either way
-    assert (
-        sum(p.numel() for p in BeamNetwork({"lidar_grid": (200, 20, 10)}, (64, 8), small=True).parameters())
-        <= 10_000
+        away, most = rx - tx, np.abs(rx - tx).max()
+        back = [*(np.arange(1, LINE + 1) / (LINE + 1)), *(np.arange(1, STEPS + 1) / most)]
+        points = [np.round(rx - away * share).astype(int) for share in back]
+        wanted = [share < 1 and grid[(n, *point)] > 0 for share, point in zip(back, points, strict=True)]
+        assert np.count_nonzero((rows["line"][n, :-1] > 0) != wanted) <= 2
+        layer = max(1, shape[2] // 5)
+        for _ in range(40):
+            a, b = rng.integers(-length, length + 1), rng.integers(-width, width + 1)
+            k = rng.integers(0, rows["around"].shape[1])
+            x, y = (rx[0] + b, rx[1] + a) if shape[1] > shape[0] else (rx[0] + a, rx[1] + b)
+            inside = 0 <= x < shape[0] and 0 <= y < shape[1]
+            stands = inside and (grid[n, x, y, k * layer : (k + 1) * layer] > 0).any()
+            assert rows["around"][n, k, length + a, width + b] == stands
+    model.eval()
+    given = ("arrays", "places", "observed", "row_shapes")
+    scene = Samples(
+        arrays=(AntennaArray(columns=8), AntennaArray(columns=4)),
+        places=5,
+        observed={"lidar_grid": grid[None]},
+        row_shapes={"lidar_grid": shape},
+        **{field.name: np.zeros(5) for field in fields(Samples) if field.name not in given},
     )
+    made = experiment(data, 'model = { name = "lidar" }')
+    export_classifier(made, model, scene, tmp_path / "grid.onnx", 1, 1, {})
+    with torch.no_grad():
+        scores = model(reduced).numpy()
+    ranked = PolicyModel(tmp_path / "grid.onnx").ranked({"lidar_grid": grid})
+    np.testing.assert_array_equal(ranked[:, 0], scores.argmax(1))
+    challenge = BeamNetwork({"lidar_grid": (20, 200, 10)}, (64, 8), small=True)
+    assert sum(weights.numel() for weights in challenge.parameters()) <= 10_000

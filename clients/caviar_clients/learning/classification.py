@@ -14,7 +14,7 @@
 ... name = "position"
 ... ''')
 >>> experiment.observe
-('position',)
+('position', 'departure', 'aoa')
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ClassifierSubject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     name: Name
     seeds: tuple[Seed, ...]
     """Each is trained by itself, into a folder of its own. They draw weights and the order of users."""
-    epochs: Count = 100
+    epochs: Count = 60
     """Passes over the users at most."""
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class LabelSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     order: Literal["tx-rx", "rx-tx"] = "tx-rx"
     """Index of a pair in the network: ``tx_beam·Nr + rx_beam``, or ``rx_beam·Nt + tx_beam`` as in the
     training data of the ITU challenge. An exported policy always has the first."""
-    target: Literal["best", "amplitude", "power"] = "amplitude"
+    target: Literal["best", "amplitude", "power"] = "power"
     """``best``: the best pair alone. ``amplitude``: a distribution in proportion to |y| of the pairs that are
     within ``within_db`` of the best, as in the ITU challenge; ``power``: to |y|²."""
     within_db: Positive = 6.0
@@ -120,11 +120,11 @@ class TrainingSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """Table ``[training]``: Adam with decoupled weight decay, and early stopping."""
 
     batch_size: Rows = 128
-    learning_rate: Rate = 2e-3
-    final_learning_rate: Rate | None = None
-    """Reached after ``epochs``, in proportion; absent: the rate stays as it is."""
-    weight_decay: Annotated[float, quantity("1", "of the weights", ge=0, le=10)] = 1e-3
-    patience: Count = 10
+    learning_rate: Rate = 3e-3
+    final_learning_rate: Rate = 1e-4
+    """Reached after ``epochs``, in proportion to these."""
+    weight_decay: Annotated[float, quantity("1", "of the weights", ge=0, le=10)] = 0.1
+    patience: Count = 15
     """Epochs without a lower loss of validation after which training stops; the weights of the lowest
     stay."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -17,7 +17,7 @@ from caviar_protocol.errors import ScenarioError
 try:
     import torch
     from torch import nn
-    from torch.nn.functional import avg_pool2d, max_pool2d
+    from torch.nn.functional import avg_pool2d
 except ImportError:  # `supervised.train_classifier` says what is missing, before this module is needed
     nn = None
 
@@ -26,22 +26,28 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 _Module: Any = object if nn is None else nn.Module
 
+_PLACE = ("position", "departure", "aoa")
 OBSERVED: Mapping[str, tuple[str, ...]] = {
-    "position": ("position",),
+    "position": _PLACE,
     "lidar": ("lidar_grid",),
-    "image": ("camera", "position"),
-    "fusion": ("position", "lidar_grid"),
+    "image": ("camera", *_PLACE),
+    "fusion": (*_PLACE, "lidar_grid"),
 }
-"""Models by name, with the parts that they observe where an experiment names none. A picture that all users
-share does not say which of them is meant: so ``image`` has the position, too."""
+"""Models by name, with the parts that they observe where an experiment names none. A position is three of
+them: in the world, and as the directions that both arrays see it under, in which beams are evenly spaced and
+which mean the same at another station. A picture that all users share does not say which of them is meant: so
+``image`` has the position, too."""
 SMALL = ("lidar",)
 """Models of at most 10,000 parameters: the winner of the ITU challenge ML5G-PHY had 7,462."""
-WAVES = {"position": 32, "last_beam": 16, "aod": 16, "aoa": 16, "departure": 16}
+WAVES = {"position": 16, "last_beam": 16, "aod": 32, "aoa": 32, "departure": 32}
 """Sines and cosines of a part, as of an encoding (`caviar_clients.learning.experiment.Encoding`)."""
 PICTURE = (36, 64)
 """Rows and columns that pictures are reduced to, or a few more, by means of whole pixels."""
-LINE = 24
-"""Points of the straight line from TX to RX at which a LIDAR grid is looked at."""
+LINE, STEPS = 24, 32
+"""Points of the straight line from RX to TX at which a LIDAR grid is looked at: by shares of the distance,
+and cell by cell from RX on."""
+AROUND = (16, 6)
+"""Cells to each side of RX that are looked at, along the longer and the shorter axis of the ground."""
 MARKED = {"tx": -1, "rx": -2}
 """Cells of a LIDAR grid that have the devices."""
 
@@ -80,6 +86,7 @@ class BeamNetwork(BeamModel):
         shapes: Of a row of each part.
         beams: Nt and Nr.
         units: Of the layers that join the parts.
+        dropout: Share of these units that a step of training leaves out.
         small: At most 10,000 parameters: scores of a pair are a sum and a product of those of its two beams.
 
     Raises:
@@ -92,20 +99,25 @@ class BeamNetwork(BeamModel):
     """
 
     def __init__(
-        self, shapes: Shapes, beams: Sequence[int], units: Sequence[int] = (128, 128), small: bool = False
+        self,
+        shapes: Shapes,
+        beams: Sequence[int],
+        units: Sequence[int] = (256, 256),
+        dropout: float = 0.5,
+        small: bool = False,
     ) -> None:
         super().__init__()
         self._shapes, self._small = dict(shapes), small
         self.encoders = nn.ModuleDict()
         width = 0
         for name, shape in shapes.items():
-            encoder = _encoder(name, shape, small)
+            encoder = _encoder(name, shape, small, "position" in shapes)
             self.encoders[_key(name)] = encoder
             width += encoder.width
         sizes = [width, *((24,) if small else units)]
         layers: list[Any] = []
         for a, b in pairwise(sizes):
-            layers += [nn.Linear(a, b), nn.ReLU()]
+            layers += [nn.Linear(a, b), nn.ReLU(), nn.Dropout(0.0 if small else dropout)]
         self.joined = nn.Sequential(*layers)
         self.scores = _Product(sizes[-1], *beams) if small else nn.Linear(sizes[-1], beams[0] * beams[1])
 
@@ -133,12 +145,12 @@ def _of(rows: Tensors, part: str) -> dict[str, Any]:
     return {name[len(part) + 1 :]: value for name, value in rows.items() if name.startswith(f"{part}/")}
 
 
-def _encoder(name: str, shape: tuple[int, ...], small: bool) -> Any:
+def _encoder(name: str, shape: tuple[int, ...], small: bool, placed: bool) -> Any:
     kind = name.partition(":")[0]
     if len(shape) == 1:
         return _Numbers(shape[0], WAVES.get(kind, 0))
     if kind == "lidar_grid" and len(shape) == 3:
-        return _Grid(shape, small)
+        return _Grid(shape, small, placed)
     if len(shape) == 2 or (len(shape) == 3 and shape[2] == 3):
         return _Picture(shape)
     raise ScenarioError(
@@ -188,65 +200,86 @@ class _Numbers(_Module):  # type: ignore[misc]
 
 
 class _Grid(_Module):  # type: ignore[misc]
-    """A LIDAR grid: where TX and RX are in it, what stands on the straight line between them, and what
-    stands anywhere, by convolutions over x and y with layers of height as channels."""
+    """A LIDAR grid: what stands on the straight line between TX and RX, what stands around RX, by
+    convolutions with layers of height as channels, and unless that is known better, where RX is and its
+    direction from TX."""
 
-    def __init__(self, shape: tuple[int, ...], small: bool) -> None:
+    def __init__(self, shape: tuple[int, ...], small: bool, placed: bool) -> None:
         super().__init__()
-        self._shape = shape
+        self._shape, self._placed = shape, placed
         # The longer axis of the ground first, whichever of x and y it is.
         self._swap = shape[1] > shape[0]
-        ground = (shape[1], shape[0]) if self._swap else shape[:2]
-        most = (100, 20, 5)
-        self._pool = tuple(max(1, size // top) for size, top in zip((*ground, shape[2]), most, strict=True))
-        layers = -(-shape[2] // self._pool[2])
-        first, second, units = (4, 8, 16) if small else (8, 16, 64)
-        self.cells = nn.Sequential(
-            nn.Conv2d(layers, first, (5, 3), (4, 2), (2, 1)), nn.ReLU(),
-            nn.Conv2d(first, second, 3, 2, 1), nn.ReLU(),
-            nn.Conv2d(second, second, 3, 2, 1), nn.ReLU(), nn.Flatten(),
+        self._half = (AROUND[1], AROUND[0]) if self._swap else AROUND
+        self._layer = max(1, shape[2] // 5)
+        layers = -(-shape[2] // self._layer)
+        first, second, units = (4, 4, 12) if small else (8, 16, 48)
+        self.around = nn.Sequential(
+            nn.Conv2d(layers, first, 3, 2, 1), nn.ReLU(),
+            nn.Conv2d(first, second, 3, 2, 1), nn.ReLU(), nn.Flatten(),
         )  # fmt: skip
         with torch.no_grad():
             blank = self.reduce(torch.zeros((1, *shape), dtype=torch.int8))
-            flat = self.cells(blank["cells"].float()).shape[1]
-        self.dense = nn.Sequential(nn.Linear(flat, units), nn.ReLU())
-        self.at = _Numbers(3, 8 if small else 32)
-        self.width = units + self.at.width + LINE + 1
+            flat = self.around(blank["around"].float()).shape[1]
+        self.dense = nn.Sequential(nn.Linear(flat, units), nn.ReLU(), nn.Dropout(0.0 if small else 0.3))
+        self.rx, self.direction = _Numbers(3, 4 if small else 16), _Numbers(3, 10 if small else 32)
+        self.width = units + blank["line"].shape[1]
+        if not placed:
+            self.width += self.rx.width + self.direction.width
 
     def reduce(self, rows: Any) -> dict[str, Any]:
         _, y, z = self._shape
         flat = rows.flatten(1)
-        ends = {name: self._cell(flat == value) for name, value in MARKED.items()}
-        # Points of the line, each the nearest cell; the ends themselves are left out.
-        share = (torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1))[None, :, None]
-        point = torch.round(ends["tx"][:, None] + (ends["rx"] - ends["tx"])[:, None] * share).long()
+        # RX is the least value of a grid and TX the next: a search for bytes, of 40,000 for each user.
+        rx_at = flat.argmin(dim=1, keepdim=True)
+        tx_at = torch.where(flat == MARKED["rx"], torch.zeros_like(flat), flat).argmin(dim=1, keepdim=True)
+        has_tx = (torch.gather(flat, 1, tx_at) == MARKED["tx"]).float()
+        tx, rx = self._cell(tx_at), self._cell(rx_at)
+        away = rx - tx
+        # Cells from RX to TX, by shares of the distance and one by one; those beyond TX count for nothing.
+        length = away.abs().amax(dim=1, keepdim=True).clamp(min=1)
+        shares = torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1)
+        steps = torch.arange(1, STEPS + 1, device=rows.device) / length
+        back = torch.cat([shares + torch.zeros_like(length), steps], dim=1)
+        point = torch.round(rx[:, None] - away[:, None] * back.clamp(max=1)[:, :, None]).long()
         index = (point[..., 0] * y + point[..., 1]) * z + point[..., 2]
-        has_tx = (flat == MARKED["tx"]).any(1, keepdim=True).float()
-        line = (torch.gather(flat, 1, index) > 0).float() * has_tx
-        kx, ky, kz = self._pool
-        heights = [(rows[..., low : low + kz] > 0).float().amax(dim=-1) for low in range(0, z, kz)]
-        layers = torch.stack(heights, dim=1)
-        cells = max_pool2d(layers.transpose(2, 3) if self._swap else layers, (kx, ky), ceil_mode=True)
+        line = (torch.gather(flat, 1, index) > 0).float() * has_tx * (back < 1).float()
         return {
-            "cells": cells.to(torch.uint8),
-            "rx": ends["rx"],
+            "rx": rx,
+            "direction": away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=1),
             "line": torch.cat([line, has_tx], dim=1),
+            "around": self._around(flat, rx.long()),
         }
 
-    def _cell(self, is_here: Any) -> Any:
-        """Index of the first cell that is marked, along each axis, Shape ``[N, 3]``."""
+    def _around(self, flat: Any, rx: Any) -> Any:
+        """Whether cells around RX are occupied, the greatest of each layer, Shape ``[N, layers, …]``."""
+        (a, b), (x, y, z) = self._half, self._shape
+        i = rx[:, :1] + torch.arange(-a, a + 1, device=flat.device)
+        j = rx[:, 1:2] + torch.arange(-b, b + 1, device=flat.device)
+        inside = ((i >= 0) & (i < x))[:, :, None] & ((j >= 0) & (j < y))[:, None]
+        ground = i.clamp(0, x - 1)[:, :, None] * y + j.clamp(0, y - 1)[:, None]
+        index = ground[..., None] * z + torch.arange(z, device=flat.device)
+        cells = torch.gather(flat, 1, index.flatten(1)).reshape(-1, 2 * a + 1, 2 * b + 1, z)
+        cells = ((cells > 0) & inside[..., None]).to(torch.uint8)
+        heights = [cells[..., low : low + self._layer].amax(dim=-1) for low in range(0, z, self._layer)]
+        found = torch.stack(heights, dim=1)
+        return found.transpose(2, 3) if self._swap else found
+
+    def _cell(self, at: Any) -> Any:
+        """Index of a cell along each axis, Shape ``[N, 3]``, of that in all, Shape ``[N, 1]``."""
         _, y, z = self._shape
-        at = is_here.to(torch.float32).argmax(dim=1)
         row = torch.div(at, z, rounding_mode="floor")
         x = torch.div(row, y, rounding_mode="floor")
-        return torch.stack([x, row - x * y, at - row * z], dim=1).float()
+        return torch.cat([x, row - x * y, at - row * z], dim=1).float()
 
     def fit(self, rows: Tensors) -> None:
-        self.at.fit({"numbers": rows["rx"]})
+        self.rx.fit({"numbers": rows["rx"]})
+        self.direction.fit({"numbers": rows["direction"]})
 
     def forward(self, rows: Tensors) -> Any:
-        dense = self.dense(self.cells(rows["cells"].float()))
-        return torch.cat([dense, self.at({"numbers": rows["rx"]}), rows["line"]], dim=1)
+        parts = [self.dense(self.around(rows["around"].float())), rows["line"]]
+        if not self._placed:
+            parts += [self.rx({"numbers": rows["rx"]}), self.direction({"numbers": rows["direction"]})]
+        return torch.cat(parts, dim=1)
 
 
 class _Picture(_Module):  # type: ignore[misc]

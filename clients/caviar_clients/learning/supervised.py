@@ -41,7 +41,7 @@ from caviar_clients.learning.training import (
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
-from caviar_services.agent.policy import ACTION, SCORES, PolicyCard, TrainedOn
+from caviar_services.agent.policy import ACTION, SCORES, PolicyCard, PolicyModel, TrainedOn
 
 SAMPLES = ".samples"
 """Folder beside those of experiments, of what they read of datasets."""
@@ -329,11 +329,9 @@ def _train_epoch(experiment: Classification, state: _State, rows: Rows, seed: in
     import torch
 
     training, total = experiment.training, 0.0
-    if training.final_learning_rate is not None:
-        done = state.epoch / experiment.experiment.epochs
-        rate = training.learning_rate + (training.final_learning_rate - training.learning_rate) * done
-        for group in state.optimizer.param_groups:
-            group["lr"] = rate
+    done = state.epoch / experiment.experiment.epochs
+    for group in state.optimizer.param_groups:
+        group["lr"] = training.learning_rate + (training.final_learning_rate - training.learning_rate) * done
     (word,) = np.random.SeedSequence([seed, state.epoch]).generate_state(1)
     torch.manual_seed(int(word))  # of what a network of the user's own draws
     order = torch.randperm(len(rows))
@@ -478,11 +476,42 @@ def export_classifier(
         return np.ravel(action.numpy())
 
     usual = _usual(samples, shapes)
-    return export_module(
+    made = export_module(
         policy, spaces.Dict({n: (two | shared)[n] for n in names}), file, card, choose, usual,
         outputs=(ACTION, SCORES),
         any_size={ACTION: (1,), SCORES: (1,), **dict.fromkeys(two, (1,))},
     )  # fmt: skip
+    _check_any_size(file, samples)
+    return made
+
+
+def _check_any_size(file: Path, samples: Samples) -> None:
+    """Raise `SetupError` where what a policy ranks for a user depends on how many others there are."""
+    model, scene = PolicyModel(file), {name: np.array(of[0]) for name, of in samples.observed.items()}
+    otherwise = 0
+    try:
+        together = model.ranked(scene)[:, 0]
+        for place in range(samples.places):
+            alone = dict(scene)
+            for name, shape in samples.row_shapes.items():
+                if shape is not None:
+                    row = scene[name].reshape(samples.places, *shape)[place]
+                    alone[name] = row if len(shape) == 1 else row[None]
+            (first, *_), *others = model.ranked(alone).tolist()
+            if others:
+                raise ValueError(f"{1 + len(others)} rankings for one user")  # noqa: TRY301 - one remedy
+            otherwise += int(first != together[place])
+    except Exception as error:  # of ONNX Runtime, whose exceptions have no common base
+        reason = str(error).partition("\n")[0]
+        raise SetupError(
+            f"the exported policy is of a number of users ({reason}); in the network write "
+            "x.shape[0], and not len(x), which PyTorch's exporter takes for a constant"
+        ) from error
+    if otherwise > 1:  # one may be a tie
+        raise SetupError(
+            "the exported policy ranks other pairs for a user alone than among others; a network ranks each "
+            "user by itself"
+        )
 
 
 def _bounds(dtype: Any) -> tuple[float, float]:

@@ -32,7 +32,7 @@ CITIES = ("district", "district-b")
 PRESET = "s008"
 TEST = 0.2
 """Share of the episodes that no network is trained on."""
-EPOCHS = 100
+EPOCHS = 60
 _QUICK_EPOCHS = 12
 
 _SECONDS = {"position": 0.4, "lidar": 2.0, "fusion": 2.2}
