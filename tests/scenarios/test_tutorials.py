@@ -9,9 +9,9 @@ import pytest
 from scenarios_support import ROOT, follow
 
 TUTORIALS = ROOT / "docs" / "tutorials"
-CHANNEL = {"own-scenario"}
+CHANNEL = {"own-scenario", "beam-selector"}
 """Pages that need the ray tracer."""
-LONG = {"own-scenario", "first-agent"}
+LONG = {"own-scenario", "first-agent", "beam-selector"}
 """Pages that take most of the time."""
 
 

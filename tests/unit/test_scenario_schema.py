@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 # Experiments, which `caviar policy train` takes, ship beside the scenarios.
 SHIPPED = sorted((ROOT / "deploy" / "caviar_scenarios").rglob("*.toml"))
-for template in ("imported", "town"):  # `caviar scene import` and `caviar new` fill them in
+for template in ("district", "imported", "town"):  # commands and an example fill them in
     SHIPPED.remove(ROOT / f"deploy/caviar_scenarios/new/{template}.toml")
 FILES = [
     *(path for path in SHIPPED if "experiment" not in tomllib.loads(path.read_text())),
