@@ -222,6 +222,7 @@ def test_a_network_of_the_users_own_is_trained_from_a_file(data: Path, tmp_path:
     model = PolicyModel(tmp_path / "training" / "own" / "seed-1" / POLICY)
     assert model.card is not None
     assert model.card.observe == ("departure",)
+    assert model.card.transmitters == ("bs",)  # of the dataset
     # It was trained on all episodes, of which none is left to judge it on.
     judged = CliRunner().invoke(app, ["policy", "evaluate", str(tmp_path / "training"), "--on", str(data)])
     assert judged.exit_code != 0

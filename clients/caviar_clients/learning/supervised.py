@@ -41,6 +41,8 @@ from caviar_clients.learning.training import (
 from caviar_protocol.errors import RunError, ScenarioError, SetupError
 from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
+from caviar_protocol.observations import Users
+from caviar_protocol.scenario import Scenario
 from caviar_services.agent.policy import ACTION, SCORES, PolicyCard, PolicyModel, TrainedOn
 
 SAMPLES = ".samples"
@@ -437,12 +439,15 @@ def export_classifier(
 
     dataset = experiment.dataset()
     train, validation, _ = experiment.split()
-    scenario = dataset.settings["scenario"]
+    scenario, data = dataset.settings["scenario"], experiment.data
     card = PolicyCard(
         observe=names,
         codebooks=(samples.beams,),
         per_user=True,
-        transmitters=experiment.data.transmitters,
+        # Those of the dataset: what it learnt says nothing of another station of the scenario.
+        transmitters=Users(
+            msgspec.convert(scenario, Scenario), data.users, (), data.transmitters
+        ).transmitters,
         scenario=scenario["run"]["name"],
         algorithm=f"classification by {experiment.model.name}",
         seeds=(seed,),

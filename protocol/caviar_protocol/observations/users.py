@@ -116,6 +116,11 @@ class Users:
     def __len__(self) -> int:
         return len(self.places)
 
+    @property
+    def transmitters(self) -> tuple[str, ...]:
+        """Names of the transmitters that have places, with ``*`` and ``?`` where the scenario has them so."""
+        return tuple(dict.fromkeys(_full_name(tx) for tx, _ in self._groups))
+
     def on_objects_of(self, sensor: DeviceSpec) -> bool:
         """Return whether a receiver that is served may be on an object that carries a device.
 
