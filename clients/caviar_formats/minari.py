@@ -71,7 +71,9 @@ class Minari(Format):
         names = [
             name
             for name, part in OBSERVATION_PARTS.items()
-            if not part.needs_sensor and (name not in PACKET_PARTS or "link.throughput" in recorded)
+            # On the lowest carrier the spectrum is the answer.
+            if not part.needs_sensor and name != "spectrum"
+            if name not in PACKET_PARTS or "link.throughput" in recorded
         ]
         for name, array in OF_SENSORS.items():
             kind = OBSERVATION_PARTS[name].needs_sensor

@@ -186,10 +186,16 @@ def test_it_is_steered_by_mouse_keyboard_and_link(opened: Callable[..., Page]) -
     slider.focus()
     slider.press("ArrowRight")
     page.until("s.n === 3")
+    before = page.state["camera"]["position"]
     page.raw.mouse.move(640, 300)
     page.raw.mouse.wheel(0, 240)
-    page.holds("location.hash.includes('cam') && location.hash.includes('n=3')")
-    link, state = page.raw.evaluate("location.href"), page.state
+    # The camera stands in the link once the wheel has moved it.
+    page.until(
+        "location.hash.includes('n=3') && (new URLSearchParams(location.hash.slice(1)).get('cam') ?? '')"
+        f".split(',').slice(0, 3).every((v, i) => Math.abs(v - s.camera.position[i]) < 0.02)"
+        f" && s.camera.position.some((v, i) => Math.abs(v - {before}[i]) > 1)"
+    )
+    link, state = page.raw.evaluate("[location.href, window.caviar.state()]")
     again = opened(url=link)
     assert (again.state["n"], again.state["selected"]) == (3, nearest)
     assert np.allclose(again.state["camera"]["position"], state["camera"]["position"], atol=0.02)
