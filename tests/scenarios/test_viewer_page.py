@@ -76,8 +76,9 @@ class Page:
         return found
 
     def until(self, condition: str) -> None:
-        """Wait for a condition on ``s``, the page's state."""
-        self.holds(f"(() => {{ const s = window.caviar.state(); return {condition}; }})()")
+        """Wait for a condition on ``s``, the page's state, of a frame that is loaded."""
+        loaded = "(s.live || s.shown.n === s.n)"
+        self.holds(f"(() => {{ const s = window.caviar.state(); return {loaded} && {condition}; }})()")
 
     def holds(self, expression: str) -> None:
         """Wait until an expression is true."""

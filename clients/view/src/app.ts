@@ -464,6 +464,8 @@ export class App {
       snr_db: decibels(value(link?.snr)),
       different: { objects: [...this.different.objects], receivers: [...this.different.receivers] },
       absent: view.frame?.absent ?? [],
+      // Until it is loaded, not the one that was asked for.
+      n: view.frame?.n ?? null,
     };
   }
 
