@@ -29,13 +29,16 @@ def constant_policy(file: Path, pair: int, beams: tuple[int, int] = (64, 1)) -> 
     return file
 
 
-def ranking_policy(file: Path, scores: Sequence[float], *, with_scores: bool = True) -> Path:
+def ranking_policy(
+    file: Path, scores: Sequence[float], *, with_scores: bool = True, transmitter: str = "*"
+) -> Path:
     """A policy that ranks pairs of beams in the same way whatever it observes (``aod`` of one user).
 
     Args:
         file: Is written.
         scores: Of each pair.
         with_scores: Whether the model gives them, and not its choice alone.
+        transmitter: That it was trained for.
     """
     count = len(scores)
     outputs = [helper.make_tensor_value_info(ACTION, TensorProto.INT64, [1, 1])]
@@ -53,7 +56,13 @@ def ranking_policy(file: Path, scores: Sequence[float], *, with_scores: bool = T
     observed = helper.make_tensor_value_info("aod", TensorProto.FLOAT, [1, 1])
     graph = helper.make_graph(nodes, "ranking", [observed], outputs, numbers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    card = PolicyCard(observe=("aod",), codebooks=((count, 1),), algorithm="constant", seeds=(1,))
+    card = PolicyCard(
+        observe=("aod",),
+        codebooks=((count, 1),),
+        transmitters=(transmitter,),
+        algorithm="constant",
+        seeds=(1,),
+    )
     helper.set_model_props(model, {CARD_KEY: write_card(card)})
     file.write_bytes(model.SerializeToString())
     return file

@@ -135,6 +135,12 @@ def test_it_begins_from_the_ranking_of_a_policy_and_learns_what_is_different(tmp
     assert len(opposite) > 3
     assert [shares[number] for number in opposite] == [1.0] * len(opposite)
     assert np.mean([without[number] for number in opposite]) < 0.9
+    # Of a station that it was not trained for it says nothing.
+    of_one = policy_files.ranking_policy(tmp_path / "q.onnx", SCORES_OF_ONE, transmitter="bs")
+    other = DeviceSpec(name="another", kind="antenna", role="tx", array=ARRAY)
+    two = RunInfo(name="agent", carriers=RUN.carriers, devices=(other, *RUN.devices))
+    given = replace(settings, policy=f"file:{of_one}")
+    assert [Player(given, two).step(number).share for number in range(60)] == shares
     learning = Player(replace(settings, candidates=3, explore_least=0.3))
     reached = [learning.step(number).share for number in range(400)]
     assert np.mean(reached[-100:]) > np.mean(reached[:60]) + 0.1

@@ -38,7 +38,7 @@ from caviar_protocol.scenario.conversion import Place
 from caviar_protocol.seeding import generator
 from caviar_protocol.space.beams import straight_beams
 from caviar_protocol.space.scene import directions
-from caviar_protocol.topics import Link
+from caviar_protocol.topics import Link, Scene
 from caviar_services.agent.pilots import Measured, PilotAgent, PilotSettings, Sounding
 from caviar_services.agent.policy import SCORES, PolicyAgent, PolicySettings, Served
 from caviar_services.checkpoint import Packed, restored, saved
@@ -366,7 +366,7 @@ class LearnerAgent(PilotAgent[LearnerSettings]):
         present = self._places.present(scene)
         moment = Moment(frame, scene, frame.only("link", Link), present)
         seen = self._observer.read(moment)
-        ranking = None if self._policy is None else _ranking(self._policy, moment)
+        rankings = {} if self._policy is None else _rankings(self._policy, frame, scene)
         places = {(pair.tx.name, pair.rx.name): place for place, pair in present}
         for index, (user, at_tx, at_rx) in enumerate(
             zip(sounding.users, *directions(scene, sounding.users), strict=True)
@@ -374,7 +374,7 @@ class LearnerAgent(PilotAgent[LearnerSettings]):
             place = places[user.tx.name, user.rx.name]
             features = self._features(seen, place)
             model = self._model(ModelKey(user.carrier.name, user.beams), len(features))
-            known = np.zeros(user.beam_pairs) if ranking is None else ranking[place]
+            known = rankings.get((user.tx.name, user.rx.name), np.zeros(user.beam_pairs))
             straight_tx, straight_rx = straight_beams(user.tx.array, at_tx, user.rx.array, at_rx)
             straight = straight_tx * user.beams[1] + straight_rx
             tried = self._candidates(frame, user, straight, model.network.values(features[None])[0] + known)
@@ -431,12 +431,15 @@ class LearnerAgent(PilotAgent[LearnerSettings]):
         return np.concatenate([scaled, np.sin(phases), np.cos(phases)])
 
 
-def _ranking(policy: Served, moment: Moment) -> Float64Array:
-    """Worth of the pairs of each place by their rank r in a policy, 1/(1 + r); Shape ``[U, Nt·Nr]``."""
+def _rankings(policy: Served, frame: Frame, scene: Scene) -> dict[tuple[str, str], Float64Array]:
+    """Worth of the pairs of beams by their rank r in a policy, 1/(1 + r), Shape ``[Nt·Nr]``, of each pair of
+    devices that it was trained for."""
+    users = policy.places.present(scene)
+    moment = Moment(frame, scene, frame.only("link", Link), users)
     order = policy.model.ranked(policy.observer.read(moment))
     worth = np.empty(order.shape)
     np.put_along_axis(worth, order, 1.0 / np.arange(1, order.shape[1] + 1)[None], axis=1)
-    return worth
+    return {(pair.tx.name, pair.rx.name): worth[place] for place, pair in users}
 
 
 def _observed(settings: LearnerSettings, known: KnownScenario, place: Place) -> tuple[Users, Observer]:
