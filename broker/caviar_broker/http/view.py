@@ -26,10 +26,8 @@ from caviar_protocol.assets import AssetStore
 from caviar_protocol.errors import CaviarError, RunError
 from caviar_protocol.fields import Asset
 from caviar_protocol.keys import VIEWER, Credentials
-from caviar_protocol.messages import Subscription
 from caviar_protocol.observer import EVERYTHING, Observer
 from caviar_protocol.run_directory import RunDirectory
-from caviar_protocol.topics import TOPICS
 from caviar_view.answers import BINARY, Answers, NotThereError
 from caviar_view.live import LiveFrames
 
@@ -54,8 +52,6 @@ _FILES = {
     "viewer.css": ("viewer.css", "text/css"),
 }
 _COMPRESSED_FROM = 1024
-_WITHOUT_LIDAR = tuple(Subscription(topic=topic, every=50 if topic == "lidar" else 1) for topic in TOPICS)
-"""Of LIDAR so much that pages know that there is some."""
 
 
 async def serve_views(views: Views, address: str, keys: Path | None, announce: Callable[[str], None]) -> None:
@@ -99,8 +95,7 @@ class LiveView:
 
     def __init__(self, ask: Ask, directory: Path, endpoint: str, credentials: Credentials | None) -> None:
         self._ask, self._record = ask, RunDirectory(directory).record
-        self._endpoint, self._credentials = endpoint, credentials
-        self._subscribed = _WITHOUT_LIDAR
+        self._observed = endpoint, PAGE, EVERYTHING, credentials
         self._starting = asyncio.Lock()
         self._asking = asyncio.Lock()
         # What the run waits for, as the broker last said, and when.
@@ -111,11 +106,8 @@ class LiveView:
         # Why there is no observer now, and why the run is over; empty while there is none.
         self._failure = self._ended = ""
 
-    async def answers(self, path: str, query: Mapping[str, str]) -> Answers:
+    async def answers(self, path: str) -> Answers:
         """Answers; the observer begins with the first call.
-
-        It sees each LIDAR scan from the first query on whose ``topics`` name them: scans are most of the
-        bytes of a frame, and few pages show them.
 
         Raises:
             RunError: The run has not begun, or the broker refuses the observer.
@@ -123,8 +115,6 @@ class LiveView:
         async with self._starting:
             if self._answers is None:
                 await self._start()
-        if "lidar" in query.get("topics", "").split(","):
-            self._subscribed = EVERYTHING
         failure = self._failure or self._ended
         if self._answers is None or self._frames is None or (failure and not self._frames.end):
             raise RunError(failure)
@@ -158,17 +148,11 @@ class LiveView:
     def _observe(self, frames: LiveFrames) -> None:
         while not self._ended:
             try:
-                subscribed = self._subscribed
-                with Observer(
-                    self._endpoint, PAGE, subscribed, self._credentials, period_s=PERIOD_S
-                ) as observer:
+                with Observer(*self._observed, period_s=PERIOD_S) as observer:
                     self._failure = ""
                     for seen in observer:
                         frames.add(seen)
-                        if subscribed != self._subscribed:
-                            break
-                    else:
-                        self._ended = observer.ended or "the run is over"
+                self._ended = observer.ended or "the run is over"
             except CaviarError as error:
                 # A process that was stopped is disconnected, as slow: this one ends with the broker.
                 self._failure = str(error)
@@ -176,7 +160,7 @@ class LiveView:
 
     async def news(self, every_s: float) -> AsyncIterator[bytes]:
         """Server-sent events about new frames, and what the run does; without any, one in `QUIET_S`."""
-        frames, told, said_at = (await self.answers("news", {})).frames, -1, 0.0
+        frames, told, said_at = (await self.answers("news")).frames, -1, 0.0
         while not self._ended:
             if frames.end != told or time.monotonic() - said_at > QUIET_S:
                 why = await self._waits()
@@ -200,14 +184,14 @@ class LiveView:
             return self._why
 
 
-Views = Mapping[str, Callable[[str, Mapping[str, str]], Awaitable[Answers]]]
-"""By the place before ``data/``, "" and, of a second run, ``beside/``: answers for a path and a query."""
+Views = Mapping[str, Callable[[str], Awaitable[Answers]]]
+"""By the place before ``data/``, "" and, of a second run, ``beside/``: answers for a path."""
 
 
-def standing(answers: Answers) -> Callable[[str, Mapping[str, str]], Awaitable[Answers]]:
+def standing(answers: Answers) -> Callable[[str], Awaitable[Answers]]:
     """Answers that are there from the beginning, as an entry of `Views`."""
 
-    async def found(*_: Any) -> Answers:
+    async def found(_: str) -> Answers:
         return answers
 
     return found
@@ -241,12 +225,11 @@ def view_router(views: Views, viewer: list[Any], live: LiveView | None = None) -
         async def tell(every: Annotated[float, Query(ge=NEWS_S, le=60)] = NEWS_S) -> Response:
             return StreamingResponse(news(every), media_type="text/event-stream")
 
-    def data(view: Callable[[str, Mapping[str, str]], Awaitable[Answers]]) -> Any:
+    def data(view: Callable[[str], Awaitable[Answers]]) -> Any:
         async def answer(path: str, request: Request) -> Response:
             try:
-                query = dict(request.query_params)
-                answers = await view(path, query)
-                found = await run_in_threadpool(answers.get, path, query)
+                answers = await view(path)
+                found = await run_in_threadpool(answers.get, path, dict(request.query_params))
             except RunError as error:
                 raise HTTPException(503, str(error)) from None
             except NotThereError as error:

@@ -22,7 +22,7 @@ class UserCounts:
 
     users: int
     valid: int
-    """Whom a path reaches."""
+    """Those that a path reaches."""
     los: int
     """Of these, those with a line of sight."""
 

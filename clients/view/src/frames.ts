@@ -37,9 +37,7 @@ export class Frames {
 
   /** Load a frame; a product that fails is absent with its reason, a frame that fails is an error. */
   async load(n: number, wants: Want[], signal?: AbortSignal): Promise<Frame> {
-    // A live run is asked for the large products once a page shows them.
-    const topics = wants.map(({ topic }) => topic).join();
-    const info = await this.cached(`frames/${n}`, { topics }, signal, (content) =>
+    const info = await this.cached(`frames/${n}`, {}, signal, (content) =>
       JSON.parse(new TextDecoder().decode(content)) as FrameInfo,
     );
     const frame: Frame = { n, info, products: {}, absent: [] };
