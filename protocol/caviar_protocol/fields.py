@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import StrEnum
+from functools import cache
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -378,6 +379,10 @@ def parse_version(since: str) -> Version:
     return int(major), int(minor)
 
 
+fields_of = cache(msgspec.structs.fields)
+"""Fields of a struct's class, inspected once: that takes longer than what follows from it."""
+
+
 def required_knowledge(value: msgspec.Struct) -> Iterator[tuple[str, Any, Version]]:
     """Find what a reader of a struct has to know that version 1.0 of the protocol does not have.
 
@@ -394,7 +399,7 @@ def required_knowledge(value: msgspec.Struct) -> Iterator[tuple[str, Any, Versio
     """
     cls = type(value)
     # What has its default is not on the wire, so that a reader of 1.0 never meets it.
-    defaults = {field.name: field.default for field in msgspec.structs.fields(cls)}
+    defaults = {field.name: field.default for field in fields_of(cls)}
     for name in value.__struct_fields__:
         key, got = f"{cls.__name__}.{name}", getattr(value, name)
         since = VALUES_SINCE.get(key, {}).get(got) if isinstance(got, str) else None

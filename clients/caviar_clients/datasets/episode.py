@@ -5,6 +5,7 @@ It imports services, and runs in the processes of a cluster.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import socket
@@ -14,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +34,22 @@ from caviar_protocol.host import resident_mib
 from caviar_protocol.recording import Recording
 from caviar_protocol.run_directory import RunDirectory
 from caviar_protocol.scenario import Scenario
+from caviar_services.channel.sionna.scene import MadeScene, shared_scenes
 from caviar_services.recorder.provenance import installed_versions
 
 MEASURED = "measured.json"
 """Beside the recording of an episode: times, host and start, which differ from run to run."""
 SETTINGS = "settings"
 """Key in that file of the digest of the settings of the dataset."""
+# Of the episode before in this process: the next one of its dataset has the same scenery.
+_scenes: list[MadeScene] = []
+
+
+@cache
+def _settle() -> None:
+    """Spare collections what stays in this process: libraries, and the scene of its first episode."""
+    gc.collect()
+    gc.freeze()
 
 
 @dataclass(frozen=True)
@@ -156,9 +168,14 @@ def _play(task: EpisodeTask, folder: Path) -> dict[str, Any]:
         episode=task.episode,
         with_journal=False,
     )
-    outcome = run.run()
+    earlier = _scenes[-1:]
+    _scenes.clear()  # an episode that fails may leave a scene that is half changed
+    with shared_scenes(earlier):
+        outcome = run.run()
     if outcome.error:
         raise CaviarError(outcome.error)
+    _scenes.extend(earlier)
+    _settle()
     services = run.statistics.recent_services()
     return {"services_s": {name: service.total_ms / 1e3 for name, service in services.items()}}
 

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from caviar_protocol.errors import ScenarioError, suggestion
-from caviar_protocol.fields import PRINTABLE
+from caviar_protocol.fields import PRINTABLE, fields_of
 from caviar_protocol.scenario.conversion import Place, convert_table
 from caviar_protocol.scenario.schema import DeviceSpec, Scenario, ServiceSpec
 from caviar_protocol.topics import PARTS, PAYLOADS
@@ -278,7 +278,7 @@ def plain(value: Any, *, defaults: bool = True) -> Any:
     if isinstance(value, msgspec.Struct):
         config = value.__struct_config__
         found = {config.tag_field: config.tag} if config.tag_field else {}
-        for field in msgspec.structs.fields(value):
+        for field in fields_of(type(value)):
             item = getattr(value, field.name)
             default = field.default_factory() if callable(field.default_factory) else field.default
             if defaults or (item is not None and (item != default or type(item) is not type(default))):

@@ -390,6 +390,7 @@ class SceneryChains:
         scene, options: What is traced in, and the depth and the seed of what is wanted.
         launch: From where a transmitter stands.
         per_frame: Rays from one that moves.
+        moving: Whether any moves: all chains that there can be are looked for only then.
         cache: Where chains are kept between runs; None: nowhere.
         before: Of the same scenery among other bodies, whose chains hold; None: there are none.
     """
@@ -400,6 +401,7 @@ class SceneryChains:
         options: LaunchOptions,
         launch: SceneryLaunch,
         per_frame: int,
+        moving: bool,
         cache: ChainCache | None,
         before: SceneryChains | None = None,
     ) -> None:
@@ -412,9 +414,9 @@ class SceneryChains:
         self._known: dict[str, tuple[Float64Array, KnownScenery]] = {}
         if before is not None:
             self._known.update(before._known)
-        # All chains, and which planes see one another; None: too many.
+        # All chains, and which planes see one another; None: too many, or no transmitter moves.
         self._every: tuple[ChainTree, Int32Array] | None = (
-            self._every_chain() if before is None else before._every
+            before._every if before is not None else self._every_chain() if moving else None
         )
         self._last: tuple[bytes, int, KnownScenery] | None = None
 

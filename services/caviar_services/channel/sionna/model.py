@@ -196,6 +196,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
             ),
         )
         scene = self._scene
+        self._bodies_version = scene.bodies_version
         if self.foliage is not None:
             self.foliage.stand(scene.foliage_meshes)
             notes += tuple(f"foliage {brief}" for brief in self.foliage.briefs)

@@ -142,11 +142,15 @@ class PathFinder:
         self._enumerated = EnumeratedTracer(scene, options)
         known_options = replace(options, max_depth=depth)
         earlier = before._scenery if before is not None and before._enumerated is not None else None
-        self._scenery = SceneryChains(scene, known_options, launch, s.samples_per_frame, cache, earlier)
+        transmitters = [d for d in self._run.devices if d.kind == "antenna" and d.role in ("tx", "both")]
+        moving = any(device.on for device in transmitters)
+        self._scenery = SceneryChains(
+            scene, known_options, launch, s.samples_per_frame, moving, cache, earlier
+        )
         if earlier is not None:
             return
-        for device in self._run.devices:
-            if device.kind == "antenna" and device.role in ("tx", "both") and not device.on:
+        for device in transmitters:
+            if not device.on:
                 name = device.name
 
                 def progress(part: int, parts: int, name: str = name) -> None:
@@ -162,6 +166,10 @@ class PathFinder:
     def compile_kernels(self) -> None:
         """Trace above the scene, so that every kernel that frames need is compiled before the first one."""
         scene, options, s = self._scene, self.options, self._settings
+        # Of an episode before this one, in the same scene.
+        if (s, options) in scene.compiled:
+            return
+        scene.compiled.append((s, options))
         if options.diffraction:
             importlib.import_module("scipy.special")  # which the first diffracted path would wait for
         middle = (scene.low + scene.high) / 2

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -204,13 +205,18 @@ class PartedLauncher:
     """
 
     def __init__(self, mi_scene: Any, options: LaunchOptions, generator: Any = None) -> None:
+        self._made_of = mi_scene, options, generator
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, int, Launcher]]:
+        """First ray of each part, the one past its last, and what launches it; made at the first launch,
+        which where all is enumerated never comes."""
+        mi_scene, options, generator = self._made_of
         # All passes of a ray are lanes of one launch.
         at_once = max(1, options.rays_at_once // max(len(options.passes), 1))
         begins = range(0, options.samples, at_once)
         bounds = [(begin, min(begin + at_once, options.samples)) for begin in begins]
-        self._parts = [
-            (begin, end, Launcher(mi_scene, options, (begin, end), generator)) for begin, end in bounds
-        ]
+        return [(begin, end, Launcher(mi_scene, options, (begin, end), generator)) for begin, end in bounds]
 
     @property
     def in_parts(self) -> bool:

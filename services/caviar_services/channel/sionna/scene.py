@@ -132,6 +132,8 @@ class SionnaScene(NumberedTriangles):
         self._settings = settings
         self.bodies_version = 0
         """Counts how often bodies were made anew while the run goes on."""
+        self.compiled: list[object] = []
+        """Of what has traced in it, and has its kernels (`PathFinder.compile_kernels`)."""
         self._rt_objects: list[tuple[Shape, Any]] = []
         own = own_materials(assets)
         skins = self._skins = self._skin_materials(pool, settings, own)
@@ -551,21 +553,27 @@ def _constants(material: Any) -> Constants:
     return float(material.relative_permittivity[0]), float(material.conductivity[0])
 
 
-# Scenes made within `shared_scenes`, with what they were made of.
-_made: ContextVar[list[tuple[tuple[Any, ...], SionnaScene]] | None] = ContextVar("made", default=None)
+MadeScene = tuple[tuple[Any, ...], SionnaScene]
+"""A scene made within `shared_scenes`, after what it was made of."""
+_made: ContextVar[list[MadeScene] | None] = ContextVar("made", default=None)
 
 
 @contextmanager
-def shared_scenes() -> Iterator[None]:
+def shared_scenes(made: list[MadeScene] | None = None) -> Iterator[None]:
     """Within, `scene_of` returns one scene for equal arguments.
 
     Models that share a scene take turns: each frame of one places the bodies anew.
+
+    Args:
+        made: Scenes that were made before, to which those that are made are added; None: those of
+            `shared_scenes` around this one, or else none.
 
     Example:
         >>> with shared_scenes():
         ...     pass  # prepare the models of a ladder
     """
-    token = _made.set([])
+    outer = _made.get()
+    token = _made.set(made if made is not None else outer if outer is not None else [])
     try:
         yield
     finally:
