@@ -99,8 +99,9 @@ class EnumeratedTracer:
         # A chain by way of a plane without area has no face to be mirrored in.
         planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
         chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
-        views = self._views(of_scenery, sights, ends)
-        targets = Targets(faces, sizes)
+        views = self._views(of_scenery, ends)
+        sights = np.searchsorted(of_scenery.plane, sights[np.isin(sights, of_scenery.plane).all(1)])
+        targets = Targets(faces, sizes, sights)
         pairs = chain_pairs(targets, chains, views, start, ends)
         paths = self._once(faces, image_paths(faces, pairs, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
@@ -142,15 +143,13 @@ class EnumeratedTracer:
         keys = np.column_stack([paths.receiver, surfaces])
         return paths.take(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
-    def _views(self, scenery: FaceRectangles, sights: Int64Array, receivers: Float64Array) -> SceneryViews:
+    def _views(self, scenery: FaceRectangles, receivers: Float64Array) -> SceneryViews:
         """Faces of scenery that may reflect last before each receiver."""
-        pairs = np.searchsorted(scenery.plane, sights[np.isin(sights, scenery.plane).all(1)])
         if len(scenery) <= _FEW:
             seen = np.ones((len(receivers), len(scenery)), np.bool_)
         else:
             seen = seen_planes(self._look, receivers, scenery.plane, _RAYS)
-        receiver, place = np.nonzero(seen)
-        return SceneryViews(np.arange(len(scenery)), pairs, receiver, place)
+        return SceneryViews(*np.nonzero(seen))
 
     def _transmitted(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array

@@ -1,0 +1,688 @@
+"""Loops over beams and what they light, compiled by Numba: cones, pyramids, mirrors and edges, in float64.
+
+All loops are in this file, because Numba's cache on disk looks at the date of a loop's own file and not at those
+of what the loop calls. Each loop has one signature and is compiled when this module is imported: a frame never
+waits for a compiler. There are no threads, no reassociated sums and no fused products, so that results are the
+same bits on every processor.
+
+Arrays that the loops share:
+
+- ``beams``, Shape ``[B, 36]``: image of the source, axis, cosine and sine of the half angle of the narrowest
+  cone, unit normal of the last plane towards the lit side and the plane's offset along it, and the unit
+  normals, inwards, of eight sides of pyramids; sides that do not exist are 0.
+- ``faces``, Shape ``[9, F]``: centre and radius of the sphere around each, unit normal, offset, and whether
+  both sides reflect.
+- ``bodies``, Shape ``[4, V]``: centre and radius of the sphere around each. The faces of body v are
+  ``begin[v]`` to ``begin[v + 1]``.
+- ``corners``, Shape ``[F, 4, 3]``: corners of the faces' rectangles, in turn.
+
+Pairs are found in a fixed order, by their first index first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
+
+try:
+    import numba
+except ImportError:  # on the base install, where nothing calls the loops
+    numba = None
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, WIDTH = 3, 6, 7, 8, 11, 12, 36
+"""Columns of beams, and how many there are."""
+
+# Cosine of the half angle of the widest cone that is tested; wider ones light everything.
+_WIDE = 0.01
+
+
+def _compiled(function: F) -> F:
+    """The function, compiled with each loop that calls it, or as it is without Numba."""
+    made: F = function if numba is None else numba.njit(nogil=True, error_model="numpy")(function)
+    return made
+
+
+def _loop(signature: str) -> Callable[[F], F]:
+    """Compile a function for these types of arguments, or take it from the cache on disk."""
+
+    def decorate(function: F) -> F:
+        if numba is None:
+            return function
+        options = {"nogil": True, "error_model": "numpy"}
+        made: F
+        try:
+            made = numba.njit(signature, cache=True, **options)(function)
+        except RuntimeError:  # Numba has no folder that it may write to
+            made = numba.njit(signature, **options)(function)
+        return made
+
+    return decorate
+
+
+@_compiled
+def _grown(found: Int64Array, count: int) -> Int64Array:
+    """Room for one more row after so many."""
+    if count < len(found):
+        return found
+    larger = np.empty((2 * count, found.shape[1]), np.int64)
+    larger[:count] = found
+    return larger
+
+
+@_compiled
+def _near_cone(
+    beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, extra: float, near: BoolArray
+) -> None:
+    """Test whether spheres reach into the cone of beam b, on the lit side of its last plane.
+
+    A cheap test before `_in_pyramid`, without a branch, so that a compiler takes several spheres at once.
+    """
+    ix, iy, iz = beams[b, 0], beams[b, 1], beams[b, 2]
+    ax, ay, az = beams[b, AXIS], beams[b, AXIS + 1], beams[b, AXIS + 2]
+    lx, ly, lz, lit_from = beams[b, LIT], beams[b, LIT + 1], beams[b, LIT + 2], beams[b, LIT_FROM]
+    # A wide cone lights all.
+    cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
+    square = cosine * cosine
+    for j in range(low, high):
+        x, y, z = spheres[0, j], spheres[1, j], spheres[2, j]
+        reach = spheres[3, j] + extra
+        tx, ty, tz = x - ix, y - iy, z - iz
+        along = ax * tx + ay * ty + az * tz
+        # The centre's distance from the mantle is across·cos − along·sin, which reach bounds; both sides squared.
+        within = reach + along * sine
+        across = (tx * tx + ty * ty + tz * tz - along * along) * square
+        near[j - low] = (
+            (within >= 0) & (across <= within * within) & (x * lx + y * ly + z * lz - lit_from > -reach)
+        )
+
+
+@_compiled
+def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach: float) -> bool:
+    """Test whether a sphere reaches into all pyramids of beam b."""
+    tx, ty, tz = x - beams[b, 0], y - beams[b, 1], z - beams[b, 2]
+    for k in range(SIDES, WIDTH, 3):
+        if beams[b, k] * tx + beams[b, k + 1] * ty + beams[b, k + 2] * tz <= -reach:
+            return False
+    return True
+
+
+@_compiled
+def _on_lit_side(beams: Float64Array, b: int, x: float, y: float, z: float, slack: float) -> bool:
+    lit = beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z
+    return lit > beams[b, LIT_FROM] - slack
+
+
+@_compiled
+def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, slack: float) -> bool:
+    """Test whether face f may be lit: no side of beam b has all four corners beyond it.
+
+    These are separating planes of a convex pyramid and a convex rectangle: conservative, as only the pyramid's
+    are tried.
+    """
+    most = -np.inf
+    for i in range(4):
+        x, y, z = corners[f, i, 0], corners[f, i, 1], corners[f, i, 2]
+        most = max(most, beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z)
+    if most <= beams[b, LIT_FROM] + slack:
+        return False
+    for k in range(SIDES, WIDTH, 3):
+        nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
+        least = nx * beams[b, 0] + ny * beams[b, 1] + nz * beams[b, 2] - slack
+        most = -np.inf
+        for i in range(4):
+            most = max(most, nx * corners[f, i, 0] + ny * corners[f, i, 1] + nz * corners[f, i, 2])
+        if most <= least:
+            return False
+    return True
+
+
+@_compiled
+def _fill_sides(beams: Float64Array, b: int, column: int, edge: Float64Array) -> None:
+    """Unit normals, inwards, of the sides of a pyramid with these edges, Shape ``[4, 3]``."""
+    mx, my, mz = edge[0, 0] + edge[2, 0], edge[0, 1] + edge[2, 1], edge[0, 2] + edge[2, 2]
+    for i in range(4):
+        j = (i + 1) % 4
+        x = edge[i, 1] * edge[j, 2] - edge[i, 2] * edge[j, 1]
+        y = edge[i, 2] * edge[j, 0] - edge[i, 0] * edge[j, 2]
+        z = edge[i, 0] * edge[j, 1] - edge[i, 1] * edge[j, 0]
+        # Of an image in the plane of its rectangle the pyramid is flat, and a side has no direction.
+        scale = 1.0 / math.sqrt(max(x * x + y * y + z * z, 1e-20))
+        if x * mx + y * my + z * mz < 0:
+            scale = -scale
+        k = column + 3 * i
+        beams[b, k], beams[b, k + 1], beams[b, k + 2] = x * scale, y * scale, z * scale
+
+
+@_loop("f8[:,::1](f8[:,::1], f8[:,:,::1], i8[::1], f8[:,::1], i8[::1])")
+def reflected(
+    faces: Float64Array, corners: Float64Array, last: Int64Array, source: Float64Array, before: Int64Array
+) -> Float64Array:
+    """Beams after a reflection of images ``[B, 3]`` at the faces ``last``; the faces of the reflections
+    ``before``, −1 for none, bound the beams too."""
+    beams = np.zeros((len(last), WIDTH))
+    edge, axis = np.empty((4, 3)), np.empty(3)
+    for b in range(len(last)):
+        f = last[b]
+        n0, n1, n2, offset = faces[4, f], faces[5, f], faces[6, f], faces[7, f]
+        height = source[b, 0] * n0 + source[b, 1] * n1 + source[b, 2] * n2 - offset
+        image = beams[b]
+        image[0] = source[b, 0] - 2 * height * n0
+        image[1] = source[b, 1] - 2 * height * n1
+        image[2] = source[b, 2] - 2 * height * n2
+        # The image is behind the mirror, so the lit side is the other one.
+        away = -1.0 if image[0] * n0 + image[1] * n1 + image[2] * n2 > offset else 1.0
+        beams[b, LIT], beams[b, LIT + 1], beams[b, LIT + 2] = n0 * away, n1 * away, n2 * away
+        beams[b, LIT_FROM] = offset * away
+        narrowest = -2.0
+        for which in range(2 if before[b] >= 0 else 1):
+            g = before[b] if which else f
+            axis[:] = 0.0
+            for i in range(4):
+                x, y, z = corners[g, i, 0], corners[g, i, 1], corners[g, i, 2]
+                # The rectangle before this one bounds the beam, too, by its mirror image.
+                height = (x * n0 + y * n1 + z * n2 - offset) if which else 0.0
+                edge[i, 0] = x - 2 * height * n0 - image[0]
+                edge[i, 1] = y - 2 * height * n1 - image[1]
+                edge[i, 2] = z - 2 * height * n2 - image[2]
+                length = math.sqrt(edge[i, 0] ** 2 + edge[i, 1] ** 2 + edge[i, 2] ** 2)
+                if length > 0:
+                    for c in range(3):
+                        axis[c] += edge[i, c] / length
+            length = math.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+            cosine = 2.0 if length > 0 else -1.0
+            for i in range(4):
+                norm = math.sqrt(edge[i, 0] ** 2 + edge[i, 1] ** 2 + edge[i, 2] ** 2) * length
+                dot = edge[i, 0] * axis[0] + edge[i, 1] * axis[1] + edge[i, 2] * axis[2]
+                cosine = min(cosine, dot / norm if norm > 0 else -1.0)
+            # A cone that is wider than a half-space does not hold all that its directions span.
+            cosine = cosine if cosine > _WIDE else -1.0
+            if cosine > narrowest:
+                narrowest = cosine
+                for c in range(3):
+                    beams[b, AXIS + c] = axis[c] / length if length > 0 else 0.0
+            _fill_sides(beams, b, SIDES + 12 * which, edge)
+        beams[b, COSINE] = narrowest
+        beams[b, SINE] = math.sqrt(max(1 - min(narrowest, 1.0) ** 2, 0.0))
+    return beams
+
+
+@_loop("i8[:,::1](f8[:,::1], f8[:,::1], f8)")
+def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64Array:
+    """Pairs of a beam and a point that it lights; points as spheres of radius 0, Shape ``[4, R]``."""
+    found, count = np.empty((64, 2), np.int64), 0
+    near = np.empty(points.shape[1], np.bool_)
+    for b in range(len(beams)):
+        _near_cone(beams, b, points, 0, len(near), 2 * slack, near)
+        for r in range(len(near)):
+            if near[r] and _in_pyramid(beams, b, points[0, r], points[1, r], points[2, r], slack):
+                found = _grown(found, count)
+                found[count, 0], found[count, 1] = b, r
+                count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _shows_face(beams: Float64Array, b: int, last: Int64Array, faces: Float64Array, f: int, slack: float) -> bool:
+    """Test whether beam b may be reflected at face f of a body, of whose sphere nothing is known."""
+    if f == last[b]:  # a plane does not reflect twice in a row
+        return False
+    # A face of a closed body reflects on its outside only, which the image has to be in front of.
+    height = faces[4, f] * beams[b, 0] + faces[5, f] * beams[b, 1] + faces[6, f] * beams[b, 2] - faces[7, f]
+    if height <= -slack and faces[8, f] == 0:
+        return False
+    return _in_pyramid(beams, b, faces[0, f], faces[1, f], faces[2, f], faces[3, f] + slack)
+
+
+@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], i8[::1], f8)")
+def lit_bodies(
+    beams: Float64Array,
+    last: Int64Array,
+    faces: Float64Array,
+    corners: Float64Array,
+    bodies: Float64Array,
+    begin: Int64Array,
+    slack: float,
+) -> Int64Array:
+    """Pairs of a beam and a face of a body that it lights; ``last`` is the face that reflected each beam."""
+    found, count = np.empty((1024, 2), np.int64), 0
+    near_body, near = np.empty(bodies.shape[1], np.bool_), np.empty(faces.shape[1], np.bool_)
+    for b in range(len(beams)):
+        _near_cone(beams, b, bodies, 0, len(near_body), 2 * slack, near_body)
+        for v in range(len(near_body)):
+            if not near_body[v] or not _in_pyramid(
+                beams, b, bodies[0, v], bodies[1, v], bodies[2, v], bodies[3, v] + slack
+            ):
+                continue
+            low, high = begin[v], begin[v + 1]
+            _near_cone(beams, b, faces, low, high, 2 * slack, near)
+            for f in range(low, high):
+                if near[f - low] and _shows_face(beams, b, last, faces, f, slack):
+                    if _lights_corner(beams, b, corners, f, slack):
+                        found = _grown(found, count)
+                        found[count, 0], found[count, 1] = b, f
+                        count += 1
+    return found[:count].copy()
+
+
+@_loop("i8[:,::1](f8[:,::1], i8[::1], i8, f8[:,::1], f8[:,:,::1], i8, f8)")
+def lit_scenery(
+    beams: Float64Array,
+    last: Int64Array,
+    first: int,
+    faces: Float64Array,
+    corners: Float64Array,
+    many: int,
+    slack: float,
+) -> Int64Array:
+    """Pairs of a beam from ``first`` on and one of the first ``many`` faces that it lights."""
+    found, count = np.empty((1024, 2), np.int64), 0
+    near = np.empty(many, np.bool_)
+    for b in range(first, len(beams)):
+        _near_cone(beams, b, faces, 0, many, 2 * slack, near)
+        for f in range(many):
+            if near[f] and f != last[b] and _lights_corner(beams, b, corners, f, slack):
+                found = _grown(found, count)
+                found[count, 0], found[count, 1] = b, f
+                count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _shows_other(
+    views: Float64Array, w: int, faces: Float64Array, corners: Float64Array, f: int, slack: float, near: BoolArray
+) -> bool:
+    _near_cone(views, w, faces, f, f + 1, 2 * slack, near)
+    return near[0] and _lights_corner(views, w, corners, f, slack)
+
+
+@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], i8[::1], i8[::1], f8)")
+def shown_scenery(
+    views: Float64Array,
+    last: Int64Array,
+    faces: Float64Array,
+    corners: Float64Array,
+    sight_begin: Int64Array,
+    sights: Int64Array,
+    slack: float,
+) -> Int64Array:
+    """Pairs of a view and a face of scenery that it shows, of those that its last face sees: face f sees
+    ``sights[sight_begin[f]:sight_begin[f + 1]]``."""
+    found, count = np.empty((256, 2), np.int64), 0
+    near = np.empty(1, np.bool_)
+    for w in range(len(views)):
+        for k in range(sight_begin[last[w]], sight_begin[last[w] + 1]):
+            if _shows_other(views, w, faces, corners, sights[k], slack, near):
+                found = _grown(found, count)
+                found[count, 0], found[count, 1] = w, sights[k]
+                count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _crossing(
+    beams: Float64Array,
+    b: int,
+    faces: Float64Array,
+    frames: Float64Array,
+    f: int,
+    height: float,
+    seen: Float64Array,
+    slack: float,
+    crosses: BoolArray,
+) -> bool:
+    """Test which receivers see the image of beam b in face f, within the rectangle and the beam's cone.
+
+    Coordinates are those of the face's frame; ``height`` is the image's, and ``seen`` has the receivers'.
+    """
+    c = faces[:3, f]
+    u, v, half = frames[f, 0], frames[f, 1], frames[f, 2]
+    dx, dy, dz = beams[b, 0] - c[0], beams[b, 1] - c[1], beams[b, 2] - c[2]
+    x, y = dx * u[0] + dy * u[1] + dz * u[2], dx * v[0] + dy * v[1] + dz * v[2]
+    ax, ay, az = beams[b, AXIS], beams[b, AXIS + 1], beams[b, AXIS + 2]
+    au, av = ax * u[0] + ay * u[1] + az * u[2], ax * v[0] + ay * v[1] + az * v[2]
+    an = ax * faces[4, f] + ay * faces[5, f] + az * faces[6, f]
+    cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
+    square, wide, tall = cosine * cosine, half[0] + slack, half[1] + slack
+    some = 0
+    for r in range(seen.shape[1]):
+        p, q, g = seen[0, r], seen[1, r], seen[2, r]
+        # The line from the receiver to the image meets the plane at the share g / (g + height) of its length.
+        share = g / (g + height)
+        # Towards the receiver's image in the face, which the beam's cone has to hold.
+        tx, ty, tz = p - x, q - y, -g - height
+        along = au * tx + av * ty + an * tz
+        within = 2 * slack + along * sine
+        across = (tx * tx + ty * ty + tz * tz - along * along) * square
+        crosses[r] = (
+            (g * height > 0)
+            & (abs(p - share * tx) <= wide)
+            & (abs(q - share * ty) <= tall)
+            & (within >= 0)
+            & (across <= within * within)
+        )
+        some += crosses[r]
+    return some > 0
+
+
+@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8)")
+def ends_by_bodies(
+    beams: Float64Array,
+    last: Int64Array,
+    faces: Float64Array,
+    frames: Float64Array,
+    bodies: Float64Array,
+    points: Float64Array,
+    begin: Int64Array,
+    seen: Float64Array,
+    slack: float,
+) -> Int64Array:
+    """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
+
+    Instead of a beam through the last face, the receiver's image in it is held against the beam before.
+
+    Args:
+        beams: Before the last reflection; ``last`` likewise.
+        last: Face that reflected each beam.
+        faces: All faces.
+        frames: Unit vectors along the sides of faces, and half lengths in the third row, Shape ``[F, 3, 3]``.
+        bodies: All bodies; their faces from ``begin`` on.
+        points: Receivers, Shape ``[R, 3]``.
+        begin: See ``bodies``.
+        seen: Receivers in the frames of faces of bodies: along both sides from the centre, and height, 0
+            where the face shows its back, Shape ``[F, 3, R]``, without the faces of scenery.
+        slack: By which all targets are larger [m].
+    """
+    found, count = np.empty((256, 3), np.int64), 0
+    many = len(points)
+    near_body, near = np.empty(bodies.shape[1], np.bool_), np.empty(faces.shape[1], np.bool_)
+    crosses, shown = np.empty(many, np.bool_), np.zeros(len(seen), np.bool_)
+    scenery = begin[0]
+    for f in range(len(seen)):
+        for r in range(many):
+            shown[f] |= seen[f, 2, r] != 0
+    for b in range(len(beams)):
+        ix, iy, iz = beams[b, 0], beams[b, 1], beams[b, 2]
+        _near_cone(beams, b, bodies, 0, len(near_body), 2 * slack, near_body)
+        for v in range(len(near_body)):
+            if not near_body[v] or not _in_pyramid(
+                beams, b, bodies[0, v], bodies[1, v], bodies[2, v], bodies[3, v] + slack
+            ):
+                continue
+            low, high = begin[v], begin[v + 1]
+            _near_cone(beams, b, faces, low, high, 2 * slack, near)
+            for f in range(low, high):
+                if not (near[f - low] and shown[f - scenery]) or f == last[b]:
+                    continue
+                height = faces[4, f] * ix + faces[5, f] * iy + faces[6, f] * iz - faces[7, f]
+                if height <= 0 and faces[8, f] == 0:
+                    continue
+                if not _crossing(beams, b, faces, frames, f, height, seen[f - scenery], slack, crosses):
+                    continue
+                for r in range(many):
+                    if not crosses[r]:
+                        continue
+                    twice = 2 * seen[f - scenery, 2, r]
+                    x = points[r, 0] - twice * faces[4, f]
+                    y = points[r, 1] - twice * faces[5, f]
+                    z = points[r, 2] - twice * faces[6, f]
+                    if _in_pyramid(beams, b, x, y, z, slack):
+                        found = _grown(found, count)
+                        found[count, 0], found[count, 1], found[count, 2] = b, f, r
+                        count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _cones_near(
+    columns: Float64Array, low: int, high: int, x: float, y: float, z: float, reach: float, lit: BoolArray
+) -> None:
+    """`_near_cone` of one sphere with several beams, whose columns are rows here."""
+    for b in range(low, high):
+        tx, ty, tz = x - columns[0, b], y - columns[1, b], z - columns[2, b]
+        along = columns[AXIS, b] * tx + columns[AXIS + 1, b] * ty + columns[AXIS + 2, b] * tz
+        cosine = max(columns[COSINE, b], 0.0)
+        within = reach + along * columns[SINE, b]
+        across = (tx * tx + ty * ty + tz * tz - along * along) * (cosine * cosine)
+        side = columns[LIT, b] * x + columns[LIT + 1, b] * y + columns[LIT + 2, b] * z
+        lit[b - low] = (
+            (within >= 0) & (across <= within * within) & (side - columns[LIT_FROM, b] > -reach)
+        )
+
+
+@_loop(
+    "i8[:,::1](f8[:,::1], i8[::1], i8[::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1],"
+    " f8[:,::1], i8[::1], i8[::1], f8)"
+)
+def ends_by_scenery(
+    beams: Float64Array,
+    last: Int64Array,
+    group_begin: Int64Array,
+    views: Float64Array,
+    mirror: Int64Array,
+    faces: Float64Array,
+    corners: Float64Array,
+    frames: Float64Array,
+    bodies: Float64Array,
+    points: Float64Array,
+    sight_begin: Int64Array,
+    sights: Int64Array,
+    slack: float,
+) -> Int64Array:
+    """Beam and view of each pair where the beam may light the view's receiver by a reflection at its face.
+
+    Args:
+        beams: By way of bodies, before the last reflection, group by group of what reflected them last: a
+            body, or a face of scenery, after the bodies. Group g begins at ``group_begin[g]``.
+        last: Face that reflected each beam.
+        group_begin: See ``beams``.
+        views: What receivers see in faces of scenery, as beams; ``mirror`` is the face of each.
+        mirror: See ``views``.
+        faces: All faces.
+        corners: Of these.
+        frames: As in `ends_by_bodies`.
+        bodies: All bodies.
+        points: Receiver of each view, Shape ``[W, 3]``.
+        sight_begin: As in `shown_scenery`; likewise ``sights``.
+        sights: See ``sight_begin``.
+        slack: By which all targets are larger [m].
+    """
+    found, count = np.empty((256, 2), np.int64), 0
+    many = bodies.shape[1]
+    near_body, near = np.empty(many, np.bool_), np.empty(1, np.bool_)
+    seen, crosses = np.empty((3, 1)), np.empty(1, np.bool_)
+    # Beams as columns: a view's image is held against several at once.
+    columns = np.ascontiguousarray(beams[:, :SIDES].T)
+    lit = np.empty(len(beams), np.bool_)
+    for w in range(len(views)):
+        f = mirror[w]
+        ix, iy, iz = views[w, 0], views[w, 1], views[w, 2]
+        px, py, pz = points[w, 0] - faces[0, f], points[w, 1] - faces[1, f], points[w, 2] - faces[2, f]
+        for c in range(2):
+            seen[c, 0] = px * frames[f, c, 0] + py * frames[f, c, 1] + pz * frames[f, c, 2]
+        seen[2, 0] = px * faces[4, f] + py * faces[5, f] + pz * faces[6, f]
+        if seen[2, 0] <= 0 and faces[8, f] == 0:
+            continue
+        _near_cone(views, w, bodies, 0, many, 2 * slack, near_body)
+        for k in range(many + sight_begin[f + 1] - sight_begin[f]):
+            if k < many:
+                group = k
+                if group_begin[group] == group_begin[group + 1] or not near_body[k]:
+                    continue
+                if not _in_pyramid(views, w, bodies[0, k], bodies[1, k], bodies[2, k], bodies[3, k] + slack):
+                    continue
+            else:
+                other = sights[sight_begin[f] + k - many]
+                group = many + other
+                if group_begin[group] == group_begin[group + 1]:
+                    continue
+                if not _shows_other(views, w, faces, corners, other, slack, near):
+                    continue
+            low, high = group_begin[group], group_begin[group + 1]
+            _cones_near(columns, low, high, ix, iy, iz, 2 * slack, lit)
+            for b in range(low, high):
+                if not lit[b - low] or last[b] == f:
+                    continue
+                height = (
+                    faces[4, f] * beams[b, 0] + faces[5, f] * beams[b, 1] + faces[6, f] * beams[b, 2] - faces[7, f]
+                )
+                if not _crossing(beams, b, faces, frames, f, height, seen, slack, crosses):
+                    continue
+                if _in_pyramid(beams, b, ix, iy, iz, slack):
+                    found = _grown(found, count)
+                    found[count, 0], found[count, 1] = b, w
+                    count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _lights_edge(beams: Float64Array, b: int, ends: Float64Array, normals: Float64Array, slack: float) -> bool:
+    """Test whether an edge may be lit: the image is in front of one of its faces at least, and no side of the
+    beam has both ends beyond it."""
+    x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
+    front = -np.inf
+    for i in range(2):
+        front = max(
+            front,
+            (x - ends[0, 0]) * normals[i, 0] + (y - ends[0, 1]) * normals[i, 1] + (z - ends[0, 2]) * normals[i, 2],
+        )
+    if front <= -slack:
+        return False
+    for k in range(SIDES, WIDTH, 3):
+        most = -np.inf
+        for i in range(2):
+            tx, ty, tz = ends[i, 0] - x, ends[i, 1] - y, ends[i, 2] - z
+            most = max(most, beams[b, k] * tx + beams[b, k + 1] * ty + beams[b, k + 2] * tz)
+        if most <= -slack:
+            return False
+    return _on_lit_side(beams, b, ends[0, 0], ends[0, 1], ends[0, 2], slack) or _on_lit_side(
+        beams, b, ends[1, 0], ends[1, 1], ends[1, 2], slack
+    )
+
+
+@_loop(
+    "i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], b1[::1], f8)"
+)
+def lit_edges(
+    beams: Float64Array,
+    pieces: Float64Array,
+    begin: Int64Array,
+    spheres: Float64Array,
+    ends: Float64Array,
+    normals: Float64Array,
+    surfaces: Int64Array,
+    own: Int64Array,
+    wanted: BoolArray,
+    slack: float,
+) -> Int64Array:
+    """Pairs of a beam and an edge that it may light, but edges of the surface that reflected it last.
+
+    Args:
+        beams: Beams.
+        pieces: Spheres around the edges of each piece, Shape ``[4, P]``; those of piece p are ``begin[p]`` to
+            ``begin[p + 1]``.
+        begin: See ``pieces``.
+        spheres: Around each edge, Shape ``[4, E]``.
+        ends: Of the edges, Shape ``[E, 2, 3]``.
+        normals: Of their faces, Shape ``[E, 2, 3]``.
+        surfaces: Of these, Shape ``[E, 2]``.
+        own: Surface that reflected each beam last, −2 for none.
+        wanted: Edges that are looked for, Shape ``[E]``.
+        slack: By which all targets are larger [m].
+    """
+    found, count = np.empty((1024, 2), np.int64), 0
+    near_piece, near = np.empty(pieces.shape[1], np.bool_), np.empty(len(ends), np.bool_)
+    for b in range(len(beams)):
+        _near_cone(beams, b, pieces, 0, len(near_piece), 2 * slack, near_piece)
+        for p in range(len(near_piece)):
+            if not near_piece[p] or not _in_pyramid(
+                beams, b, pieces[0, p], pieces[1, p], pieces[2, p], pieces[3, p] + slack
+            ):
+                continue
+            low, high = begin[p], begin[p + 1]
+            _near_cone(beams, b, spheres, low, high, 2 * slack, near)
+            for e in range(low, high):
+                if not (near[e - low] and wanted[e]) or surfaces[e, 0] == own[b] or surfaces[e, 1] == own[b]:
+                    continue
+                if _lights_edge(beams, b, ends[e], normals[e], slack):
+                    found = _grown(found, count)
+                    found[count, 0], found[count, 1] = b, e
+                    count += 1
+    return found[:count].copy()
+
+
+@_compiled
+def _unfolded(
+    beams: Float64Array, b: int, ends: Float64Array, ux: float, uy: float, uz: float
+) -> tuple[float, float]:
+    """Coordinate of the image of beam b along the line of an edge, and its distance from that line."""
+    x, y, z = beams[b, 0] - ends[0, 0], beams[b, 1] - ends[0, 1], beams[b, 2] - ends[0, 2]
+    s = x * ux + y * uy + z * uz
+    x, y, z = x - s * ux, y - s * uy, z - s * uz
+    return s, math.sqrt(x * x + y * y + z * z)
+
+
+@_loop(
+    "i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[::1], i8[::1], b1[::1], f8[:,:,::1], b1[::1], f8)"
+)
+def meetings(
+    sent: Float64Array,
+    lit: Int64Array,
+    sent_moves: BoolArray,
+    taken: Float64Array,
+    taken_begin: Int64Array,
+    taken_beam: Int64Array,
+    taken_moves: BoolArray,
+    ends: Float64Array,
+    edge_moves: BoolArray,
+    slack: float,
+) -> Int64Array:
+    """Sent beam, edge and taken beam wherever both beams meet at the edge, at the point of Keller's law.
+
+    Args:
+        sent: Beams from one side.
+        lit: Pairs of one of these and an edge that it lights.
+        sent_moves: Which beams are by way of a body; likewise ``taken_moves``, and ``edge_moves`` of edges.
+            One of the three is of a body.
+        taken: Beams from the other side. Edge e is lit by ``taken_beam[taken_begin[e]:taken_begin[e + 1]]``.
+        taken_begin: See ``taken``; likewise ``taken_beam``.
+        taken_beam: See ``taken``.
+        taken_moves: See ``sent_moves``.
+        ends: Of the edges, Shape ``[E, 2, 3]``.
+        edge_moves: See ``sent_moves``.
+        slack: By which all targets are larger [m].
+    """
+    found, count = np.empty((256, 3), np.int64), 0
+    for k in range(len(lit)):
+        b, e = lit[k]
+        if taken_begin[e] == taken_begin[e + 1]:
+            continue
+        x, y, z = ends[e, 0, 0], ends[e, 0, 1], ends[e, 0, 2]
+        ux, uy, uz = ends[e, 1, 0] - x, ends[e, 1, 1] - y, ends[e, 1, 2] - z
+        length = math.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / length, uy / length, uz / length
+        s, from_source = _unfolded(sent, b, ends[e], ux, uy, uz)
+        moves = sent_moves[b] or edge_moves[e]
+        for i in range(taken_begin[e], taken_begin[e + 1]):
+            o = taken_beam[i]
+            if not (moves or taken_moves[o]):
+                continue
+            t, from_target = _unfolded(taken, o, ends[e], ux, uy, uz)
+            # Keller's law: s − place over from_source is place − t over from_target.
+            place = (s * from_target + t * from_source) / (from_source + from_target)
+            if not -slack < place < length + slack:
+                continue
+            px, py, pz = x + place * ux, y + place * uy, z + place * uz
+            if not (_on_lit_side(sent, b, px, py, pz, slack) and _on_lit_side(taken, o, px, py, pz, slack)):
+                continue
+            if _in_pyramid(sent, b, px, py, pz, slack) and _in_pyramid(taken, o, px, py, pz, slack):
+                found = _grown(found, count)
+                found[count, 0], found[count, 1], found[count, 2] = b, e, o
+                count += 1
+    return found[:count].copy()
