@@ -90,17 +90,17 @@ def _near_cone(
     # A wide cone lights all.
     cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
     square = cosine * cosine
-    for j in range(low, high):
-        x, y, z = spheres[0, j], spheres[1, j], spheres[2, j]
-        reach = spheres[3, j] + extra
+    # From 0 on: an index that may be negative keeps the compiler from taking several at once.
+    xs, ys, zs, radius = spheres[0, low:high], spheres[1, low:high], spheres[2, low:high], spheres[3, low:high]
+    for j in range(len(xs)):
+        x, y, z = xs[j], ys[j], zs[j]
+        reach = radius[j] + extra
         tx, ty, tz = x - ix, y - iy, z - iz
         along = ax * tx + ay * ty + az * tz
         # The centre's distance from the mantle is across·cos − along·sin, which reach bounds; both sides squared.
         within = reach + along * sine
         across = (tx * tx + ty * ty + tz * tz - along * along) * square
-        near[j - low] = (
-            (within >= 0) & (across <= within * within) & (x * lx + y * ly + z * lz - lit_from > -reach)
-        )
+        near[j] = (within >= 0) & (across <= within * within) & (x * lx + y * ly + z * lz - lit_from > -reach)
 
 
 @_compiled
@@ -444,16 +444,15 @@ def _cones_near(
     columns: Float64Array, low: int, high: int, x: float, y: float, z: float, reach: float, lit: BoolArray
 ) -> None:
     """`_near_cone` of one sphere with several beams, whose columns are rows here."""
-    for b in range(low, high):
-        tx, ty, tz = x - columns[0, b], y - columns[1, b], z - columns[2, b]
-        along = columns[AXIS, b] * tx + columns[AXIS + 1, b] * ty + columns[AXIS + 2, b] * tz
-        cosine = max(columns[COSINE, b], 0.0)
-        within = reach + along * columns[SINE, b]
+    some = columns[:, low:high]
+    for b in range(some.shape[1]):
+        tx, ty, tz = x - some[0, b], y - some[1, b], z - some[2, b]
+        along = some[AXIS, b] * tx + some[AXIS + 1, b] * ty + some[AXIS + 2, b] * tz
+        cosine = max(some[COSINE, b], 0.0)
+        within = reach + along * some[SINE, b]
         across = (tx * tx + ty * ty + tz * tz - along * along) * (cosine * cosine)
-        side = columns[LIT, b] * x + columns[LIT + 1, b] * y + columns[LIT + 2, b] * z
-        lit[b - low] = (
-            (within >= 0) & (across <= within * within) & (side - columns[LIT_FROM, b] > -reach)
-        )
+        side = some[LIT, b] * x + some[LIT + 1, b] * y + some[LIT + 2, b] * z
+        lit[b] = (within >= 0) & (across <= within * within) & (side - some[LIT_FROM, b] > -reach)
 
 
 @_loop(
@@ -567,7 +566,7 @@ def _lights_edge(beams: Float64Array, b: int, ends: Float64Array, normals: Float
 
 
 @_loop(
-    "i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], b1[::1], f8)"
+    "i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8)"
 )
 def lit_edges(
     beams: Float64Array,
@@ -578,7 +577,6 @@ def lit_edges(
     normals: Float64Array,
     surfaces: Int64Array,
     own: Int64Array,
-    wanted: BoolArray,
     slack: float,
 ) -> Int64Array:
     """Pairs of a beam and an edge that it may light, but edges of the surface that reflected it last.
@@ -593,7 +591,6 @@ def lit_edges(
         normals: Of their faces, Shape ``[E, 2, 3]``.
         surfaces: Of these, Shape ``[E, 2]``.
         own: Surface that reflected each beam last, −2 for none.
-        wanted: Edges that are looked for, Shape ``[E]``.
         slack: By which all targets are larger [m].
     """
     found, count = np.empty((1024, 2), np.int64), 0
@@ -608,7 +605,7 @@ def lit_edges(
             low, high = begin[p], begin[p + 1]
             _near_cone(beams, b, spheres, low, high, 2 * slack, near)
             for e in range(low, high):
-                if not (near[e - low] and wanted[e]) or surfaces[e, 0] == own[b] or surfaces[e, 1] == own[b]:
+                if not near[e - low] or surfaces[e, 0] == own[b] or surfaces[e, 1] == own[b]:
                     continue
                 if _lights_edge(beams, b, ends[e], normals[e], slack):
                     found = _grown(found, count)
@@ -629,15 +626,14 @@ def _unfolded(
 
 
 @_loop(
-    "i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[::1], i8[::1], b1[::1], f8[:,:,::1], b1[::1], f8)"
+    "i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)"
 )
 def meetings(
     sent: Float64Array,
     lit: Int64Array,
     sent_moves: BoolArray,
     taken: Float64Array,
-    taken_begin: Int64Array,
-    taken_beam: Int64Array,
+    taken_lit: Int64Array,
     taken_moves: BoolArray,
     ends: Float64Array,
     edge_moves: BoolArray,
@@ -650,15 +646,25 @@ def meetings(
         lit: Pairs of one of these and an edge that it lights.
         sent_moves: Which beams are by way of a body; likewise ``taken_moves``, and ``edge_moves`` of edges.
             One of the three is of a body.
-        taken: Beams from the other side. Edge e is lit by ``taken_beam[taken_begin[e]:taken_begin[e + 1]]``.
-        taken_begin: See ``taken``; likewise ``taken_beam``.
-        taken_beam: See ``taken``.
+        taken: Beams from the other side; likewise ``taken_lit``.
+        taken_lit: See ``taken``.
         taken_moves: See ``sent_moves``.
         ends: Of the edges, Shape ``[E, 2, 3]``.
         edge_moves: See ``sent_moves``.
         slack: By which all targets are larger [m].
     """
     found, count = np.empty((256, 3), np.int64), 0
+    # Taken beams edge by edge.
+    taken_begin, beam = np.zeros(len(ends) + 1, np.int64), np.empty(len(taken_lit), np.int64)
+    for k in range(len(taken_lit)):
+        taken_begin[taken_lit[k, 1] + 1] += 1
+    for e in range(len(ends)):
+        taken_begin[e + 1] += taken_begin[e]
+    place_of = taken_begin.copy()
+    for k in range(len(taken_lit)):
+        e = taken_lit[k, 1]
+        beam[place_of[e]] = taken_lit[k, 0]
+        place_of[e] += 1
     for k in range(len(lit)):
         b, e = lit[k]
         if taken_begin[e] == taken_begin[e + 1]:
@@ -670,7 +676,7 @@ def meetings(
         s, from_source = _unfolded(sent, b, ends[e], ux, uy, uz)
         moves = sent_moves[b] or edge_moves[e]
         for i in range(taken_begin[e], taken_begin[e + 1]):
-            o = taken_beam[i]
+            o = beam[i]
             if not (moves or taken_moves[o]):
                 continue
             t, from_target = _unfolded(taken, o, ends[e], ux, uy, uz)

@@ -80,14 +80,6 @@ class EdgeTargets:
         """Surface of each face, Shape ``[F]``."""
         self.piece = piece[is_edge]
         """Of the body that each is of, −1 for scenery, in ascending order, Shape ``[E]``."""
-        first = np.flatnonzero(np.diff(self.piece, prepend=-2))
-        self.begin = np.append(first, len(self.piece))
-        """First edge of each piece, and one past the last, Shape ``[P + 1]``."""
-        self.pieces = spheres(self.ends, self.begin)
-        """Spheres around the edges of each piece [m], Shape ``[4, P]``."""
-        self.spheres = spheres(self.ends, np.arange(len(self.ends) + 1))
-        """Around each edge [m], Shape ``[4, E]``."""
-
     def __len__(self) -> int:
         return len(self.number)
 
@@ -143,12 +135,12 @@ def edge_chains(
     # Reflections of both sides and the diffraction together are at most ``depth`` interactions.
     sources = list(_from_transmitter(targets, scenery, transmitter))
     sinks = list(_from_receivers(targets, views, receivers, depth))
-    every = np.ones(len(edges), np.bool_)
+    every = np.arange(len(edges))
     sent = [_lit(targets, edges, every, sources[0], np.zeros(1, np.int64))]
     taken = [_lit(targets, edges, every, *sinks[0])]
     # A side with all reflections that a path may have leaves none to the other side: only edges that the
     # other side lights directly can be met there.
-    of_sent, of_taken = (np.isin(np.arange(len(edges)), side[0].pairs[:, 1]) for side in (taken, sent))
+    of_sent, of_taken = (np.unique(side[0].pairs[:, 1]) for side in (taken, sent))
     for n, beams in enumerate(sources[1:], start=2):
         owner = np.zeros(len(beams), np.int64)
         sent.append(_lit(targets, edges, every if n < depth else of_sent, beams, owner))
@@ -227,40 +219,39 @@ def _source_beams(points: Float64Array) -> ImageBeams:
 
 
 def _lit(
-    targets: Targets, edges: EdgeTargets, wanted: BoolArray, beams: ImageBeams, owner: Int64Array
+    targets: Targets, edges: EdgeTargets, wanted: Int64Array, beams: ImageBeams, owner: Int64Array
 ) -> _Lit:
-    """Edges, of the wanted ones, that beams may light, except for edges of the face that reflected the beam
-    last: they lie in the mirror's plane, and no wave goes from there to them."""
+    """Edges, of the wanted ones in ascending order, that beams may light, except for edges of the face that
+    reflected the beam last: they lie in the mirror's plane, and no wave goes from there to them."""
     own = np.full(len(beams), -2)
     if beams.chain.shape[1]:
         own = edges.surface_of_face[beams.last]
+    ends, every = edges.ends[wanted], np.arange(len(wanted) + 1)
+    begin = np.append(np.flatnonzero(np.diff(edges.piece[wanted], prepend=-2)), len(wanted))
     pairs = kernels.lit_edges(
         beams.rows,
-        edges.pieces,
-        edges.begin,
-        edges.spheres,
-        edges.ends,
-        edges.normals,
-        edges.surfaces,
+        spheres(ends, begin),
+        begin,
+        spheres(ends, every),
+        ends,
+        edges.normals[wanted],
+        edges.surfaces[wanted],
         own,
-        wanted,
         targets.slack,
     )
+    pairs[:, 1] = wanted[pairs[:, 1]]
     return _Lit(beams, owner, pairs)
 
 
 def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> EdgeChains:
     """Pairs of a beam from each side that meet at an edge within both beams."""
-    order = np.argsort(other.pairs[:, 1], kind="stable")
-    begin = np.searchsorted(other.pairs[order, 1], np.arange(len(edges) + 1))
     # Chains of scenery alone over an edge of scenery are left to rays.
     sent, edge, taken = kernels.meetings(
         one.beams.rows,
         one.pairs,
         one.beams.by_body,
         other.beams.rows,
-        begin,
-        other.pairs[order, 0],
+        other.pairs,
         other.beams.by_body,
         edges.ends,
         edges.piece >= 0,
