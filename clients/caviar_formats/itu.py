@@ -262,7 +262,12 @@ class Itu(Format):
             )
         if self.flavour == "baseline":
             about = {f"raw_data/{name}": text for name, text in about.items()}
-            about |= {f"baseline_data/{name.format('SPLIT')}": f"`{key}`" for name, key in TRAINING.values()}
+            has = {"beams": True, "coord": True, "lidar": self._grid, "img": self._cameras}
+            about |= {
+                f"baseline_data/{name.format('SPLIT')}": f"`{key}`"
+                for what, (name, key) in TRAINING.items()
+                if has[what]
+            }
             about["baseline_data/beam_output/best_pairs_SPLIT.npz"] = "index of the best pair, in both orders"
             split = f" SPLIT is `train` up to episode {self._last_training}, then `validation`."
         return f"""# {users.dataset.name} in the layout of the ITU challenge ML5G-PHY

@@ -46,9 +46,9 @@ class Cost:
     preset: str
     scenes: int
     """Of an episode."""
-    wall_s: tuple[float, ...]
-    """Of each episode, at a worker."""
-    cpu_s: float
+    cpu_s: tuple[float, ...]
+    """Processor time of each episode, at a worker: what others do on the machine counts little."""
+    wall_s: float
     """Of a scene."""
     bytes: float
     """Of a scene."""
@@ -59,14 +59,14 @@ class Cost:
 
     @property
     def scene_s(self) -> float:
-        return fmean(self.wall_s) / self.scenes
+        return fmean(self.cpu_s) / self.scenes
 
     @property
     def greatest(self) -> str:
         """What takes most of a scene's time, and its share."""
-        parts = {**self.services_s, "set-up of the episode": self.scene_s - sum(self.services_s.values())}
+        parts = {**self.services_s, "set-up of the episode": self.wall_s - sum(self.services_s.values())}
         name = max(parts, key=lambda part: parts[part])
-        return f"{name}, {parts[name] / self.scene_s:.0%}"
+        return f"{name}, {parts[name] / self.wall_s:.0%}"
 
 
 def measure(name: str, seconds: float, out: Path) -> Cost:
@@ -111,8 +111,8 @@ def measure(name: str, seconds: float, out: Path) -> Cost:
     return Cost(
         preset=name,
         scenes=preset.scenes,
-        wall_s=tuple(measured["wall_s"] for _, measured in warm),
-        cpu_s=sum(measured["cpu_s"] for _, measured in warm) / played,
+        cpu_s=tuple(measured["cpu_s"] for _, measured in warm),
+        wall_s=sum(measured["wall_s"] for _, measured in warm) / played,
         bytes=sum(rows.episode[4] for rows, _ in warm) / played,
         services_s=services,
         catalogue_s=fmean(catalogue_s[1:] or catalogue_s),
@@ -153,7 +153,7 @@ def simulate(cost: Cost, workers: int, serve_s: float, disk: float) -> float:
     """
     draw = random.Random(workers)
     write_s = cost.bytes * cost.scenes / disk
-    ready = [(draw.choice(cost.wall_s) * draw.random(), worker) for worker in range(workers)]
+    ready = [(draw.choice(cost.cpu_s) * draw.random(), worker) for worker in range(workers)]
     heapq.heapify(ready)
     disk_free = command_free = 0.0
     ends = list[float]()
@@ -162,7 +162,7 @@ def simulate(cost: Cost, workers: int, serve_s: float, disk: float) -> float:
         disk_free = max(disk_free, now) + write_s
         command_free = max(command_free, disk_free) + serve_s
         ends.append(command_free)
-        heapq.heappush(ready, (command_free + draw.choice(cost.wall_s), worker))
+        heapq.heappush(ready, (command_free + draw.choice(cost.cpu_s), worker))
     # The first third fills the queues, the last one empties them.
     first, last = len(ends) // 3, 2 * len(ends) // 3
     return (last - first) * cost.scenes / (ends[last] - ends[first])
@@ -171,7 +171,7 @@ def simulate(cost: Cost, workers: int, serve_s: float, disk: float) -> float:
 def bottleneck(cost: Cost, workers: int, serve_s: float, disk: float) -> str:
     """What bounds so many workers."""
     rates = {
-        "workers": workers / fmean(cost.wall_s),
+        "workers": workers / fmean(cost.cpu_s),
         "command": 1.0 / serve_s,
         "disk": disk / (cost.bytes * cost.scenes),
     }
@@ -183,7 +183,7 @@ def tables(costs: Sequence[Cost], dispatch: float, disk: float) -> str:
     lines = [
         "## Cost of scenes",
         "",
-        "| preset | s a scene | kB a scene | 1e6 scenes | 1e9 scenes | most of the time |",
+        "| preset | processor s a scene | kB a scene | 1e6 scenes | 1e9 scenes | most of the time |",
         "| --- | ---: | ---: | ---: | ---: | --- |",
     ]
     for cost in costs:

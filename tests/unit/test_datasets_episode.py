@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from caviar_clients.datasets import episode as episodes
 from caviar_clients.datasets.directory import DatasetDirectory, writing_dataset
 from caviar_clients.datasets.episode import EpisodeTask, play_episode
 from caviar_clients.datasets.estimate import Estimate, Trial, check_disk, estimate
@@ -95,6 +96,28 @@ def test_an_episode_is_that_of_a_run_of_many(tmp_path: Path) -> None:
             of_run = whole.frame(number, frame.number)
             assert frame.entry.seed == of_run.entry.seed
             assert [p.digest for p in frame.products] == [p.digest for p in of_run.products]
+
+
+def test_a_scene_of_the_episode_before_changes_no_byte(tmp_path: Path) -> None:
+    """Bodies are made where more objects come than there is room for, and stay for the next episode."""
+    pytest.importorskip("sionna.rt")
+    pytest.importorskip("libsumo")
+    scenario = load_scenario("canyon-mobile", ["services.channel.settings.pool={car=1, truck=1, bus=1}"])
+    plan = plan_dataset(scenario, episodes=3, scenes=2)
+    found = []
+    for order in ((0, 1, 2), (2, 1, 0)):
+        out = tmp_path / str(order[0])
+        episodes._scenes.clear()
+        with writing_dataset(DatasetDirectory(out)):
+            for number in order:
+                assert play_episode(EpisodeTask(plan.scenario, number, str(out))).error == ""
+                ((_, scene),) = episodes._scenes
+        assert scene.bodies_version > 0
+        found.append(
+            [(folder / "recording-0000.mcap").read_bytes() for folder in sorted(out.glob("episodes/*"))]
+        )
+    assert len(found[0]) == 3
+    assert found[0] == found[1]
 
 
 def test_what_differs_from_run_to_run_stands_in_no_recording(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -243,6 +244,17 @@ def test_baseline_is_ready_for_training(paired: Dataset, tmp_path: Path) -> None
         # The challenge's RX beams count in the other direction of rotation than `Link.rx_beam`.
         assert (tx == kept["tx_beam"][:6]).all()
         assert ((8 - rx) % 8 == kept["rx_beam"][:6]).all()
+
+
+def test_readme_of_the_baseline_names_the_arrays_that_are_there(
+    paired: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = [device for device in paired.settings["scenario"]["devices"] if device["kind"] != "camera"]
+    monkeypatch.setitem(paired.settings["scenario"], "devices", cameras)
+    folder = exported(paired, "baseline", tmp_path / "out")
+    named = re.findall(r"baseline_data/(\S+)/\S*SPLIT", (folder / "README.md").read_text("utf-8"))
+    assert set(named) == {file.name for file in (folder / "baseline_data").iterdir()}
+    assert "lidar_input" in named
 
 
 def test_database_has_the_rays_of_the_arrays(paired: Dataset, tmp_path: Path) -> None:
