@@ -1,20 +1,23 @@
 """Loops over beams and what they light, compiled by Numba: cones, pyramids, mirrors and edges, in float64.
 
-All loops are in this file, because Numba's cache on disk looks at the date of a loop's own file and not at those
-of what the loop calls. Each loop has one signature and is compiled when this module is imported: a frame never
-waits for a compiler. There are no threads, no reassociated sums and no fused products, so that results are the
-same bits on every processor.
+All loops are in this file, because Numba's cache on disk looks at the date of a loop's own file and not at
+those of what the loop calls. Each loop has one signature and is compiled when this module is imported: no
+frame waits for a compiler. There are no threads, no reassociated sums and no fused products, so that results
+are the same bits on every processor.
 
-Arrays that the loops share:
+Beams have the Shape ``[B, 37]``: image of the source, axis, cosine and sine of the half angle of the
+narrowest cone, unit normal of the last plane towards the lit side and the plane's offset along it, the unit
+normals, inwards, of eight sides of pyramids, of which those that do not exist are 0, and the face that
+reflected last, −1 for none. Targets are a tuple of
 
-- ``beams``, Shape ``[B, 36]``: image of the source, axis, cosine and sine of the half angle of the narrowest
-  cone, unit normal of the last plane towards the lit side and the plane's offset along it, and the unit
-  normals, inwards, of eight sides of pyramids; sides that do not exist are 0.
-- ``faces``, Shape ``[9, F]``: centre and radius of the sphere around each, unit normal, offset, and whether
-  both sides reflect.
-- ``bodies``, Shape ``[4, V]``: centre and radius of the sphere around each. The faces of body v are
-  ``begin[v]`` to ``begin[v + 1]``.
-- ``corners``, Shape ``[F, 4, 3]``: corners of the faces' rectangles, in turn.
+0. ``faces``, Shape ``[9, F]``: centre and radius of the sphere around each, unit normal, offset, and whether
+   both sides reflect; those of scenery first,
+1. ``corners`` of the faces' rectangles, in turn, Shape ``[F, 4, 3]``,
+2. ``frames``, Shape ``[F, 3, 3]``: unit vectors along the sides of each rectangle, and their half lengths,
+3. ``bodies``, Shape ``[4, V]``: centre and radius of the sphere around each,
+4. ``begin``: the faces of body v are ``begin[v]`` to ``begin[v + 1]``,
+5. ``sight_begin``, and 6. ``sights``: face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``,
+7. ``slack`` by which every target is larger [m].
 
 Pairs are found in a fixed order, by their first index first.
 """
@@ -36,7 +39,12 @@ except ImportError:  # on the base install, where nothing calls the loops
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, WIDTH = 3, 6, 7, 8, 11, 12, 36
+Targets = tuple[
+    Float64Array, Float64Array, Float64Array, Float64Array, Int64Array, Int64Array, Int64Array, float
+]
+_TARGETS = "Tuple((f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1], i8[::1], i8[::1], f8))"
+
+AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 37
 """Columns of beams, and how many there are."""
 
 # Cosine of the half angle of the widest cone that is tested; wider ones light everything.
@@ -91,13 +99,18 @@ def _near_cone(
     cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
     square = cosine * cosine
     # From 0 on: an index that may be negative keeps the compiler from taking several at once.
-    xs, ys, zs, radius = spheres[0, low:high], spheres[1, low:high], spheres[2, low:high], spheres[3, low:high]
+    xs, ys, zs, radius = (
+        spheres[0, low:high],
+        spheres[1, low:high],
+        spheres[2, low:high],
+        spheres[3, low:high],
+    )
     for j in range(len(xs)):
         x, y, z = xs[j], ys[j], zs[j]
         reach = radius[j] + extra
         tx, ty, tz = x - ix, y - iy, z - iz
         along = ax * tx + ay * ty + az * tz
-        # The centre's distance from the mantle is across·cos − along·sin, which reach bounds; both sides squared.
+        # The centre's distance from the mantle is across·cos − along·sin, which reach bounds; here squared.
         within = reach + along * sine
         across = (tx * tx + ty * ty + tz * tz - along * along) * square
         near[j] = (within >= 0) & (across <= within * within) & (x * lx + y * ly + z * lz - lit_from > -reach)
@@ -107,10 +120,27 @@ def _near_cone(
 def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach: float) -> bool:
     """Test whether a sphere reaches into all pyramids of beam b."""
     tx, ty, tz = x - beams[b, 0], y - beams[b, 1], z - beams[b, 2]
-    for k in range(SIDES, WIDTH, 3):
+    for k in range(SIDES, LAST, 3):
         if beams[b, k] * tx + beams[b, k + 1] * ty + beams[b, k + 2] * tz <= -reach:
             return False
     return True
+
+
+@_compiled
+def _lit_spheres(
+    beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, slack: float, lit: Int64Array
+) -> int:
+    """Write the numbers of the spheres that beam b lights, and return how many they are."""
+    near = np.empty(high - low, np.bool_)
+    _near_cone(beams, b, spheres, low, high, 2 * slack, near)
+    count = 0
+    for j in range(low, high):
+        if near[j - low] and _in_pyramid(
+            beams, b, spheres[0, j], spheres[1, j], spheres[2, j], spheres[3, j] + slack
+        ):
+            lit[count] = j
+            count += 1
+    return count
 
 
 @_compiled
@@ -120,11 +150,19 @@ def _on_lit_side(beams: Float64Array, b: int, x: float, y: float, z: float, slac
 
 
 @_compiled
+def _height(beams: Float64Array, b: int, faces: Float64Array, f: int) -> float:
+    """Height of the image of beam b above the plane of face f [m]."""
+    x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
+    height: float = faces[4, f] * x + faces[5, f] * y + faces[6, f] * z - faces[7, f]
+    return height
+
+
+@_compiled
 def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, slack: float) -> bool:
     """Test whether face f may be lit: no side of beam b has all four corners beyond it.
 
-    These are separating planes of a convex pyramid and a convex rectangle: conservative, as only the pyramid's
-    are tried.
+    These are separating planes of a convex pyramid and a convex rectangle: conservative, as only those of the
+    pyramid are tried.
     """
     most = -np.inf
     for i in range(4):
@@ -132,7 +170,7 @@ def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, s
         most = max(most, beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z)
     if most <= beams[b, LIT_FROM] + slack:
         return False
-    for k in range(SIDES, WIDTH, 3):
+    for k in range(SIDES, LAST, 3):
         nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
         least = nx * beams[b, 0] + ny * beams[b, 1] + nz * beams[b, 2] - slack
         most = -np.inf
@@ -160,13 +198,13 @@ def _fill_sides(beams: Float64Array, b: int, column: int, edge: Float64Array) ->
         beams[b, k], beams[b, k + 1], beams[b, k + 2] = x * scale, y * scale, z * scale
 
 
-@_loop("f8[:,::1](f8[:,::1], f8[:,:,::1], i8[::1], f8[:,::1], i8[::1])")
-def reflected(
-    faces: Float64Array, corners: Float64Array, last: Int64Array, source: Float64Array, before: Int64Array
-) -> Float64Array:
+@_loop(f"f8[:,::1]({_TARGETS}, i8[::1], f8[:,::1], i8[::1])")
+def reflected(targets: Targets, last: Int64Array, source: Float64Array, before: Int64Array) -> Float64Array:
     """Beams after a reflection of images ``[B, 3]`` at the faces ``last``; the faces of the reflections
     ``before``, −1 for none, bound the beams too."""
+    faces, corners = targets[:2]
     beams = np.zeros((len(last), WIDTH))
+    beams[:, LAST] = last
     edge, axis = np.empty((4, 3)), np.empty(3)
     for b in range(len(last)):
         f = last[b]
@@ -217,77 +255,46 @@ def reflected(
 def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64Array:
     """Pairs of a beam and a point that it lights; points as spheres of radius 0, Shape ``[4, R]``."""
     found, count = np.empty((64, 2), np.int64), 0
-    near = np.empty(points.shape[1], np.bool_)
+    lit = np.empty(points.shape[1], np.int64)
     for b in range(len(beams)):
-        _near_cone(beams, b, points, 0, len(near), 2 * slack, near)
-        for r in range(len(near)):
-            if near[r] and _in_pyramid(beams, b, points[0, r], points[1, r], points[2, r], slack):
-                found = _grown(found, count)
-                found[count, 0], found[count, 1] = b, r
-                count += 1
+        for i in range(_lit_spheres(beams, b, points, 0, len(lit), slack, lit)):
+            found = _grown(found, count)
+            found[count, 0], found[count, 1] = b, lit[i]
+            count += 1
     return found[:count].copy()
 
 
-@_compiled
-def _shows_face(beams: Float64Array, b: int, last: Int64Array, faces: Float64Array, f: int, slack: float) -> bool:
-    """Test whether beam b may be reflected at face f of a body, of whose sphere nothing is known."""
-    if f == last[b]:  # a plane does not reflect twice in a row
-        return False
-    # A face of a closed body reflects on its outside only, which the image has to be in front of.
-    height = faces[4, f] * beams[b, 0] + faces[5, f] * beams[b, 1] + faces[6, f] * beams[b, 2] - faces[7, f]
-    if height <= -slack and faces[8, f] == 0:
-        return False
-    return _in_pyramid(beams, b, faces[0, f], faces[1, f], faces[2, f], faces[3, f] + slack)
-
-
-@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], i8[::1], f8)")
-def lit_bodies(
-    beams: Float64Array,
-    last: Int64Array,
-    faces: Float64Array,
-    corners: Float64Array,
-    bodies: Float64Array,
-    begin: Int64Array,
-    slack: float,
-) -> Int64Array:
-    """Pairs of a beam and a face of a body that it lights; ``last`` is the face that reflected each beam."""
+@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
+def lit_bodies(beams: Float64Array, targets: Targets) -> Int64Array:
+    """Pairs of a beam and a face of a body that it lights."""
+    faces, corners, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    near_body, near = np.empty(bodies.shape[1], np.bool_), np.empty(faces.shape[1], np.bool_)
+    near, lit = np.empty(bodies.shape[1], np.int64), np.empty(faces.shape[1], np.int64)
     for b in range(len(beams)):
-        _near_cone(beams, b, bodies, 0, len(near_body), 2 * slack, near_body)
-        for v in range(len(near_body)):
-            if not near_body[v] or not _in_pyramid(
-                beams, b, bodies[0, v], bodies[1, v], bodies[2, v], bodies[3, v] + slack
-            ):
-                continue
-            low, high = begin[v], begin[v + 1]
-            _near_cone(beams, b, faces, low, high, 2 * slack, near)
-            for f in range(low, high):
-                if near[f - low] and _shows_face(beams, b, last, faces, f, slack):
-                    if _lights_corner(beams, b, corners, f, slack):
-                        found = _grown(found, count)
-                        found[count, 0], found[count, 1] = b, f
-                        count += 1
+        for i in range(_lit_spheres(beams, b, bodies, 0, len(near), slack, near)):
+            v = near[i]
+            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, lit)):
+                f = lit[k]
+                # A plane does not reflect twice in a row, and a face of a closed body on its outside only.
+                if f == beams[b, LAST] or (_height(beams, b, faces, f) <= -slack and faces[8, f] == 0):
+                    continue
+                if _lights_corner(beams, b, corners, f, slack):
+                    found = _grown(found, count)
+                    found[count, 0], found[count, 1] = b, f
+                    count += 1
     return found[:count].copy()
 
 
-@_loop("i8[:,::1](f8[:,::1], i8[::1], i8, f8[:,::1], f8[:,:,::1], i8, f8)")
-def lit_scenery(
-    beams: Float64Array,
-    last: Int64Array,
-    first: int,
-    faces: Float64Array,
-    corners: Float64Array,
-    many: int,
-    slack: float,
-) -> Int64Array:
-    """Pairs of a beam from ``first`` on and one of the first ``many`` faces that it lights."""
+@_loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
+def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
+    """Pairs of a beam from ``first`` on and a face of scenery that it lights."""
+    faces, corners, _, _, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    near = np.empty(many, np.bool_)
+    near = np.empty(begin[0], np.bool_)
     for b in range(first, len(beams)):
-        _near_cone(beams, b, faces, 0, many, 2 * slack, near)
-        for f in range(many):
-            if near[f] and f != last[b] and _lights_corner(beams, b, corners, f, slack):
+        _near_cone(beams, b, faces, 0, len(near), 2 * slack, near)
+        for f in range(len(near)):
+            if near[f] and f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                 found = _grown(found, count)
                 found[count, 0], found[count, 1] = b, f
                 count += 1
@@ -295,33 +302,30 @@ def lit_scenery(
 
 
 @_compiled
-def _shows_other(
-    views: Float64Array, w: int, faces: Float64Array, corners: Float64Array, f: int, slack: float, near: BoolArray
-) -> bool:
-    _near_cone(views, w, faces, f, f + 1, 2 * slack, near)
-    return near[0] and _lights_corner(views, w, corners, f, slack)
-
-
-@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], i8[::1], i8[::1], f8)")
-def shown_scenery(
-    views: Float64Array,
-    last: Int64Array,
-    faces: Float64Array,
-    corners: Float64Array,
-    sight_begin: Int64Array,
-    sights: Int64Array,
-    slack: float,
-) -> Int64Array:
-    """Pairs of a view and a face of scenery that it shows, of those that its last face sees: face f sees
-    ``sights[sight_begin[f]:sight_begin[f + 1]]``."""
-    found, count = np.empty((256, 2), np.int64), 0
+def _shown_sights(views: Float64Array, w: int, targets: Targets, shown: Int64Array) -> int:
+    """Write the faces of scenery that view w shows, of those that its face sees; return how many they are."""
+    faces, corners, _, _, _, sight_begin, sights, slack = targets
+    face, count = int(views[w, LAST]), 0
     near = np.empty(1, np.bool_)
+    for k in range(sight_begin[face], sight_begin[face + 1]):
+        f = sights[k]
+        _near_cone(views, w, faces, f, f + 1, 2 * slack, near)
+        if near[0] and _lights_corner(views, w, corners, f, slack):
+            shown[count] = f
+            count += 1
+    return count
+
+
+@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
+def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
+    """Pairs of a view in a face of scenery, and a face of scenery that it shows."""
+    found, count = np.empty((256, 2), np.int64), 0
+    shown = np.empty(targets[0].shape[1], np.int64)
     for w in range(len(views)):
-        for k in range(sight_begin[last[w]], sight_begin[last[w] + 1]):
-            if _shows_other(views, w, faces, corners, sights[k], slack, near):
-                found = _grown(found, count)
-                found[count, 0], found[count, 1] = w, sights[k]
-                count += 1
+        for i in range(_shown_sights(views, w, targets, shown)):
+            found = _grown(found, count)
+            found[count, 0], found[count, 1] = w, shown[i]
+            count += 1
     return found[:count].copy()
 
 
@@ -371,68 +375,44 @@ def _crossing(
     return some > 0
 
 
-@_loop("i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1], i8[::1], f8[:,:,::1], f8)")
+@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS}, f8[:,::1], f8[:,:,::1])")
 def ends_by_bodies(
-    beams: Float64Array,
-    last: Int64Array,
-    faces: Float64Array,
-    frames: Float64Array,
-    bodies: Float64Array,
-    points: Float64Array,
-    begin: Int64Array,
-    seen: Float64Array,
-    slack: float,
+    beams: Float64Array, targets: Targets, points: Float64Array, seen: Float64Array
 ) -> Int64Array:
     """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
 
     Instead of a beam through the last face, the receiver's image in it is held against the beam before.
 
     Args:
-        beams: Before the last reflection; ``last`` likewise.
-        last: Face that reflected each beam.
-        faces: All faces.
-        frames: Unit vectors along the sides of faces, and half lengths in the third row, Shape ``[F, 3, 3]``.
-        bodies: All bodies; their faces from ``begin`` on.
+        beams: Before the last reflection.
+        targets: All targets.
         points: Receivers, Shape ``[R, 3]``.
-        begin: See ``bodies``.
         seen: Receivers in the frames of faces of bodies: along both sides from the centre, and height, 0
             where the face shows its back, Shape ``[F, 3, R]``, without the faces of scenery.
-        slack: By which all targets are larger [m].
     """
+    faces, _, frames, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 3), np.int64), 0
-    many = len(points)
-    near_body, near = np.empty(bodies.shape[1], np.bool_), np.empty(faces.shape[1], np.bool_)
-    crosses, shown = np.empty(many, np.bool_), np.zeros(len(seen), np.bool_)
-    scenery = begin[0]
+    near_body, near = np.empty(bodies.shape[1], np.int64), np.empty(faces.shape[1], np.bool_)
+    crosses, shown = np.empty(len(points), np.bool_), np.zeros(len(seen), np.bool_)
     for f in range(len(seen)):
-        for r in range(many):
-            shown[f] |= seen[f, 2, r] != 0
+        shown[f] = (seen[f, 2] != 0).any()
     for b in range(len(beams)):
-        ix, iy, iz = beams[b, 0], beams[b, 1], beams[b, 2]
-        _near_cone(beams, b, bodies, 0, len(near_body), 2 * slack, near_body)
-        for v in range(len(near_body)):
-            if not near_body[v] or not _in_pyramid(
-                beams, b, bodies[0, v], bodies[1, v], bodies[2, v], bodies[3, v] + slack
-            ):
-                continue
-            low, high = begin[v], begin[v + 1]
+        for i in range(_lit_spheres(beams, b, bodies, 0, len(near_body), slack, near_body)):
+            low, high = begin[near_body[i]], begin[near_body[i] + 1]
             _near_cone(beams, b, faces, low, high, 2 * slack, near)
             for f in range(low, high):
-                if not (near[f - low] and shown[f - scenery]) or f == last[b]:
+                own = f - begin[0]
+                if not (near[f - low] and shown[own]) or f == beams[b, LAST]:
                     continue
-                height = faces[4, f] * ix + faces[5, f] * iy + faces[6, f] * iz - faces[7, f]
+                height = _height(beams, b, faces, f)
                 if height <= 0 and faces[8, f] == 0:
                     continue
-                if not _crossing(beams, b, faces, frames, f, height, seen[f - scenery], slack, crosses):
+                if not _crossing(beams, b, faces, frames, f, height, seen[own], slack, crosses):
                     continue
-                for r in range(many):
-                    if not crosses[r]:
-                        continue
-                    twice = 2 * seen[f - scenery, 2, r]
-                    x = points[r, 0] - twice * faces[4, f]
-                    y = points[r, 1] - twice * faces[5, f]
-                    z = points[r, 2] - twice * faces[6, f]
-                    if _in_pyramid(beams, b, x, y, z, slack):
+                for r in range(len(points)):
+                    twice = 2 * seen[own, 2, r]
+                    x, y = points[r, 0] - twice * faces[4, f], points[r, 1] - twice * faces[5, f]
+                    if crosses[r] and _in_pyramid(beams, b, x, y, points[r, 2] - twice * faces[6, f], slack):
                         found = _grown(found, count)
                         found[count, 0], found[count, 1], found[count, 2] = b, f, r
                         count += 1
@@ -455,82 +435,53 @@ def _cones_near(
         lit[b] = (within >= 0) & (across <= within * within) & (side - some[LIT_FROM, b] > -reach)
 
 
-@_loop(
-    "i8[:,::1](f8[:,::1], i8[::1], i8[::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1],"
-    " f8[:,::1], i8[::1], i8[::1], f8)"
-)
+@_loop(f"i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], {_TARGETS}, f8[:,::1])")
 def ends_by_scenery(
     beams: Float64Array,
-    last: Int64Array,
     group_begin: Int64Array,
     views: Float64Array,
-    mirror: Int64Array,
-    faces: Float64Array,
-    corners: Float64Array,
-    frames: Float64Array,
-    bodies: Float64Array,
+    targets: Targets,
     points: Float64Array,
-    sight_begin: Int64Array,
-    sights: Int64Array,
-    slack: float,
 ) -> Int64Array:
     """Beam and view of each pair where the beam may light the view's receiver by a reflection at its face.
 
     Args:
         beams: By way of bodies, before the last reflection, group by group of what reflected them last: a
             body, or a face of scenery, after the bodies. Group g begins at ``group_begin[g]``.
-        last: Face that reflected each beam.
         group_begin: See ``beams``.
-        views: What receivers see in faces of scenery, as beams; ``mirror`` is the face of each.
-        mirror: See ``views``.
-        faces: All faces.
-        corners: Of these.
-        frames: As in `ends_by_bodies`.
-        bodies: All bodies.
+        views: What receivers see in faces of scenery, as beams.
+        targets: All targets.
         points: Receiver of each view, Shape ``[W, 3]``.
-        sight_begin: As in `shown_scenery`; likewise ``sights``.
-        sights: See ``sight_begin``.
-        slack: By which all targets are larger [m].
     """
+    faces, _, frames, bodies, _, _, _, slack = targets
     found, count = np.empty((256, 2), np.int64), 0
     many = bodies.shape[1]
-    near_body, near = np.empty(many, np.bool_), np.empty(1, np.bool_)
-    seen, crosses = np.empty((3, 1)), np.empty(1, np.bool_)
+    groups, shown = np.empty(len(group_begin), np.int64), np.empty(faces.shape[1], np.int64)
+    seen, crosses = np.zeros((3, 1)), np.empty(1, np.bool_)
     # Beams as columns: a view's image is held against several at once.
-    columns = np.ascontiguousarray(beams[:, :SIDES].T)
-    lit = np.empty(len(beams), np.bool_)
+    columns, lit = np.ascontiguousarray(beams[:, :SIDES].T), np.empty(len(beams), np.bool_)
     for w in range(len(views)):
-        f = mirror[w]
+        f = int(views[w, LAST])
         ix, iy, iz = views[w, 0], views[w, 1], views[w, 2]
-        px, py, pz = points[w, 0] - faces[0, f], points[w, 1] - faces[1, f], points[w, 2] - faces[2, f]
-        for c in range(2):
-            seen[c, 0] = px * frames[f, c, 0] + py * frames[f, c, 1] + pz * frames[f, c, 2]
-        seen[2, 0] = px * faces[4, f] + py * faces[5, f] + pz * faces[6, f]
+        seen[:] = 0.0
+        for c in range(3):
+            beside = points[w, c] - faces[c, f]
+            seen[0, 0] += beside * frames[f, 0, c]
+            seen[1, 0] += beside * frames[f, 1, c]
+            seen[2, 0] += beside * faces[4 + c, f]
         if seen[2, 0] <= 0 and faces[8, f] == 0:
             continue
-        _near_cone(views, w, bodies, 0, many, 2 * slack, near_body)
-        for k in range(many + sight_begin[f + 1] - sight_begin[f]):
-            if k < many:
-                group = k
-                if group_begin[group] == group_begin[group + 1] or not near_body[k]:
-                    continue
-                if not _in_pyramid(views, w, bodies[0, k], bodies[1, k], bodies[2, k], bodies[3, k] + slack):
-                    continue
-            else:
-                other = sights[sight_begin[f] + k - many]
-                group = many + other
-                if group_begin[group] == group_begin[group + 1]:
-                    continue
-                if not _shows_other(views, w, faces, corners, other, slack, near):
-                    continue
-            low, high = group_begin[group], group_begin[group + 1]
+        some = _lit_spheres(views, w, bodies, 0, many, slack, groups)
+        for i in range(_shown_sights(views, w, targets, shown)):
+            groups[some] = many + shown[i]
+            some += 1
+        for i in range(some):
+            low, high = group_begin[groups[i]], group_begin[groups[i] + 1]
             _cones_near(columns, low, high, ix, iy, iz, 2 * slack, lit)
             for b in range(low, high):
-                if not lit[b - low] or last[b] == f:
+                if not lit[b - low] or beams[b, LAST] == f:
                     continue
-                height = (
-                    faces[4, f] * beams[b, 0] + faces[5, f] * beams[b, 1] + faces[6, f] * beams[b, 2] - faces[7, f]
-                )
+                height = _height(beams, b, faces, f)
                 if not _crossing(beams, b, faces, frames, f, height, seen, slack, crosses):
                     continue
                 if _in_pyramid(beams, b, ix, iy, iz, slack):
@@ -541,7 +492,9 @@ def ends_by_scenery(
 
 
 @_compiled
-def _lights_edge(beams: Float64Array, b: int, ends: Float64Array, normals: Float64Array, slack: float) -> bool:
+def _lights_edge(
+    beams: Float64Array, b: int, ends: Float64Array, normals: Float64Array, slack: float
+) -> bool:
     """Test whether an edge may be lit: the image is in front of one of its faces at least, and no side of the
     beam has both ends beyond it."""
     x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
@@ -549,11 +502,13 @@ def _lights_edge(beams: Float64Array, b: int, ends: Float64Array, normals: Float
     for i in range(2):
         front = max(
             front,
-            (x - ends[0, 0]) * normals[i, 0] + (y - ends[0, 1]) * normals[i, 1] + (z - ends[0, 2]) * normals[i, 2],
+            (x - ends[0, 0]) * normals[i, 0]
+            + (y - ends[0, 1]) * normals[i, 1]
+            + (z - ends[0, 2]) * normals[i, 2],
         )
     if front <= -slack:
         return False
-    for k in range(SIDES, WIDTH, 3):
+    for k in range(SIDES, LAST, 3):
         most = -np.inf
         for i in range(2):
             tx, ty, tz = ends[i, 0] - x, ends[i, 1] - y, ends[i, 2] - z
@@ -594,15 +549,10 @@ def lit_edges(
         slack: By which all targets are larger [m].
     """
     found, count = np.empty((1024, 2), np.int64), 0
-    near_piece, near = np.empty(pieces.shape[1], np.bool_), np.empty(len(ends), np.bool_)
+    near_piece, near = np.empty(pieces.shape[1], np.int64), np.empty(len(ends), np.bool_)
     for b in range(len(beams)):
-        _near_cone(beams, b, pieces, 0, len(near_piece), 2 * slack, near_piece)
-        for p in range(len(near_piece)):
-            if not near_piece[p] or not _in_pyramid(
-                beams, b, pieces[0, p], pieces[1, p], pieces[2, p], pieces[3, p] + slack
-            ):
-                continue
-            low, high = begin[p], begin[p + 1]
+        for i in range(_lit_spheres(beams, b, pieces, 0, len(near_piece), slack, near_piece)):
+            low, high = begin[near_piece[i]], begin[near_piece[i] + 1]
             _near_cone(beams, b, spheres, low, high, 2 * slack, near)
             for e in range(low, high):
                 if not near[e - low] or surfaces[e, 0] == own[b] or surfaces[e, 1] == own[b]:
@@ -625,9 +575,7 @@ def _unfolded(
     return s, math.sqrt(x * x + y * y + z * z)
 
 
-@_loop(
-    "i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)"
-)
+@_loop("i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)")
 def meetings(
     sent: Float64Array,
     lit: Int64Array,

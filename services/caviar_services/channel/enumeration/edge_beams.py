@@ -37,7 +37,6 @@ from caviar_services.channel.enumeration.image_beams import (
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.rectangles import FaceRectangles
-from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512
@@ -80,6 +79,7 @@ class EdgeTargets:
         """Surface of each face, Shape ``[F]``."""
         self.piece = piece[is_edge]
         """Of the body that each is of, −1 for scenery, in ascending order, Shape ``[E]``."""
+
     def __len__(self) -> int:
         return len(self.number)
 
@@ -215,7 +215,8 @@ def _source_beams(points: Float64Array) -> ImageBeams:
     count = len(points)
     rows = np.zeros((count, kernels.WIDTH))
     rows[:, :3], rows[:, kernels.COSINE], rows[:, kernels.LIT_FROM] = points, -1.0, _EVERYWHERE
-    return ImageBeams(np.zeros((count, 0), np.int64), np.zeros(count, np.bool_), rows, np.full(count, -1))
+    rows[:, kernels.LAST] = -1
+    return ImageBeams(np.zeros((count, 0), np.int64), np.zeros(count, np.bool_), rows)
 
 
 def _lit(
@@ -225,7 +226,7 @@ def _lit(
     reflected the beam last: they lie in the mirror's plane, and no wave goes from there to them."""
     own = np.full(len(beams), -2)
     if beams.chain.shape[1]:
-        own = edges.surface_of_face[beams.last]
+        own = edges.surface_of_face[beams.chain[:, -1]]
     ends, every = edges.ends[wanted], np.arange(len(wanted) + 1)
     begin = np.append(np.flatnonzero(np.diff(edges.piece[wanted], prepend=-2)), len(wanted))
     pairs = kernels.lit_edges(

@@ -54,23 +54,25 @@ class Targets:
         """Number of the first face of a body, and of faces of scenery."""
         self.begin = self.first_body + np.append(0, np.cumsum(sizes))
         """First face of each body, and one past the last, Shape ``[V + 1]``."""
+        slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
+        self.slack = slack
+        """By which every target is larger in tests [m]."""
         u, v = (faces.axes[:, i] * faces.half[:, i, None] for i in (0, 1))
         corners = np.stack([-u - v, u - v, u + v, v - u], axis=1) + faces.centre[:, None]
-        self.corners = np.ascontiguousarray(corners)
-        """Of the rectangles, in turn [m], Shape ``[F, 4, 3]``."""
-        self.bodies = spheres(corners, self.begin)
-        """Centre and radius of a sphere around each body [m], Shape ``[4, V]``."""
         rows = [faces.centre.T, faces.radius, faces.normal.T, faces.offset, faces.two_sided]
-        self.columns = np.ascontiguousarray(np.vstack(rows))
-        """Centre, radius, normal, offset, and whether both sides reflect, Shape ``[9, F]``."""
-        self.frames = np.zeros((len(faces), 3, 3))
-        """Axes of the rectangles, and in the third row their half lengths, Shape ``[F, 3, 3]``."""
-        self.frames[:, :2], self.frames[:, 2, :2] = faces.axes, faces.half
-        self.sight_begin = np.searchsorted(sights[:, 0], np.arange(self.first_body + 1))
-        """Face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``."""
-        self.sights = np.ascontiguousarray(sights[:, 1])
-        self.slack = _SLACK + _RELATIVE_SLACK * float(np.abs(faces.centre).max(initial=0.0))
-        """By which every target is larger in tests [m]."""
+        frames = np.zeros((len(faces), 3, 3))
+        frames[:, :2], frames[:, 2, :2] = faces.axes, faces.half
+        self.arrays = (
+            np.ascontiguousarray(np.vstack(rows)),
+            np.ascontiguousarray(corners),
+            frames,
+            spheres(corners, self.begin),
+            self.begin,
+            np.searchsorted(sights[:, 0], np.arange(self.first_body + 1)),
+            np.ascontiguousarray(sights[:, 1]),
+            slack,
+        )
+        """As `beam_kernels` takes them."""
 
     def body_of(self, faces: Int64Array) -> Int64Array:
         """Number of the body of these faces of bodies."""
@@ -98,9 +100,7 @@ class ImageBeams:
     by_body: BoolArray
     """Whether one of these is of a body, Shape ``[B]``."""
     rows: Float64Array
-    """Image, cone and pyramids of each (`beam_kernels`), Shape ``[B, 36]``."""
-    last: Int64Array
-    """The last face of each, −1 without a reflection, Shape ``[B]``."""
+    """Image, cone and pyramids of each (`beam_kernels`), Shape ``[B, 37]``."""
 
     def __len__(self) -> int:
         return len(self.chain)
@@ -113,7 +113,7 @@ class ImageBeams:
     def scenery_alone(self) -> ImageBeams:
         """Beams before the first one by way of a body."""
         first = slice(0, self.first_by_body)
-        return ImageBeams(self.chain[first], self.by_body[first], self.rows[first], self.last[first])
+        return ImageBeams(self.chain[first], self.by_body[first], self.rows[first])
 
 
 def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> ImageBeams:
@@ -157,7 +157,7 @@ def longer_beams(
     for pairs in more:
         parent = np.concatenate([parent, pairs[:, 0]])
         chain = np.concatenate([chain, np.column_stack([beams.chain[pairs[:, 0]], pairs[:, 1]])])
-    return reflected_beams(targets, chain, beams.rows[parent, :3], beams.last[parent])
+    return reflected_beams(targets, chain, beams.rows[parent, :3], beams.chain[parent, -1])
 
 
 def _begun_by(beams: ImageBeams, wanted: Int64Array) -> Int64Array:
@@ -177,40 +177,30 @@ def reflected_beams(
         image: Image of the source before that reflection [m], Shape ``[B, 3]``.
         before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
     """
-    last = np.ascontiguousarray(chain[:, -1])
     if before is None:
         before = np.full(len(chain), -1)
-    image = np.ascontiguousarray(image)
-    rows = kernels.reflected(targets.columns, targets.corners, last, image, before)
-    return ImageBeams(chain, (chain >= targets.first_body).any(1), rows, last)
+    last, image = np.ascontiguousarray(chain[:, -1]), np.ascontiguousarray(image)
+    rows = kernels.reflected(targets.arrays, last, image, before)
+    return ImageBeams(chain, (chain >= targets.first_body).any(1), rows)
 
 
 def by_scenery(targets: Targets, beams: ImageBeams) -> Int64Array:
     """Pairs of a beam by way of a body and a face of scenery that it lights, Shape ``[N, 2]``."""
     # Only beams by way of a body: which chains of scenery alone exist is known (`scenery_chains`).
-    first, many = beams.first_by_body, targets.first_body
-    found: Int64Array = kernels.lit_scenery(
-        beams.rows, beams.last, first, targets.columns, targets.corners, many, targets.slack
-    )
+    found: Int64Array = kernels.lit_scenery(beams.rows, beams.first_by_body, targets.arrays)
     return found
 
 
 def lit_bodies(targets: Targets, beams: ImageBeams) -> Int64Array:
     """Pairs of a beam and a face of a body that it lights, Shape ``[N, 2]``."""
-    t = targets
-    found: Int64Array = kernels.lit_bodies(
-        beams.rows, beams.last, t.columns, t.corners, t.bodies, t.begin, t.slack
-    )
+    found: Int64Array = kernels.lit_bodies(beams.rows, targets.arrays)
     return found
 
 
 def shown_scenery(targets: Targets, views: ImageBeams) -> Int64Array:
     """Pairs of a view, the beam of what a receiver sees in a face of scenery, and a face of scenery that
     waves may come from, of those that the former sees, Shape ``[N, 2]``."""
-    t = targets
-    found: Int64Array = kernels.shown_scenery(
-        views.rows, views.last, t.columns, t.corners, t.sight_begin, t.sights, t.slack
-    )
+    found: Int64Array = kernels.shown_scenery(views.rows, targets.arrays)
     return found
 
 
@@ -240,43 +230,29 @@ def ends_by_scenery(
         receivers: Positions [m], Shape ``[R, 3]``.
         scenery: Which faces the receivers see.
     """
-    t, first = targets, beams.first_by_body
+    first, many = beams.first_by_body, len(targets.begin) - 1
     points = receivers[scenery.receiver]
-    views = reflected_beams(t, scenery.face[:, None], points)
-    last, many = beams.last[first:], t.bodies.shape[1]
-    group = np.where(last >= t.first_body, t.body_of(last), many + last)
+    views = reflected_beams(targets, scenery.face[:, None], points)
+    last = beams.chain[first:, -1]
+    group = np.where(last >= targets.first_body, targets.body_of(last), many + last)
     order = np.argsort(group, kind="stable")
-    group_begin = np.searchsorted(group[order], np.arange(many + t.first_body + 1))
-    found = kernels.ends_by_scenery(
-        beams.rows[first + order],
-        last[order],
-        group_begin,
-        views.rows,
-        views.last,
-        t.columns,
-        t.corners,
-        t.frames,
-        t.bodies,
-        points,
-        t.sight_begin,
-        t.sights,
-        t.slack,
-    )
-    return first + order[found[:, 0]], scenery.face[found[:, 1]], scenery.receiver[found[:, 1]]
+    begin = np.searchsorted(group[order], np.arange(many + targets.first_body + 1))
+    beam, view = kernels.ends_by_scenery(
+        beams.rows[first + order], begin, views.rows, targets.arrays, points
+    ).T
+    return first + order[beam], scenery.face[view], scenery.receiver[view]
 
 
 def ends_by_bodies(targets: Targets, beams: ImageBeams, receivers: Float64Array) -> Int64Array:
     """Beam, face of a body and receiver [m], Shape ``[R, 3]``, wherever the beam may light the receiver by a
     reflection at the face, Shape ``[N, 3]``."""
-    t, faces = targets, targets.faces
-    bodies = slice(t.first_body, len(faces))
+    faces = targets.faces
+    bodies = slice(targets.first_body, len(faces))
     axes = np.concatenate([faces.axes[bodies], faces.normal[bodies, None]], axis=1)
-    seen: Float64Array = axes @ receivers.T - np.einsum("fac,fc->fa", axes, faces.centre[bodies])[..., None]
+    seen = axes @ receivers.T - np.einsum("fac,fc->fa", axes, faces.centre[bodies])[..., None]
     # A height of 0 crosses no plane.
     seen[:, 2] = np.where(faces.two_sided[bodies, None], seen[:, 2], np.maximum(seen[:, 2], 0.0))
-    found: Int64Array = kernels.ends_by_bodies(
-        beams.rows, beams.last, t.columns, t.frames, t.bodies, receivers, t.begin, seen, t.slack
-    )
+    found: Int64Array = kernels.ends_by_bodies(beams.rows, targets.arrays, receivers, seen)
     return found
 
 
