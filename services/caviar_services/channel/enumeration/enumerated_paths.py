@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
+from caviar_protocol.errors import SetupError
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.enumeration.edge_beams import EdgeTargets, edge_chains, enumerated_scenery
-from caviar_services.channel.enumeration.image_beams import SceneryViews, Targets, chain_pairs
+from caviar_services.channel.enumeration.image_beams import SceneryViews, Targets, chain_pairs, kernels
 from caviar_services.channel.enumeration.image_paths import (
     ImagePaths,
     crossings,
@@ -64,6 +65,18 @@ class EnumeratedTracer:
         self._faces = SceneFaces(scene, inner=options.refraction)
         self._look = Faces(scene)
         self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
+
+    def compile_kernels(self) -> None:
+        """Compile the loops over beams, some 20 s, or read what was compiled before.
+
+        Raises:
+            SetupError: Numba is not installed.
+        """
+        if kernels.numba is None:
+            raise SetupError(
+                'candidates = "enumerated" needs Numba, which is not installed; add it: '
+                "pip install 'caviar-sim[channel]'"
+            )
 
     def trace(
         self,

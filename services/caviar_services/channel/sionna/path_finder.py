@@ -164,7 +164,11 @@ class PathFinder:
         self.notes += tuple(cache.notes if cache else ())
 
     def compile_kernels(self) -> None:
-        """Trace above the scene, so that every kernel that frames need is compiled before the first one."""
+        """Trace above the scene, so that every kernel that frames need is compiled before the first one.
+
+        Raises:
+            SetupError: A library is missing (`EnumeratedTracer.compile_kernels`).
+        """
         scene, options, s = self._scene, self.options, self._settings
         # Of an episode before this one, in the same scene.
         if (s, options) in scene.compiled:
@@ -190,6 +194,7 @@ class PathFinder:
             for tracer in tracers:
                 tracer.trace(above, receivers, corners=corners)
         if self._enumerated is not None:
+            self._enumerated.compile_kernels()
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
             look = self.tracer.look
