@@ -194,6 +194,7 @@ class PathFinder:
             for tracer in tracers:
                 tracer.trace(above, receivers, corners=corners)
         if self._enumerated is not None:
+            self._run.progress("compiling kernels of enumeration", COMPILE_GRACE_S)
             self._enumerated.compile_kernels()
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
