@@ -145,8 +145,9 @@ def _lit_spheres(
 
 @_compiled
 def _on_lit_side(beams: Float64Array, b: int, x: float, y: float, z: float, slack: float) -> bool:
-    lit = beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z
-    return lit > beams[b, LIT_FROM] - slack
+    height = beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z
+    lit: bool = height > beams[b, LIT_FROM] - slack
+    return lit
 
 
 @_compiled

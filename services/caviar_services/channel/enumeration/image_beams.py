@@ -181,7 +181,8 @@ def reflected_beams(
         before = np.full(len(chain), -1)
     last, image = np.ascontiguousarray(chain[:, -1]), np.ascontiguousarray(image)
     rows = kernels.reflected(targets.arrays, last, image, before)
-    return ImageBeams(chain, (chain >= targets.first_body).any(1), rows)
+    by_body: BoolArray = np.logical_or.reduce(chain >= targets.first_body, axis=1)
+    return ImageBeams(chain, by_body, rows)
 
 
 def by_scenery(targets: Targets, beams: ImageBeams) -> Int64Array:
