@@ -1,11 +1,14 @@
 """Rates of the agent ``learner`` over a run beside those of ``los-beam`` and of the best pairs, in and out of
 sight.
 
-Run as ``python tests/bench/bench_learner.py [SCENARIO] [--seeds 5] [--frames N] [--markdown FILE]
-[--picture FILE]``: a run in this process for each seed. Rates are Shannon's, and those of the learner are
-less by the air time of its pilots. The picture has the rate over the run, the mean of all seeds; the table
-has the last quarter of the frames with such users, and of all windows the one in which the learner is worst
-beside ``los-beam``.
+Run as ``python tests/bench/bench_learner.py [SCENARIO] [--seeds 5] [--frames N] [--policy FILE] [--markdown
+FILE] [--picture FILE]``: a run in this process for each seed. Rates are Shannon's, and those of the learner
+are less by the air time of its pilots. The picture has the rate over the run, the mean of all seeds; the
+table has the last quarter of the frames with such users, and of all windows the one in which the learner is
+worst beside ``los-beam``.
+
+With ``--policy``, trained elsewhere, the agent ``policy`` and a learner that begins from it play each seed
+too, with the transmitters of the policy's card; the table then has a row for each of them.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
@@ -13,12 +16,17 @@ beside ``los-beam``.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
+from policy_files import for_policy
 
+from caviar_clients.replay.plan import Request, plan_replay
+from caviar_clients.replay.recorded import RecordedRun
 from caviar_clients.session.embedded import EmbeddedRun
 from caviar_protocol.arrays import BoolArray, Float64Array
 from caviar_protocol.recording import Recording
@@ -26,6 +34,7 @@ from caviar_protocol.scenario import Scenario, load_scenario
 from caviar_protocol.spec import table
 from caviar_protocol.topics import Link
 from caviar_services.agent.pilots import PILOT_TIME
+from caviar_services.agent.policy import PolicyModel
 
 WINDOW = 25
 """Frames of a point of the curve."""
@@ -33,13 +42,30 @@ AGENTS = ("learner", "los-beam", "best pair")
 
 
 def with_learner(scenario: Scenario, seed: int, frames: int | None) -> Scenario:
-    """The scenario with this agent and seed, its scene and link recorded."""
+    """The scenario with this agent and seed; what a replay with another agent needs is recorded."""
     services = {
         name: replace(spec, use="learner", settings={}) if spec.role == "agent" else spec
         for name, spec in scenario.services.items()
     }
-    run = replace(scenario.run, seed=seed, record=("scene", "link"), frames=frames or scenario.run.frames)
+    sensors = tuple(spec.use for spec in services.values() if spec.role == "sensors")
+    topics = ("scene", "channel", "link", *sensors)
+    run = replace(scenario.run, seed=seed, record=topics, frames=frames or scenario.run.frames, episodes=1)
     return replace(scenario, run=run, services=services)
+
+
+def with_policy(folder: Path, file: Path) -> dict[str, Scenario]:
+    """Replays of a recorded run with other agents: they serve the same users over the same channels."""
+    run, policy = RecordedRun(Recording(folder)), f"file:{file.resolve()}"
+    (agent,) = (name for name, spec in run.scenario.services.items() if spec.role == "agent")
+    settings: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "policy": ("policy", {"file": policy}),
+        "policy, 8 pilots": ("policy", {"file": policy, "candidates": 8}),
+        "learner from policy": ("learner", {"policy": policy}),
+    }
+    return {
+        name: plan_replay(run, Request(replace={agent: use}, settings={agent: given})).scenario
+        for name, (use, given) in settings.items()
+    }
 
 
 def rates_of(scenario: Scenario, folder: Path) -> tuple[Float64Array, BoolArray, BoolArray]:
@@ -95,7 +121,19 @@ def last_quarter(chosen: BoolArray) -> BoolArray:
     return found
 
 
-def draw(curves: dict[str, Float64Array], file: Path, title: str) -> None:
+def by_agent(rates: Float64Array, agents: Sequence[str], chosen: Mapping[str, BoolArray]) -> list[list[str]]:
+    """Rows of the table with a policy: mean rates over all frames, then those of the last quarter.
+
+    Args:
+        rates: Shape ``[A, S, K, U]``.
+        agents: Names, A.
+        chosen: Users by the name of their kind, Shape ``[S, K, U]``.
+    """
+    masks = [*chosen.values(), *(last_quarter(of) for of in chosen.values())]
+    return [[agent, *(f"{rates[a, mask].mean():.2f}" for mask in masks)] for a, agent in enumerate(agents)]
+
+
+def draw(curves: dict[str, Float64Array], agents: Sequence[str], file: Path, title: str) -> None:
     """Draw the rate of each agent over the run, in and out of sight."""
     from matplotlib.figure import Figure
 
@@ -103,7 +141,7 @@ def draw(curves: dict[str, Float64Array], file: Path, title: str) -> None:
     axes = figure.subplots(1, len(curves), sharey=True)
     for ax, (name, curve) in zip(axes, curves.items(), strict=True):
         frames = WINDOW * (np.arange(curve.shape[1]) + 0.5)
-        for agent, values in zip(AGENTS, curve, strict=True):
+        for agent, values in zip(agents, curve, strict=True):
             ax.plot(frames, values, marker=".", label=agent)
         ax.set(title=name, xlabel="frame")
     axes[0].set(ylabel="rate [bit/s/Hz]")
@@ -118,26 +156,37 @@ def main() -> None:
     parser.add_argument("scenario", nargs="?", default="geometric")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--frames", type=int, help="of each run; absent: those of the scenario")
+    parser.add_argument("--policy", type=Path, help="ONNX file that was trained elsewhere")
     parser.add_argument("--markdown", type=Path, help="write the table of the documentation there")
     parser.add_argument("--picture", type=Path, help="draw the curve there")
     args = parser.parse_args()
     base = load_scenario(args.scenario)
+    agents = [*AGENTS]
+    if args.policy:
+        base = for_policy(base, PolicyModel(args.policy))
     runs = []
-    with TemporaryDirectory(prefix="caviar-learner-") as folder:
+    with TemporaryDirectory(prefix="caviar-learner-") as name:
         for seed in range(1, args.seeds + 1):
-            scenario = with_learner(base, seed, args.frames)
-            runs.append(rates_of(scenario, Path(folder) / str(seed)))
+            folder = Path(name) / str(seed)
+            rates, has_path, los = rates_of(with_learner(base, seed, args.frames), folder)
+            replays = with_policy(folder, args.policy) if args.policy else {}
+            for number, scenario in enumerate(replays.values()):
+                again, _, _ = rates_of(scenario, Path(name) / f"{seed}-{number}")
+                rates = np.concatenate([rates, again[:1]])
+            agents = [*AGENTS, *replays]
+            runs.append((rates, has_path, los))
     users = min(rates.shape[2] for rates, _, _ in runs)
     rates = np.stack([one[:, :, :users] for one, _, _ in runs], axis=1)
     has_path = np.stack([one[:, :users] for _, one, _ in runs])
     los = np.stack([one[:, :users] for _, _, one in runs])
     curves, rows = {}, []
-    for name, chosen in (("in sight", has_path & los), ("out of sight", has_path & ~los)):
+    kinds = {"in sight": has_path & los, "out of sight": has_path & ~los}
+    for name, chosen in kinds.items():
         if not chosen.any():
             continue
         curves[name] = curve = windows(rates, chosen)
         late = last_quarter(chosen)
-        last = rates[:, late].mean(axis=-1)
+        last = rates[: len(AGENTS), late].mean(axis=-1)
         ratios = [
             of_seed[0, own].mean() / of_seed[1, own].mean()
             for of_seed, own in zip(np.moveaxis(rates, 1, 0), late, strict=True)
@@ -159,11 +208,15 @@ def main() -> None:
         "least of a window",
     )
     text = table(head, rows)
+    if args.policy:
+        print(text)
+        head = ("agent", *kinds, *(f"{name}, last quarter" for name in kinds))
+        text = table(head, by_agent(rates, agents, kinds))
     print(text)
     if args.markdown:
         args.markdown.write_text(f"# Learner\n\n{text}\n")
     if args.picture:
-        draw(curves, args.picture, f"{args.scenario}, {args.seeds} seeds, means of {WINDOW} frames")
+        draw(curves, agents, args.picture, f"{args.scenario}, {args.seeds} seeds, means of {WINDOW} frames")
 
 
 if __name__ == "__main__":

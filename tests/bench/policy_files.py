@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 
+from msgspec.structs import replace
 from onnx import TensorProto, helper
 
-from caviar_services.agent.policy import ACTION, CARD_KEY, SCORES, PolicyCard, write_card
+from caviar_protocol.observations import inputs_of
+from caviar_protocol.scenario import Scenario
+from caviar_services.agent.policy import ACTION, CARD_KEY, SCORES, PolicyCard, PolicyModel, write_card
 
 
 def constant_policy(file: Path, pair: int, beams: tuple[int, int] = (64, 1)) -> Path:
@@ -103,3 +107,24 @@ def scenario_with(folder: Path, file: str, frames: int, more: str = "") -> Path:
     path = folder / "scenario.toml"
     path.write_text(text + more)
     return path
+
+
+def for_policy(scenario: Scenario, model: PolicyModel) -> Scenario:
+    """A scenario with the transmitters that a policy was trained for, and only the sensors that it
+    observes."""
+    card = model.card
+    assert card is not None
+    topics = {entry.topic for entry in inputs_of(card.observe)}
+    services = {
+        name: spec for name, spec in scenario.services.items() if spec.role != "sensors" or spec.use in topics
+    }
+    devices = tuple(
+        device
+        for device in scenario.devices
+        if device.kind in topics
+        or (
+            device.kind == "antenna"
+            and (device.role != "tx" or any(fnmatchcase(device.name, t) for t in card.transmitters))
+        )
+    )
+    return replace(scenario, services=services, devices=devices)

@@ -18,7 +18,7 @@ from caviar_clients.cli.main import app
 from caviar_clients.datasets.reader import Dataset
 from caviar_clients.learning.classification import Classification, load_any_experiment, parse_classification
 from caviar_clients.learning.dataset_evaluation import evaluate_on_dataset
-from caviar_clients.learning.networks import AROUND, LINE, OBSERVED, STEPS, BeamModel, BeamNetwork
+from caviar_clients.learning.networks import AROUND, FINE, LINE, OBSERVED, STEPS, BeamModel, BeamNetwork
 from caviar_clients.learning.ranking_methods import ranked_along_the_line, ranked_by_policy
 from caviar_clients.learning.rankings import terms_of
 from caviar_clients.learning.samples import Samples, read_samples
@@ -272,9 +272,11 @@ def test_a_grid_tells_what_stands_on_the_line_and_around(
     length, width = AROUND
     for n, (tx, rx) in enumerate(ends):
         away, most = rx - tx, np.abs(rx - tx).max()
-        back = [*(np.arange(1, LINE + 1) / (LINE + 1)), *(np.arange(1, STEPS + 1) / most)]
+        fine = LINE * FINE
+        back = [*(np.arange(1, fine + 1) / (fine + 1)), *(np.arange(1, STEPS + 1) / most)]
         points = [np.round(rx - away * share).astype(int) for share in back]
-        wanted = [share < 1 and grid[(n, *point)] > 0 for share, point in zip(back, points, strict=True)]
+        met = [share < 1 and grid[(n, *point)] > 0 for share, point in zip(back, points, strict=True)]
+        wanted = [*np.reshape(met[:fine], (LINE, FINE)).any(1), *met[fine:]]
         assert np.count_nonzero((rows["line"][n, :-1] > 0) != wanted) <= 2
         layer = max(1, shape[2] // 5)
         for _ in range(40):

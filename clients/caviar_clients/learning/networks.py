@@ -43,9 +43,9 @@ WAVES = {"position": 16, "last_beam": 16, "aod": 32, "aoa": 32, "departure": 32}
 """Sines and cosines of a part, as of an encoding (`caviar_clients.learning.experiment.Encoding`)."""
 PICTURE = (36, 64)
 """Rows and columns that pictures are reduced to, or a few more, by means of whole pixels."""
-LINE, STEPS = 24, 32
-"""Points of the straight line from RX to TX at which a LIDAR grid is looked at: by shares of the distance,
-and cell by cell from RX on."""
+LINE, FINE, STEPS = 24, 8, 32
+"""Parts of the straight line from RX to TX by shares of the distance, points of each at which a LIDAR grid is
+looked at, and points cell by cell from RX on."""
 AROUND = (16, 6)
 """Cells to each side of RX that are looked at, along the longer and the shorter axis of the ground."""
 MARKED = {"tx": -1, "rx": -2}
@@ -237,16 +237,17 @@ class _Grid(_Module):  # type: ignore[misc]
         away = rx - tx
         # Cells from RX to TX, by shares of the distance and one by one; those beyond TX count for nothing.
         length = away.abs().amax(dim=1, keepdim=True).clamp(min=1)
-        shares = torch.arange(1, LINE + 1, device=rows.device) / (LINE + 1)
+        shares = torch.arange(1, LINE * FINE + 1, device=rows.device) / (LINE * FINE + 1)
         steps = torch.arange(1, STEPS + 1, device=rows.device) / length
         back = torch.cat([shares + torch.zeros_like(length), steps], dim=1)
         point = torch.round(rx[:, None] - away[:, None] * back.clamp(max=1)[:, :, None]).long()
         index = (point[..., 0] * y + point[..., 1]) * z + point[..., 2]
-        line = (torch.gather(flat, 1, index) > 0).float() * has_tx * (back < 1).float()
+        met = (torch.gather(flat, 1, index) > 0).float() * has_tx * (back < 1).float()
+        parts, cells = met[:, : LINE * FINE].reshape(-1, LINE, FINE), met[:, LINE * FINE :]
         return {
             "rx": rx,
             "direction": away / torch.linalg.vector_norm(away, dim=1, keepdim=True).clamp(min=1),
-            "line": torch.cat([line, has_tx], dim=1),
+            "line": torch.cat([parts.amax(dim=2), cells, has_tx], dim=1),
             "around": self._around(flat, rx.long()),
         }
 
