@@ -173,6 +173,8 @@ def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, s
         return False
     for k in range(SIDES, LAST, 3):
         nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
+        if nx == 0 and ny == 0 and nz == 0:  # after one reflection there are four sides
+            break
         least = nx * beams[b, 0] + ny * beams[b, 1] + nz * beams[b, 2] - slack
         most = -np.inf
         for i in range(4):
@@ -291,11 +293,11 @@ def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array
     """Pairs of a beam from ``first`` on and a face of scenery that it lights."""
     faces, corners, _, _, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    near = np.empty(begin[0], np.bool_)
+    lit = np.empty(begin[0], np.int64)
     for b in range(first, len(beams)):
-        _near_cone(beams, b, faces, 0, len(near), 2 * slack, near)
-        for f in range(len(near)):
-            if near[f] and f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
+        for i in range(_lit_spheres(beams, b, faces, 0, len(lit), slack, lit)):
+            f = lit[i]
+            if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                 found = _grown(found, count)
                 found[count, 0], found[count, 1] = b, f
                 count += 1
