@@ -3,10 +3,10 @@
     python tests/bench/bench_datasets.py [--presets s008 …] [--seconds 60] [--markdown FILE]
 
 Episodes of each preset are played by one worker, as ``caviar dataset generate`` does, for about
-``--seconds``. What the command itself does for each episode is measured apart: the Dask scheduler's part by
-tasks that do nothing, and the rows of the catalogue. With these times, in their spread, 1 to 10,000 workers
-are simulated: workers play, the command serves one episode after the other, and the disk takes so many bytes
-a second.
+``--seconds``; the worker's processor time counts. What the command itself does for each episode is measured
+apart, by the clock: the Dask scheduler's part by tasks that do nothing, and the rows of the catalogue. With
+these times, in their spread, 1 to 10,000 workers are simulated: workers play, the command serves one episode
+after the other, and the disk takes so many bytes a second.
 """
 
 # ruff: noqa: T201 - a command that prints what it measured
