@@ -43,7 +43,14 @@ from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_protocol.observations import Users
 from caviar_protocol.scenario import Scenario
-from caviar_services.agent.policy import ACTION, SCORES, PolicyCard, PolicyModel, TrainedOn
+from caviar_services.agent.policy import (
+    ACTION,
+    SCORES,
+    PolicyCard,
+    PolicyModel,
+    TrainedOn,
+    keeps_heading,
+)
 
 SAMPLES = ".samples"
 """Folder beside those of experiments, of what they read of datasets."""
@@ -440,14 +447,14 @@ def export_classifier(
     dataset = experiment.dataset()
     train, validation, _ = experiment.split()
     scenario, data = dataset.settings["scenario"], experiment.data
+    known = msgspec.convert(scenario, Scenario)
     card = PolicyCard(
         observe=names,
         codebooks=(samples.beams,),
         per_user=True,
         # Those of the dataset: what it learnt says nothing of another station of the scenario.
-        transmitters=Users(
-            msgspec.convert(scenario, Scenario), data.users, (), data.transmitters
-        ).transmitters,
+        transmitters=Users(known, data.users, (), data.transmitters).transmitters,
+        keeps_heading=keeps_heading(known.devices),
         scenario=scenario["run"]["name"],
         algorithm=f"classification by {experiment.model.name}",
         seeds=(seed,),
