@@ -188,8 +188,8 @@ def test_packages_that_code_of_the_user_imports_count_by_version(
 ) -> None:
     (own / "helper_of_mine.py").write_text("def f():\n    from yaml.nodes import Node\n    import json\n")
     monkeypatch.setattr(provenance, "_distributions", lambda: {"yaml": ["PyYAML"], "numpy": ["numpy"]})
-    version = metadata.version
-    monkeypatch.setattr(metadata, "version", lambda name: "6.0" if name == "PyYAML" else version(name))
+    version = provenance._version
+    monkeypatch.setattr(provenance, "_version", lambda name: "6.0" if name == "PyYAML" else version(name))
     services = {"services": {"a": {"role": "agent", "use": "agent_of_mine:Mine", "settings": {}}}}
     assert used_versions(services)["PyYAML"] == "6.0"
 
