@@ -179,7 +179,7 @@ def test_what_does_not_fit_is_refused_with_both_sides(tmp_path: Path) -> None:
     for keeps in (True, False):  # geometric has a receiver that turns with its UAV
         made(tmp_path, Straight(), "turned.onnx", keeps_heading=keeps)
         text = refused(with_policy(tmp_path, "turned.onnx"), tmp_path / f"turned-{keeps}")
-        assert ("keeps_heading = true, and 'rx'" in text) == keeps
+        assert ("keeps_heading = true, and uav/rx" in text) == keeps
         assert bool(text) == keeps
     missing = refused(with_policy(tmp_path, "none.onnx"), tmp_path / "c")
     assert "none.onnx" in missing

@@ -43,14 +43,7 @@ from caviar_protocol.files import replace_file
 from caviar_protocol.host import install_command
 from caviar_protocol.observations import Users
 from caviar_protocol.scenario import Scenario
-from caviar_services.agent.policy import (
-    ACTION,
-    SCORES,
-    PolicyCard,
-    PolicyModel,
-    TrainedOn,
-    keeps_heading,
-)
+from caviar_services.agent.policy import ACTION, SCORES, PolicyCard, PolicyModel, TrainedOn
 
 SAMPLES = ".samples"
 """Folder beside those of experiments, of what they read of datasets."""
@@ -447,14 +440,14 @@ def export_classifier(
     dataset = experiment.dataset()
     train, validation, _ = experiment.split()
     scenario, data = dataset.settings["scenario"], experiment.data
-    known = msgspec.convert(scenario, Scenario)
+    users = Users(msgspec.convert(scenario, Scenario), data.users, (), data.transmitters)
     card = PolicyCard(
         observe=names,
         codebooks=(samples.beams,),
         per_user=True,
         # Those of the dataset: what it learnt says nothing of another station of the scenario.
-        transmitters=Users(known, data.users, (), data.transmitters).transmitters,
-        keeps_heading=keeps_heading(known.devices),
+        transmitters=users.transmitters,
+        keeps_heading=users.keeps_heading,
         scenario=scenario["run"]["name"],
         algorithm=f"classification by {experiment.model.name}",
         seeds=(seed,),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -27,7 +27,7 @@ from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input
 from caviar_protocol.observations import KnownDevices, Moment, Observer, Place, Users, inputs_of
 from caviar_protocol.policies import DECISION, NEXT, REFUSED
-from caviar_protocol.scenario import DeviceSpec, ServiceSpec
+from caviar_protocol.scenario import ServiceSpec
 from caviar_protocol.space.scene import Pair
 from caviar_protocol.topics import BeamChoice, Link, Scene
 from caviar_services.agent.base import Agent, AgentSettings
@@ -76,7 +76,7 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     transmitters: tuple[str, ...] = ("*",)
     """Those that it chooses for, as names with ``*`` and ``?``."""
     keeps_heading: bool | None = None
-    """Whether receivers on objects kept their heading, or turned with these; None: not known, or both."""
+    """Whether receivers on objects kept their heading, or turned; None: not known (`Users.keeps_heading`)."""
     environment: str = ""
     """Of gymnasium, that it was trained in."""
     scenario: str = ""
@@ -91,20 +91,6 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     """Of a policy that was trained on a dataset."""
     versions: Mapping[str, str] = {}
     """Of the packages that it was trained with."""
-
-
-def _moves(device: DeviceSpec) -> bool:
-    return device.kind == "antenna" and device.role == "rx" and bool(device.on)
-
-
-def keeps_heading(devices: Iterable[DeviceSpec]) -> bool | None:
-    """Whether the receivers on objects keep their heading; None: there are none, or some do.
-
-    Args:
-        devices: Of a scenario.
-    """
-    found = {device.keeps_heading for device in devices if _moves(device)}
-    return found.pop() if len(found) == 1 else None
 
 
 def write_card(card: PolicyCard) -> str:
@@ -348,15 +334,14 @@ class PolicyAgent(PilotAgent[PolicySettings]):
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
                 key=key,
             )
-        if card is not None and card.keeps_heading is not None:
-            for device in self.run.devices:
-                if _moves(device) and device.keeps_heading != card.keeps_heading:
-                    raise ScenarioError(
-                        f"{called} was trained for receivers with keeps_heading = "
-                        f"{str(card.keeps_heading).lower()}, and {device.name!r} has the other value: its "
-                        "beams would mean other directions; write the same below [[devices]]",
-                        key=key,
-                    )
+        kept, keeps = card.keeps_heading if card else None, places.keeps_heading
+        if None not in (kept, keeps) and kept != keeps:
+            raise ScenarioError(
+                f"{called} was trained for receivers with keeps_heading = {str(kept).lower()}, and "
+                f"{', '.join(places.receivers)} has the other value: its beams would mean other directions; "
+                "write the same below [[devices]]",
+                key=key,
+            )
         observer = Observer(known, places, observe)
         given = {entry.topic for entry in self.inputs}
         for entry in observer.inputs:
