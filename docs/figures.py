@@ -59,6 +59,18 @@ class Measurement(NamedTuple):
 
 
 MEASUREMENTS: Mapping[str, Measurement] = {
+    "beams": Measurement(
+        "caviar paper beams --quick --out {out}",
+        "caviar paper beams --out {out}",
+        "beams.md",
+        {
+            "beams": "Beam selection, held-out",
+            "beams-other": "Beam selection, another city",
+            "beams-kinds": "line of sight, held-out",
+            "beams-worth": "sensors are worth, held-out",
+            "beams-worth-other": "sensors are worth, another city",
+        },
+    ),
     "broker": Measurement(
         f"{_BROKER} --rounds 3 --markdown {{out}}/broker.md",
         f"{_BROKER} --markdown {{out}}/broker.md",

@@ -443,6 +443,7 @@ on = "vehicle.user-*"
 count = 10
 mount = "roof"
 position_m = [0.0, 0.0, 0.1]
+keeps_heading = true  # rows of elements lie north–south, as in the ITU challenge
 array = { columns = 8 }
 
 # Above each of these receivers, and so above everything that the vehicle is made of.

@@ -145,7 +145,7 @@ def draw(curves: dict[str, Float64Array], agents: Sequence[str], file: Path, tit
             ax.plot(frames, values, marker=".", label=agent)
         ax.set(title=name, xlabel="frame")
     axes[0].set(ylabel="rate [bit/s/Hz]")
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
     figure.suptitle(title)
     figure.savefig(file, dpi=120)
 

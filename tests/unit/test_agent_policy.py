@@ -65,9 +65,12 @@ class NoSensors:
         return {}
 
 
-def made(folder: Path, module: Any, name: str = "policy.onnx", scenario: str = "geometric") -> Path:
+def made(
+    folder: Path, module: Any, name: str = "policy.onnx", scenario: str = "geometric", **facts: Any
+) -> Path:
     env = BeamSelectionEnv(scenario, observe=("aod",))
-    export_module(module, env.observation_space, folder / name, card_of(env, algorithm="by hand", seeds=(1,)))
+    card = card_of(env, algorithm="by hand", seeds=(1,), **facts)
+    export_module(module, env.observation_space, folder / name, card)
     return folder / name
 
 
@@ -173,6 +176,11 @@ def test_what_does_not_fit_is_refused_with_both_sides(tmp_path: Path) -> None:
     other = refused(with_policy(tmp_path, base="smoke"), tmp_path / "b")
     assert "was trained for 1 user(s) with beams 64 × 1, and the scenario has 2 user(s)" in other
     assert "services.agent.settings.file" in other or "scenario.toml" in other
+    for keeps in (True, False):  # geometric has a receiver that turns with its UAV
+        made(tmp_path, Straight(), "turned.onnx", keeps_heading=keeps)
+        text = refused(with_policy(tmp_path, "turned.onnx"), tmp_path / f"turned-{keeps}")
+        assert ("keeps_heading = true, and uav/rx" in text) == keeps
+        assert bool(text) == keeps
     missing = refused(with_policy(tmp_path, "none.onnx"), tmp_path / "c")
     assert "none.onnx" in missing
     made(tmp_path, Constant(BEAMS), "beyond.onnx")

@@ -37,7 +37,7 @@ def scenario(**settings: dict[str, Any]) -> dict[str, Any]:
 @pytest.fixture
 def every_package(monkeypatch: pytest.MonkeyPatch) -> None:
     """All packages are installed, of version 7."""
-    monkeypatch.setattr(metadata, "version", lambda name: "7")
+    monkeypatch.setattr(provenance, "_version", lambda name: "7")
 
 
 @pytest.mark.parametrize(
@@ -78,13 +78,13 @@ def test_what_else_is_installed_changes_no_byte_and_stands_beside(
     """A recording and the settings of the dataset are the same; `measured.json` has the whole list."""
     plan = plan_dataset(load_scenario(SMOKE), episodes=1, scenes=2)
     before, found = plan.settings(), []
-    version, more = metadata.version, {"panda3d": "99.1", "duckdb": "99.2", "scipy": "99.3"}
+    version, more = provenance._version, {"panda3d": "99.1", "duckdb": "99.2", "scipy": "99.3"}
     everything = {**installed_versions(), **more}
     for name in ("one", "two"):
         if name == "two":
             monkeypatch.setattr("caviar_clients.datasets.episode.installed_versions", lambda: everything)
             monkeypatch.setattr("caviar_services.recorder.mcap.installed_versions", lambda: everything)
-            monkeypatch.setattr(metadata, "version", lambda name: more.get(name) or version(name))
+            monkeypatch.setattr(provenance, "_version", lambda name: more.get(name) or version(name))
         (tmp_path / name / "episodes").mkdir(parents=True)
         assert play_episode(EpisodeTask(plan.scenario, 0, str(tmp_path / name))).error == ""
         episode = tmp_path / name / "episodes" / "episode-000000"
@@ -188,8 +188,8 @@ def test_packages_that_code_of_the_user_imports_count_by_version(
 ) -> None:
     (own / "helper_of_mine.py").write_text("def f():\n    from yaml.nodes import Node\n    import json\n")
     monkeypatch.setattr(provenance, "_distributions", lambda: {"yaml": ["PyYAML"], "numpy": ["numpy"]})
-    version = metadata.version
-    monkeypatch.setattr(metadata, "version", lambda name: "6.0" if name == "PyYAML" else version(name))
+    version = provenance._version
+    monkeypatch.setattr(provenance, "_version", lambda name: "6.0" if name == "PyYAML" else version(name))
     services = {"services": {"a": {"role": "agent", "use": "agent_of_mine:Mine", "settings": {}}}}
     assert used_versions(services)["PyYAML"] == "6.0"
 

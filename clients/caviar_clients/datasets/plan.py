@@ -405,9 +405,11 @@ def _with_receivers(preset: Preset, scenario: Scenario) -> tuple[DeviceSpec, ...
 
 
 def _device(preset: Preset, device: DeviceSpec) -> DeviceSpec:
-    if device.kind == "antenna" and device.on and not preset.arrays_turn:
-        return replace(device, keeps_heading=True, yaw_deg=0.0)
-    return device
+    if device.kind != "antenna" or not device.on:
+        return device
+    if preset.arrays_turn:
+        return replace(device, keeps_heading=False)
+    return replace(device, keeps_heading=True, yaw_deg=0.0)
 
 
 def _service(preset: Preset, spec: ServiceSpec) -> ServiceSpec:

@@ -440,14 +440,14 @@ def export_classifier(
     dataset = experiment.dataset()
     train, validation, _ = experiment.split()
     scenario, data = dataset.settings["scenario"], experiment.data
+    users = Users(msgspec.convert(scenario, Scenario), data.users, (), data.transmitters)
     card = PolicyCard(
         observe=names,
         codebooks=(samples.beams,),
         per_user=True,
         # Those of the dataset: what it learnt says nothing of another station of the scenario.
-        transmitters=Users(
-            msgspec.convert(scenario, Scenario), data.users, (), data.transmitters
-        ).transmitters,
+        transmitters=users.transmitters,
+        keeps_heading=users.keeps_heading,
         scenario=scenario["run"]["name"],
         algorithm=f"classification by {experiment.model.name}",
         seeds=(seed,),

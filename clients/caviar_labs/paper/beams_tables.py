@@ -129,7 +129,7 @@ def _worth(title: str, report: Report, made: DatasetEvaluation) -> Comparison:
         if method in made.methods
     ]
     columns = (f"less {first}", *(f"{kind} ({made.users[kind]:,})" for kind in kinds))
-    note = "Points, paired by episode and seed; a difference is shown where its interval does not have 0."
+    note = "Points, paired by episode and seed; a difference is there where its interval leaves out 0."
     return Comparison(title, columns, rows, [note])
 
 

@@ -134,6 +134,13 @@ class Users:
         """Names of the receivers that are served, with ``*`` where the scene has those of objects."""
         return tuple(dict.fromkeys(_full_name(rx) for _, rx in self._groups))
 
+    @property
+    def keeps_heading(self) -> bool | None:
+        """Whether the served receivers on objects keep their heading, or turn; None: none is on one, or some
+        do."""
+        found = {rx.keeps_heading for _, rx in self._groups if rx.on}
+        return found.pop() if len(found) == 1 else None
+
     def present(self, scene: Scene) -> tuple[tuple[int, Pair], ...]:
         """Find the pairs of a scene that are served.
 

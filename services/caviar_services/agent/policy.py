@@ -75,6 +75,8 @@ class PolicyCard(msgspec.Struct, frozen=True, kw_only=True):
     and the model takes any number of them."""
     transmitters: tuple[str, ...] = ("*",)
     """Those that it chooses for, as names with ``*`` and ``?``."""
+    keeps_heading: bool | None = None
+    """Whether receivers on objects kept their heading, or turned; None: not known (`Users.keeps_heading`)."""
     environment: str = ""
     """Of gymnasium, that it was trained in."""
     scenario: str = ""
@@ -330,6 +332,14 @@ class PolicyAgent(PilotAgent[PolicySettings]):
             raise ScenarioError(
                 f"{called} was trained for {_codebooks(card.codebooks)}, and the scenario has "
                 f"{_codebooks(sizes)}; train it for this scenario, or serve other users",
+                key=key,
+            )
+        kept, keeps = card.keeps_heading if card else None, places.keeps_heading
+        if None not in (kept, keeps) and kept != keeps:
+            raise ScenarioError(
+                f"{called} was trained for receivers with keeps_heading = {str(kept).lower()}, and "
+                f"{', '.join(places.receivers)} has the other value: its beams would mean other directions; "
+                "write the same below [[devices]]",
                 key=key,
             )
         observer = Observer(known, places, observe)
