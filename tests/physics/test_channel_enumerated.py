@@ -28,7 +28,7 @@ from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.enumeration import image_beams, scenery_chains
+from caviar_services.channel.enumeration import compiled_loops, scenery_chains
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
@@ -73,7 +73,7 @@ def street(
 def test_a_missing_compiler_is_said_before_the_first_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(image_beams.kernels, "numba", None)
+    monkeypatch.setattr(compiled_loops, "numba", None)
     with pytest.raises(SetupError, match=r"Numba.*caviar-sim\[channel\]"):
         street(tmp_path)
 

@@ -1,9 +1,4 @@
-"""Loops over beams and what they light, compiled by Numba: cones, pyramids, mirrors and edges, in float64.
-
-All loops are in this file, because Numba's cache on disk looks at the date of a loop's own file and not at
-those of what the loop calls. Each loop has one signature and is compiled when this module is imported: no
-frame waits for a compiler. There are no threads, no reassociated sums and no fused products, so that results
-are the same bits on every processor.
+"""Loops over beams and what they light: cones, pyramids, mirrors and edges, in float64.
 
 Beams have the Shape ``[B, 37]``: image of the source, axis, cosine and sine of the half angle of the
 narrowest cone, unit normal of the last plane towards the lit side and the plane's offset along it, the unit
@@ -25,19 +20,11 @@ Pairs are found in a fixed order, by their first index first.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-
-try:
-    import numba
-except ImportError:  # on the base install, where nothing calls the loops
-    numba = None
-
-F = TypeVar("F", bound=Callable[..., Any])
+from caviar_services.channel.enumeration.compiled_loops import compiled, loop
 
 Targets = tuple[
     Float64Array, Float64Array, Float64Array, Float64Array, Int64Array, Int64Array, Int64Array, float
@@ -51,30 +38,7 @@ AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 
 _WIDE = 0.01
 
 
-def _compiled(function: F) -> F:
-    """The function, compiled with each loop that calls it, or as it is without Numba."""
-    made: F = function if numba is None else numba.njit(nogil=True, error_model="numpy")(function)
-    return made
-
-
-def _loop(signature: str) -> Callable[[F], F]:
-    """Compile a function for these types of arguments, or take it from the cache on disk."""
-
-    def decorate(function: F) -> F:
-        if numba is None:
-            return function
-        options = {"nogil": True, "error_model": "numpy"}
-        made: F
-        try:
-            made = numba.njit(signature, cache=True, **options)(function)
-        except RuntimeError:  # Numba has no folder that it may write to
-            made = numba.njit(signature, **options)(function)
-        return made
-
-    return decorate
-
-
-@_compiled
+@compiled
 def _grown(found: Int64Array, count: int) -> Int64Array:
     """Room for one more row after so many."""
     if count < len(found):
@@ -84,7 +48,7 @@ def _grown(found: Int64Array, count: int) -> Int64Array:
     return larger
 
 
-@_compiled
+@compiled
 def _near_cone(
     beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, extra: float, near: BoolArray
 ) -> None:
@@ -116,7 +80,7 @@ def _near_cone(
         near[j] = (within >= 0) & (across <= within * within) & (x * lx + y * ly + z * lz - lit_from > -reach)
 
 
-@_compiled
+@compiled
 def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach: float) -> bool:
     """Test whether a sphere reaches into all pyramids of beam b."""
     tx, ty, tz = x - beams[b, 0], y - beams[b, 1], z - beams[b, 2]
@@ -126,7 +90,7 @@ def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach
     return True
 
 
-@_compiled
+@compiled
 def _lit_spheres(
     beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, slack: float, lit: Int64Array
 ) -> int:
@@ -143,14 +107,14 @@ def _lit_spheres(
     return count
 
 
-@_compiled
+@compiled
 def _on_lit_side(beams: Float64Array, b: int, x: float, y: float, z: float, slack: float) -> bool:
     height = beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z
     lit: bool = height > beams[b, LIT_FROM] - slack
     return lit
 
 
-@_compiled
+@compiled
 def _height(beams: Float64Array, b: int, faces: Float64Array, f: int) -> float:
     """Height of the image of beam b above the plane of face f [m]."""
     x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
@@ -158,7 +122,7 @@ def _height(beams: Float64Array, b: int, faces: Float64Array, f: int) -> float:
     return height
 
 
-@_compiled
+@compiled
 def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, slack: float) -> bool:
     """Test whether face f may be lit: no side of beam b has all four corners beyond it.
 
@@ -184,7 +148,7 @@ def _lights_corner(beams: Float64Array, b: int, corners: Float64Array, f: int, s
     return True
 
 
-@_compiled
+@compiled
 def _fill_sides(beams: Float64Array, b: int, column: int, edge: Float64Array) -> None:
     """Unit normals, inwards, of the sides of a pyramid with these edges, Shape ``[4, 3]``."""
     mx, my, mz = edge[0, 0] + edge[2, 0], edge[0, 1] + edge[2, 1], edge[0, 2] + edge[2, 2]
@@ -201,7 +165,7 @@ def _fill_sides(beams: Float64Array, b: int, column: int, edge: Float64Array) ->
         beams[b, k], beams[b, k + 1], beams[b, k + 2] = x * scale, y * scale, z * scale
 
 
-@_loop(f"f8[:,::1]({_TARGETS}, i8[::1], f8[:,::1], i8[::1])")
+@loop(f"f8[:,::1]({_TARGETS}, i8[::1], f8[:,::1], i8[::1])")
 def reflected(targets: Targets, last: Int64Array, source: Float64Array, before: Int64Array) -> Float64Array:
     """Beams after a reflection of images ``[B, 3]`` at the faces ``last``; the faces of the reflections
     ``before``, −1 for none, bound the beams too."""
@@ -254,7 +218,7 @@ def reflected(targets: Targets, last: Int64Array, source: Float64Array, before: 
     return beams
 
 
-@_loop("i8[:,::1](f8[:,::1], f8[:,::1], f8)")
+@loop("i8[:,::1](f8[:,::1], f8[:,::1], f8)")
 def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64Array:
     """Pairs of a beam and a point that it lights; points as spheres of radius 0, Shape ``[4, R]``."""
     found, count = np.empty((64, 2), np.int64), 0
@@ -267,7 +231,7 @@ def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64
     return found[:count].copy()
 
 
-@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
+@loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
 def lit_bodies(beams: Float64Array, targets: Targets) -> Int64Array:
     """Pairs of a beam and a face of a body that it lights."""
     faces, corners, _, bodies, begin, _, _, slack = targets
@@ -288,7 +252,7 @@ def lit_bodies(beams: Float64Array, targets: Targets) -> Int64Array:
     return found[:count].copy()
 
 
-@_loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
+@loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
 def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
     """Pairs of a beam from ``first`` on and a face of scenery that it lights."""
     faces, corners, _, _, begin, _, _, slack = targets
@@ -304,7 +268,7 @@ def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array
     return found[:count].copy()
 
 
-@_compiled
+@compiled
 def _shown_sights(views: Float64Array, w: int, targets: Targets, shown: Int64Array) -> int:
     """Write the faces of scenery that view w shows, of those that its face sees; return how many they are."""
     faces, corners, _, _, _, sight_begin, sights, slack = targets
@@ -319,7 +283,7 @@ def _shown_sights(views: Float64Array, w: int, targets: Targets, shown: Int64Arr
     return count
 
 
-@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
+@loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
 def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
     """Pairs of a view in a face of scenery, and a face of scenery that it shows."""
     found, count = np.empty((256, 2), np.int64), 0
@@ -332,7 +296,7 @@ def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
     return found[:count].copy()
 
 
-@_compiled
+@compiled
 def _crossing(
     beams: Float64Array,
     b: int,
@@ -378,7 +342,7 @@ def _crossing(
     return some > 0
 
 
-@_loop(f"i8[:,::1](f8[:,::1], {_TARGETS}, f8[:,::1], f8[:,:,::1])")
+@loop(f"i8[:,::1](f8[:,::1], {_TARGETS}, f8[:,::1], f8[:,:,::1])")
 def ends_by_bodies(
     beams: Float64Array, targets: Targets, points: Float64Array, seen: Float64Array
 ) -> Int64Array:
@@ -422,7 +386,7 @@ def ends_by_bodies(
     return found[:count].copy()
 
 
-@_compiled
+@compiled
 def _cones_near(
     columns: Float64Array, low: int, high: int, x: float, y: float, z: float, reach: float, lit: BoolArray
 ) -> None:
@@ -438,7 +402,7 @@ def _cones_near(
         lit[b] = (within >= 0) & (across <= within * within) & (side - some[LIT_FROM, b] > -reach)
 
 
-@_loop(f"i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], {_TARGETS}, f8[:,::1])")
+@loop(f"i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], {_TARGETS}, f8[:,::1])")
 def ends_by_scenery(
     beams: Float64Array,
     group_begin: Int64Array,
@@ -494,7 +458,7 @@ def ends_by_scenery(
     return found[:count].copy()
 
 
-@_compiled
+@compiled
 def _lights_edge(
     beams: Float64Array, b: int, ends: Float64Array, normals: Float64Array, slack: float
 ) -> bool:
@@ -523,9 +487,7 @@ def _lights_edge(
     )
 
 
-@_loop(
-    "i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8)"
-)
+@loop("i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8)")
 def lit_edges(
     beams: Float64Array,
     pieces: Float64Array,
@@ -567,7 +529,7 @@ def lit_edges(
     return found[:count].copy()
 
 
-@_compiled
+@compiled
 def _unfolded(
     beams: Float64Array, b: int, ends: Float64Array, ux: float, uy: float, uz: float
 ) -> tuple[float, float]:
@@ -578,7 +540,7 @@ def _unfolded(
     return s, math.sqrt(x * x + y * y + z * z)
 
 
-@_loop("i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)")
+@loop("i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)")
 def meetings(
     sent: Float64Array,
     lit: Int64Array,

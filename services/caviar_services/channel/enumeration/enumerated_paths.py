@@ -10,14 +10,14 @@ In the street canyon this finds the reflections that 3e7 rays find, in about hal
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
-from caviar_protocol.errors import SetupError
 from caviar_protocol.topics import Interaction
 from caviar_services.channel.enumeration.edge_beams import EdgeTargets, edge_chains, enumerated_scenery
-from caviar_services.channel.enumeration.image_beams import SceneryViews, Targets, chain_pairs, kernels
+from caviar_services.channel.enumeration.image_beams import SceneryViews, Targets, chain_pairs
 from caviar_services.channel.enumeration.image_paths import (
     ImagePaths,
     crossings,
@@ -26,6 +26,7 @@ from caviar_services.channel.enumeration.image_paths import (
     unhidden,
     unhidden_over_edges,
 )
+from caviar_services.channel.enumeration.obstacle_trees import ObstacleTrees
 from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneFaces, seen_planes
 from caviar_services.channel.propagation.utd import reflection_fields
 from caviar_services.channel.sionna.candidates import Faces, first_of_each
@@ -63,20 +64,12 @@ class EnumeratedTracer:
         self._depth = options.max_depth
         self._edges = scene.edges if options.diffraction else None
         self._faces = SceneFaces(scene, inner=options.refraction)
-        self._look = Faces(scene)
+        self._look = Faces(scene, still=True)
         self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
 
-    def compile_kernels(self) -> None:
-        """Compile the loops over beams, some 20 s, or read what was compiled before.
-
-        Raises:
-            SetupError: Numba is not installed.
-        """
-        if kernels.numba is None:
-            raise SetupError(
-                'candidates = "enumerated" needs Numba, which is not installed; add it: '
-                "pip install 'caviar-sim[channel]'"
-            )
+    @cached_property
+    def _obstacles(self) -> ObstacleTrees:
+        return ObstacleTrees(self._scene)
 
     def trace(
         self,
@@ -116,10 +109,10 @@ class EnumeratedTracer:
         sights = np.searchsorted(of_scenery.plane, sights[np.isin(sights, of_scenery.plane).all(1)])
         targets = Targets(faces, sizes, sights)
         pairs = chain_pairs(targets, chains, views, start, ends)
-        paths = self._once(faces, image_paths(faces, pairs, start, ends))
+        paths = self._once(faces, image_paths(targets, pairs, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
         paths = paths.take(~near[paths.receiver])
-        free = unhidden(scene, self._look, faces, paths, start, ends)
+        free = unhidden(scene, self._obstacles, faces, paths, start, ends)
         seen = paths.take(free)
         mirrors = self._mirrors(faces, seen.chain, seen.points)
         types = np.where(seen.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
@@ -129,9 +122,9 @@ class EnumeratedTracer:
         if self._edges is not None and over_edges:
             edges = EdgeTargets(scene, self._edges, faces)
             candidates = edge_chains(targets, edges, chains, views, start, ends)
-            bent = edge_paths(faces, edges, candidates, start, ends, self._depth)
+            bent = edge_paths(targets, edges, candidates, start, ends, self._depth)
             bent = bent.take(~near[bent.receiver])
-            bent = bent.take(unhidden_over_edges(scene, self._look, faces, edges, bent, start, ends))
+            bent = bent.take(unhidden_over_edges(scene, self._obstacles, faces, edges, bent, start, ends))
             types = np.where(bent.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
             triangles, _ = self._mirrors(faces, bent.chain, bent.points)
             rows, edge = np.arange(len(bent.edge)), edges.number[bent.edge]
@@ -169,7 +162,9 @@ class EnumeratedTracer:
     ) -> Traced:
         """Hidden paths that go through their obstacles."""
         count = (paths.chain >= 0).sum(1)
-        found, through = crossings(self._scene, self._look, faces, paths, start, ends, self._depth - count)
+        found, through = crossings(
+            self._scene, self._obstacles, faces, paths, start, ends, self._depth - count
+        )
         number = np.cumsum(through) - 1
         paths, count, crossing = paths.take(through), count[through], number[found.path]
         # Transmissions stand between the reflections: each moves what follows by one place.

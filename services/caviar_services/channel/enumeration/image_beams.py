@@ -30,7 +30,7 @@ from caviar_services.channel.sionna import LateModule
 from caviar_space.rectangles import FaceRectangles
 
 kernels: Any = LateModule("caviar_services.channel.enumeration.beam_kernels", keeps=True)
-"""`beam_kernels`; its import compiles them, or reads what was compiled before."""
+path_kernels: Any = LateModule("caviar_services.channel.enumeration.path_kernels", keeps=True)
 
 # [m] by which every target is larger in tests than its rounding can be.
 _SLACK = 5e-3
@@ -73,6 +73,16 @@ class Targets:
             slack,
         )
         """As `beam_kernels` takes them."""
+        triangles = np.ascontiguousarray(faces.triangles), np.append(0, np.cumsum(faces.sizes))
+        self._mirrors = self.arrays[0], frames, *triangles
+
+    def reflections(
+        self, chain: Int64Array, start: Float64Array, end: Float64Array
+    ) -> tuple[Float64Array, BoolArray]:
+        """Points where chains of faces reflect; see `path_kernels.reflections`."""
+        rows = (np.ascontiguousarray(part) for part in (chain, start, end))
+        found: tuple[Float64Array, BoolArray] = path_kernels.reflections(*self._mirrors, *rows)
+        return found
 
     def body_of(self, faces: Int64Array) -> Int64Array:
         """Number of the body of these faces of bodies."""

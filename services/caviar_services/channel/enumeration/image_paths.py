@@ -19,10 +19,10 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
-from caviar_services.channel.enumeration.image_beams import ChainPairs
+from caviar_services.channel.enumeration.image_beams import ChainPairs, Targets
+from caviar_services.channel.enumeration.obstacle_trees import ObstacleTrees
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
-from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.materials import DRAWN
 from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
@@ -52,12 +52,12 @@ class ImagePaths(Rows):
 
 
 def image_paths(
-    faces: FaceRectangles, pairs: ChainPairs, transmitter: Float64Array, receivers: Float64Array
+    targets: Targets, pairs: ChainPairs, transmitter: Float64Array, receivers: Float64Array
 ) -> ImagePaths:
     """Pairs whose reflections all lie in a triangle of their face, by the image method.
 
     Args:
-        faces: Faces of the chains.
+        targets: Faces of the chains.
         pairs: Candidates.
         transmitter: Position [m], Shape ``[3]``.
         receivers: Positions [m], Shape ``[R, 3]``.
@@ -69,63 +69,15 @@ def image_paths(
     # A fixed order, whatever order kernels found the pairs in: products have to be equal to the bit.
     order = np.lexsort((*chain.T[::-1], count, pairs.receiver))
     chain, receiver = chain[order], pairs.receiver[order]
-    points, good = reflection_points(
-        faces, chain, np.broadcast_to(transmitter, (len(chain), 3)), receivers[receiver]
+    points, good = targets.reflections(
+        chain, np.broadcast_to(transmitter, (len(chain), 3)), receivers[receiver]
     )
     return ImagePaths(chain[good], receiver[good], points[good])
 
 
-def reflection_points(
-    faces: FaceRectangles, chain: Int64Array, start: Float64Array, end: Float64Array
-) -> tuple[Float64Array, BoolArray]:
-    """Points where chains of faces reflect a wave on its way from a start to an end.
-
-    Args:
-        faces: Faces of the chains.
-        chain: Faces in turn, −1 past the last, Shape ``[N, D]``.
-        start: Position [m], Shape ``[N, 3]``; ``end`` likewise.
-        end: See ``start``.
-
-    Returns:
-        Points, the end past the last [m], Shape ``[N, D, 3]``, and which rows have every point in a
-        triangle of its face, on the side that reflects, Shape ``[N]``. Points of other rows are undefined.
-    """
-    depth, count = chain.shape[1], (chain >= 0).sum(1)
-    images = [start]
-    for d in range(depth):
-        used = np.flatnonzero(count > d)
-        image = images[-1].copy()
-        image[used] = faces.mirrored(image[used], chain[used, d])
-        images.append(image)
-    # Back from the end: the line to the last image meets the last face at the last point, and so on. Rows
-    # that miss a rectangle drop out at once; triangles, which cost most, are tested for the rows that are
-    # left.
-    here = end.copy()
-    points = np.repeat(here[:, None], depth, axis=1)
-    good = np.ones(len(chain), np.bool_)
-    for d in reversed(range(depth)):
-        rows = np.flatnonzero(good & (count > d))
-        face, towards = chain[rows, d], images[d + 1][rows]
-        near, far = faces.height(here[rows], face), faces.height(towards, face)
-        # The line has to cross the plane between the end and the image, from the side that reflects.
-        crosses = (near * far < 0) & ((near > 0) | faces.two_sided[face])
-        good[rows[~crosses]] = False
-        rows, face, towards, near, far = (part[crosses] for part in (rows, face, towards, near, far))
-        met = here[rows] + (near / (near - far))[:, None] * (towards - here[rows])
-        within = faces.in_rectangle(met, face)
-        good[rows[~within]] = False
-        here[rows], points[rows, d] = met, met
-    rows = np.flatnonzero(good)
-    path, place = np.nonzero(chain[rows] >= 0)
-    path = rows[path]
-    held = faces.in_triangles(points[path, place], chain[path, place])
-    good[path[~held]] = False
-    return points, good
-
-
 def unhidden(
     scene: SionnaScene,
-    look: Faces,
+    look: ObstacleTrees,
     faces: FaceRectangles,
     paths: ImagePaths,
     transmitter: Float64Array,
@@ -138,7 +90,7 @@ def unhidden(
 
     Args:
         scene: The scene.
-        look: Casts the rays.
+        look: Obstacles of the scene.
         faces: Faces of the paths.
         paths: Paths of the image method.
         transmitter: Position [m], Shape ``[3]``.
@@ -225,7 +177,7 @@ class Crossings(Rows):
 
 def crossings(
     scene: SionnaScene,
-    look: Faces,
+    look: ObstacleTrees,
     faces: FaceRectangles,
     paths: ImagePaths,
     transmitter: Float64Array,
@@ -236,7 +188,7 @@ def crossings(
 
     Args:
         scene: The scene.
-        look: Casts the rays.
+        look: Obstacles of the scene.
         faces: Faces of the paths.
         paths: Paths of the image method that something hides.
         transmitter: Position [m], Shape ``[3]``.
@@ -380,7 +332,7 @@ class EdgePaths(Rows):
 
 
 def edge_paths(
-    faces: FaceRectangles,
+    targets: Targets,
     edges: EdgeTargets,
     candidates: Sequence[EdgeChains],
     transmitter: Float64Array,
@@ -391,7 +343,7 @@ def edge_paths(
     run outside of its wedge.
 
     Args:
-        faces: Faces of the chains.
+        targets: Faces of the chains.
         edges: Edges of the chains.
         candidates: From `edge_chains`.
         transmitter: Position [m], Shape ``[3]``.
@@ -402,7 +354,7 @@ def edge_paths(
         Paths sorted by receiver, number of interactions, edge and surfaces. Of paths by way of faces that are
         one surface, the first one.
     """
-    parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
+    parts = [_with_points(targets, edges, chains, transmitter, receivers, depth) for chains in candidates]
     none = np.zeros(0, np.int64)
     parts.append(EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3))))
     found = EdgePaths.joined(parts)
@@ -415,7 +367,7 @@ def edge_paths(
 
 
 def _with_points(
-    faces: FaceRectangles,
+    targets: Targets,
     edges: EdgeTargets,
     chains: EdgeChains,
     transmitter: Float64Array,
@@ -426,9 +378,9 @@ def _with_points(
     ends = receivers[chains.receiver]
     source, target = start, ends
     for column in chains.before.T:
-        source = faces.mirrored(source, column)
+        source = targets.faces.mirrored(source, column)
     for column in chains.behind.T:
-        target = faces.mirrored(target, column)
+        target = targets.faces.mirrored(target, column)
     wedge = edges.ends[chains.edge]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
         place = keller_point(source, target, wedge)
@@ -436,9 +388,9 @@ def _with_points(
     # Both rays at the edge have to run outside of the wedge, in front of one of its faces at least.
     good &= edges.outside(source, chains.edge) & edges.outside(target, chains.edge)
     rows = np.flatnonzero(good)
-    before, one = reflection_points(faces, chains.before[rows], start[rows], place[rows])
+    before, one = targets.reflections(chains.before[rows], start[rows], place[rows])
     rows, before = rows[one], before[one]
-    behind, other = reflection_points(faces, chains.behind[rows], ends[rows], place[rows])
+    behind, other = targets.reflections(chains.behind[rows], ends[rows], place[rows])
     rows, before, behind = rows[other], before[other], behind[other]
     # In the order of the path: reflections before, the edge, reflections after, which count from the
     # receiver.
@@ -459,7 +411,7 @@ def _with_points(
 
 def unhidden_over_edges(
     scene: SionnaScene,
-    look: Faces,
+    look: ObstacleTrees,
     faces: FaceRectangles,
     edges: EdgeTargets,
     paths: EdgePaths,

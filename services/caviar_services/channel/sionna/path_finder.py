@@ -167,7 +167,7 @@ class PathFinder:
         """Trace above the scene, so that every kernel that frames need is compiled before the first one.
 
         Raises:
-            SetupError: A library is missing (`EnumeratedTracer.compile_kernels`).
+            SetupError: A library is missing (`compiled_loops.compile_loops`).
         """
         scene, options, s = self._scene, self.options, self._settings
         # Of an episode before this one, in the same scene.
@@ -194,14 +194,18 @@ class PathFinder:
             for tracer in tracers:
                 tracer.trace(above, receivers, corners=corners)
         if self._enumerated is not None:
-            self._run.progress("compiling kernels of enumeration", COMPILE_GRACE_S)
-            self._enumerated.compile_kernels()
+            loops = importlib.import_module("caviar_services.channel.enumeration.compiled_loops")
+            loops.compile_loops(self._compiling)
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
             look = self.tracer.look
             look.nearest(receivers, receivers - 1.0)
             chains = np.full((len(receivers), options.max_depth), -1)
             look.reflected(chains, receivers, receivers - 1.0)
+
+    def _compiling(self, number: int, count: int) -> None:
+        phase = f"compiling kernels of enumeration {number + 1}/{count}"
+        self._run.progress(phase, COMPILE_GRACE_S)
 
     def _enumerate_above(self, tracer: EnumeratedTracer, above: Float64Array) -> None:
         """Enumerate paths among two bodies of each mesh there, with a chain of scenery of each length."""
