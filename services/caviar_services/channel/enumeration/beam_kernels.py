@@ -34,6 +34,9 @@ _TARGETS = "Tuple((f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1], i8[:
 AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 37
 """Columns of beams, and how many there are."""
 
+# Rows of spheres; faces have more.
+_SPHERE = 4
+
 # Cosine of the half angle of the widest cone that is tested; wider ones light everything.
 _WIDE = 0.01
 
@@ -92,11 +95,24 @@ def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach
 
 @compiled
 def _lit_spheres(
-    beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, slack: float, lit: Int64Array
+    beams: Float64Array,
+    b: int,
+    spheres: Float64Array,
+    low: int,
+    high: int,
+    slack: float,
+    near: BoolArray,
+    lit: Int64Array,
 ) -> int:
-    """Write the numbers of the spheres that beam b lights, and return how many they are."""
-    near = np.empty(high - low, np.bool_)
+    """Write the numbers of the spheres that beam b lights, and return how many they are; of faces, those that
+    reflect on the image's side."""
     _near_cone(beams, b, spheres, low, high, 2 * slack, near)
+    if len(spheres) > _SPHERE:
+        x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
+        nx, ny, nz = spheres[4, low:high], spheres[5, low:high], spheres[6, low:high]
+        offset, both = spheres[7, low:high], spheres[8, low:high]
+        for j in range(len(nx)):
+            near[j] &= (nx[j] * x + ny[j] * y + nz[j] * z - offset[j] > -slack) | (both[j] != 0)
     count = 0
     for j in range(low, high):
         if near[j - low] and _in_pyramid(
@@ -222,9 +238,10 @@ def reflected(targets: Targets, last: Int64Array, source: Float64Array, before: 
 def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64Array:
     """Pairs of a beam and a point that it lights; points as spheres of radius 0, Shape ``[4, R]``."""
     found, count = np.empty((64, 2), np.int64), 0
-    lit = np.empty(points.shape[1], np.int64)
+    many = points.shape[1]
+    near, lit = np.empty(many, np.bool_), np.empty(many, np.int64)
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, points, 0, len(lit), slack, lit)):
+        for i in range(_lit_spheres(beams, b, points, 0, many, slack, near, lit)):
             found = _grown(found, count)
             found[count, 0], found[count, 1] = b, lit[i]
             count += 1
@@ -236,16 +253,16 @@ def lit_bodies(beams: Float64Array, targets: Targets) -> Int64Array:
     """Pairs of a beam and a face of a body that it lights."""
     faces, corners, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    near, lit = np.empty(bodies.shape[1], np.int64), np.empty(faces.shape[1], np.int64)
+    many = bodies.shape[1]
+    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(many, np.int64)
+    lit = np.empty(faces.shape[1], np.int64)
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, bodies, 0, len(near), slack, near)):
-            v = near[i]
-            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, lit)):
+        for i in range(_lit_spheres(beams, b, bodies, 0, many, slack, near, lit_body)):
+            v = lit_body[i]
+            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
                 f = lit[k]
-                # A plane does not reflect twice in a row, and a face of a closed body on its outside only.
-                if f == beams[b, LAST] or (_height(beams, b, faces, f) <= -slack and faces[8, f] == 0):
-                    continue
-                if _lights_corner(beams, b, corners, f, slack):
+                # A plane does not reflect twice in a row.
+                if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                     found = _grown(found, count)
                     found[count, 0], found[count, 1] = b, f
                     count += 1
@@ -257,9 +274,9 @@ def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array
     """Pairs of a beam from ``first`` on and a face of scenery that it lights."""
     faces, corners, _, _, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    lit = np.empty(begin[0], np.int64)
+    near, lit = np.empty(begin[0], np.bool_), np.empty(begin[0], np.int64)
     for b in range(first, len(beams)):
-        for i in range(_lit_spheres(beams, b, faces, 0, len(lit), slack, lit)):
+        for i in range(_lit_spheres(beams, b, faces, 0, begin[0], slack, near, lit)):
             f = lit[i]
             if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                 found = _grown(found, count)
@@ -300,52 +317,51 @@ def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
 def _crossing(
     beams: Float64Array,
     b: int,
-    faces: Float64Array,
-    frames: Float64Array,
+    targets: Targets,
     f: int,
     height: float,
     seen: Float64Array,
-    slack: float,
     crosses: BoolArray,
 ) -> bool:
-    """Test which receivers see the image of beam b in face f, within the rectangle and the beam's cone.
+    """Test which receivers see the image of beam b in face f, within the rectangle.
 
     Coordinates are those of the face's frame; ``height`` is the image's, and ``seen`` has the receivers'.
     """
-    c = faces[:3, f]
-    u, v, half = frames[f, 0], frames[f, 1], frames[f, 2]
-    dx, dy, dz = beams[b, 0] - c[0], beams[b, 1] - c[1], beams[b, 2] - c[2]
-    x, y = dx * u[0] + dy * u[1] + dz * u[2], dx * v[0] + dy * v[1] + dz * v[2]
-    ax, ay, az = beams[b, AXIS], beams[b, AXIS + 1], beams[b, AXIS + 2]
-    au, av = ax * u[0] + ay * u[1] + az * u[2], ax * v[0] + ay * v[1] + az * v[2]
-    an = ax * faces[4, f] + ay * faces[5, f] + az * faces[6, f]
-    cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
-    square, wide, tall = cosine * cosine, half[0] + slack, half[1] + slack
+    faces, frame, slack = targets[0], targets[2][f], targets[7]
+    dx, dy, dz = beams[b, 0] - faces[0, f], beams[b, 1] - faces[1, f], beams[b, 2] - faces[2, f]
+    x = dx * frame[0, 0] + dy * frame[0, 1] + dz * frame[0, 2]
+    y = dx * frame[1, 0] + dy * frame[1, 1] + dz * frame[1, 2]
+    wide, tall = frame[2, 0] + slack, frame[2, 1] + slack
     some = 0
     for r in range(seen.shape[1]):
         p, q, g = seen[0, r], seen[1, r], seen[2, r]
-        # The line from the receiver to the image meets the plane at the share g / (g + height) of its length.
-        share = g / (g + height)
-        # Towards the receiver's image in the face, which the beam's cone has to hold.
-        tx, ty, tz = p - x, q - y, -g - height
-        along = au * tx + av * ty + an * tz
-        within = 2 * slack + along * sine
-        across = (tx * tx + ty * ty + tz * tz - along * along) * square
+        # The line from the receiver to the image meets the plane at (p, q)·height + (x, y)·g over the sum of
+        # both heights, of which none is divided by: most receivers see no image.
+        total = abs(g + height)
         crosses[r] = (
             (g * height > 0)
-            & (abs(p - share * tx) <= wide)
-            & (abs(q - share * ty) <= tall)
-            & (within >= 0)
-            & (across <= within * within)
+            & (abs(p * height + x * g) <= wide * total)
+            & (abs(q * height + y * g) <= tall * total)
         )
         some += crosses[r]
     return some > 0
 
 
-@loop(f"i8[:,::1](f8[:,::1], {_TARGETS}, f8[:,::1], f8[:,:,::1])")
-def ends_by_bodies(
-    beams: Float64Array, targets: Targets, points: Float64Array, seen: Float64Array
-) -> Int64Array:
+@compiled
+def _fill_seen(targets: Targets, f: int, points: Float64Array, seen: Float64Array) -> None:
+    """Points, Shape ``[R, 3]``, in the frame of face f: along both sides from the centre, and the height, 0
+    where the face shows its back; Shape ``[3, R]``."""
+    faces, frame = targets[0], targets[2][f]
+    for r in range(len(points)):
+        dx, dy, dz = points[r, 0] - faces[0, f], points[r, 1] - faces[1, f], points[r, 2] - faces[2, f]
+        seen[0, r] = dx * frame[0, 0] + dy * frame[0, 1] + dz * frame[0, 2]
+        seen[1, r] = dx * frame[1, 0] + dy * frame[1, 1] + dz * frame[1, 2]
+        height = dx * faces[4, f] + dy * faces[5, f] + dz * faces[6, f]
+        seen[2, r] = height if height > 0 or faces[8, f] != 0 else 0.0
+
+
+@loop(f"i8[:,::1](f8[:,::1], {_TARGETS}, f8[:,::1])")
+def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) -> Int64Array:
     """Beam, face of a body and receiver wherever the beam may light the receiver by a reflection at the face.
 
     Instead of a beam through the last face, the receiver's image in it is held against the beam before.
@@ -354,27 +370,23 @@ def ends_by_bodies(
         beams: Before the last reflection.
         targets: All targets.
         points: Receivers, Shape ``[R, 3]``.
-        seen: Receivers in the frames of faces of bodies: along both sides from the centre, and height, 0
-            where the face shows its back, Shape ``[F, 3, R]``, without the faces of scenery.
     """
-    faces, _, frames, bodies, begin, _, _, slack = targets
+    faces, _, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 3), np.int64), 0
-    near_body, near = np.empty(bodies.shape[1], np.int64), np.empty(faces.shape[1], np.bool_)
-    crosses, shown = np.empty(len(points), np.bool_), np.zeros(len(seen), np.bool_)
-    for f in range(len(seen)):
-        shown[f] = (seen[f, 2] != 0).any()
+    many = bodies.shape[1]
+    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(many, np.int64)
+    lit, crosses = np.empty(faces.shape[1], np.int64), np.empty(len(points), np.bool_)
+    seen = np.empty((faces.shape[1] - begin[0], 3, len(points)))
+    for own in range(len(seen)):
+        _fill_seen(targets, begin[0] + own, points, seen[own])
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, bodies, 0, len(near_body), slack, near_body)):
-            low, high = begin[near_body[i]], begin[near_body[i] + 1]
-            _near_cone(beams, b, faces, low, high, 2 * slack, near)
-            for f in range(low, high):
+        for i in range(_lit_spheres(beams, b, bodies, 0, many, slack, near, lit_body)):
+            v = lit_body[i]
+            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
+                f = lit[k]
                 own = f - begin[0]
-                if not (near[f - low] and shown[own]) or f == beams[b, LAST]:
-                    continue
                 height = _height(beams, b, faces, f)
-                if height <= 0 and faces[8, f] == 0:
-                    continue
-                if not _crossing(beams, b, faces, frames, f, height, seen[own], slack, crosses):
+                if f == beams[b, LAST] or not _crossing(beams, b, targets, f, height, seen[own], crosses):
                     continue
                 for r in range(len(points)):
                     twice = 2 * seen[own, 2, r]
@@ -402,56 +414,62 @@ def _cones_near(
         lit[b] = (within >= 0) & (across <= within * within) & (side - some[LIT_FROM, b] > -reach)
 
 
-@loop(f"i8[:,::1](f8[:,::1], i8[::1], f8[:,::1], {_TARGETS}, f8[:,::1])")
+@loop(f"i8[:,::1](f8[:,::1], i8, f8[:,::1], {_TARGETS}, f8[:,::1])")
 def ends_by_scenery(
-    beams: Float64Array,
-    group_begin: Int64Array,
-    views: Float64Array,
-    targets: Targets,
-    points: Float64Array,
+    beams: Float64Array, first: int, views: Float64Array, targets: Targets, points: Float64Array
 ) -> Int64Array:
     """Beam and view of each pair where the beam may light the view's receiver by a reflection at its face.
 
+    What a receiver sees in a face is a beam, too: only bodies and faces that this one lights can reflect
+    before. So beams of the transmitter are grouped by their last body or face, and each view is tested
+    against the groups that it shows instead of against all beams.
+
     Args:
-        beams: By way of bodies, before the last reflection, group by group of what reflected them last: a
-            body, or a face of scenery, after the bodies. Group g begins at ``group_begin[g]``.
-        group_begin: See ``beams``.
+        beams: Before the last reflection; from ``first`` on they are by way of a body, and count.
+        first: See ``beams``.
         views: What receivers see in faces of scenery, as beams.
         targets: All targets.
         points: Receiver of each view, Shape ``[W, 3]``.
     """
-    faces, _, frames, bodies, _, _, _, slack = targets
+    faces, _, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 2), np.int64), 0
     many = bodies.shape[1]
-    groups, shown = np.empty(len(group_begin), np.int64), np.empty(faces.shape[1], np.int64)
-    seen, crosses = np.zeros((3, 1)), np.empty(1, np.bool_)
+    # A group for each body, then one for each face of scenery.
+    group_of = many + np.arange(faces.shape[1])
+    for v in range(many):
+        group_of[begin[v] : begin[v + 1]] = v
+    group_begin = np.zeros(many + begin[0] + 1, np.int64)
+    for b in range(first, len(beams)):
+        group_begin[group_of[int(beams[b, LAST])] + 1] += 1
+    group_begin = np.cumsum(group_begin)
+    order, filled = np.empty(len(beams) - first, np.int64), group_begin.copy()
     # Beams as columns: a view's image is held against several at once.
-    columns, lit = np.ascontiguousarray(beams[:, :SIDES].T), np.empty(len(beams), np.bool_)
+    columns, lit = np.empty((SIDES, len(order))), np.empty(len(order) + many, np.bool_)
+    for b in range(first, len(beams)):
+        group = group_of[int(beams[b, LAST])]
+        order[filled[group]] = b
+        columns[:, filled[group]] = beams[b, :SIDES]
+        filled[group] += 1
+    groups, shown = np.empty(len(group_begin), np.int64), np.empty(begin[0], np.int64)
+    seen, crosses = np.empty((3, 1)), np.empty(1, np.bool_)
     for w in range(len(views)):
         f = int(views[w, LAST])
         ix, iy, iz = views[w, 0], views[w, 1], views[w, 2]
-        seen[:] = 0.0
-        for c in range(3):
-            beside = points[w, c] - faces[c, f]
-            seen[0, 0] += beside * frames[f, 0, c]
-            seen[1, 0] += beside * frames[f, 1, c]
-            seen[2, 0] += beside * faces[4 + c, f]
-        if seen[2, 0] <= 0 and faces[8, f] == 0:
+        _fill_seen(targets, f, points[w : w + 1], seen)
+        if seen[2, 0] == 0:
             continue
-        some = _lit_spheres(views, w, bodies, 0, many, slack, groups)
+        some = _lit_spheres(views, w, bodies, 0, many, slack, lit, groups)
         for i in range(_shown_sights(views, w, targets, shown)):
             groups[some] = many + shown[i]
             some += 1
         for i in range(some):
             low, high = group_begin[groups[i]], group_begin[groups[i] + 1]
             _cones_near(columns, low, high, ix, iy, iz, 2 * slack, lit)
-            for b in range(low, high):
-                if not lit[b - low] or beams[b, LAST] == f:
+            for k in range(low, high):
+                b = order[k]
+                if not lit[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
                     continue
-                height = _height(beams, b, faces, f)
-                if not _crossing(beams, b, faces, frames, f, height, seen, slack, crosses):
-                    continue
-                if _in_pyramid(beams, b, ix, iy, iz, slack):
+                if _crossing(beams, b, targets, f, _height(beams, b, faces, f), seen, crosses):
                     found = _grown(found, count)
                     found[count, 0], found[count, 1] = b, w
                     count += 1
@@ -516,7 +534,7 @@ def lit_edges(
     found, count = np.empty((1024, 2), np.int64), 0
     near_piece, near = np.empty(pieces.shape[1], np.int64), np.empty(len(ends), np.bool_)
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, pieces, 0, len(near_piece), slack, near_piece)):
+        for i in range(_lit_spheres(beams, b, pieces, 0, len(near_piece), slack, near, near_piece)):
             low, high = begin[near_piece[i]], begin[near_piece[i] + 1]
             _near_cone(beams, b, spheres, low, high, 2 * slack, near)
             for e in range(low, high):

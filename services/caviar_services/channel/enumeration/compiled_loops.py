@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from threading import Lock
 from typing import Any, TypeVar
 
 from caviar_protocol.errors import SetupError
@@ -26,11 +27,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 _OPTIONS = {"nogil": True, "error_model": "numpy"}
 _MODULES = ("beam_kernels", "path_kernels")
 _loops: list[tuple[Any, str]] = []
+_lock = Lock()
 
 
 def compiled(function: F) -> F:
     """Have a function compiled with each loop that calls it; without Numba it stays as it is."""
-    made: F = function if numba is None else numba.njit(**_OPTIONS)(function)
+    made: F = function if numba is None else numba.njit(forceinline=True, **_OPTIONS)(function)
     return made
 
 
@@ -67,7 +69,11 @@ def compile_loops(progress: Callable[[int, int], None]) -> None:
         )
     for name in _MODULES:
         import_module(f"{__package__}.{name}")
-    for number, (made, signature) in enumerate(_loops):
-        progress(number, len(_loops))
-        made.compile(signature)
-        made.disable_compile()
+    with _lock:  # services of an embedded run are prepared at once
+        count = len(_loops)
+        while _loops:
+            made, signature = _loops[0]
+            progress(count - len(_loops), count)
+            made.compile(signature)
+            made.disable_compile()
+            del _loops[0]

@@ -80,13 +80,9 @@ class Targets:
         self, chain: Int64Array, start: Float64Array, end: Float64Array
     ) -> tuple[Float64Array, BoolArray]:
         """Points where chains of faces reflect; see `path_kernels.reflections`."""
-        rows = (np.ascontiguousarray(part) for part in (chain, start, end))
+        rows = [np.require(part, requirements="CW") for part in (chain, start, end)]
         found: tuple[Float64Array, BoolArray] = path_kernels.reflections(*self._mirrors, *rows)
         return found
-
-    def body_of(self, faces: Int64Array) -> Int64Array:
-        """Number of the body of these faces of bodies."""
-        return np.searchsorted(self.begin[:-1], faces, side="right") - 1
 
 
 def spheres(corners: Float64Array, begin: Int64Array) -> Float64Array:
@@ -225,48 +221,6 @@ class SceneryViews:
     """Shape ``[W]``."""
 
 
-def ends_by_scenery(
-    targets: Targets, beams: ImageBeams, receivers: Float64Array, scenery: SceneryViews
-) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Beam by way of a body, face of scenery and receiver wherever the beam may light the receiver by a
-    reflection at the face.
-
-    What a receiver sees in a face is a beam, too: only bodies and faces that this one lights can reflect
-    before. So beams of the transmitter are grouped by their last body or face, and each view is tested
-    against the groups that it shows instead of against all beams.
-
-    Args:
-        targets: Faces.
-        beams: Beams before the last reflection.
-        receivers: Positions [m], Shape ``[R, 3]``.
-        scenery: Which faces the receivers see.
-    """
-    first, many = beams.first_by_body, len(targets.begin) - 1
-    points = receivers[scenery.receiver]
-    views = reflected_beams(targets, scenery.face[:, None], points)
-    last = beams.chain[first:, -1]
-    group = np.where(last >= targets.first_body, targets.body_of(last), many + last)
-    order = np.argsort(group, kind="stable")
-    begin = np.searchsorted(group[order], np.arange(many + targets.first_body + 1))
-    beam, view = kernels.ends_by_scenery(
-        beams.rows[first + order], begin, views.rows, targets.arrays, points
-    ).T
-    return first + order[beam], scenery.face[view], scenery.receiver[view]
-
-
-def ends_by_bodies(targets: Targets, beams: ImageBeams, receivers: Float64Array) -> Int64Array:
-    """Beam, face of a body and receiver [m], Shape ``[R, 3]``, wherever the beam may light the receiver by a
-    reflection at the face, Shape ``[N, 3]``."""
-    faces = targets.faces
-    bodies = slice(targets.first_body, len(faces))
-    axes = np.concatenate([faces.axes[bodies], faces.normal[bodies, None]], axis=1)
-    seen = axes @ receivers.T - np.einsum("fac,fc->fa", axes, faces.centre[bodies])[..., None]
-    # A height of 0 crosses no plane.
-    seen[:, 2] = np.where(faces.two_sided[bodies, None], seen[:, 2], np.maximum(seen[:, 2], 0.0))
-    found: Int64Array = kernels.ends_by_bodies(beams.rows, targets.arrays, receivers, seen)
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class ChainPairs:
     """N pairs of a chain and a receiver."""
@@ -279,12 +233,12 @@ class ChainPairs:
     @classmethod
     def joined(cls, parts: list[tuple[Int64Array, Int64Array]], depth: int) -> ChainPairs:
         """All pairs of parts, whose chains may have any length up to ``depth``."""
-        chains = [np.full((0, depth), -1, np.int64)]
-        chains += [
-            np.pad(chain, ((0, 0), (0, depth - chain.shape[1])), constant_values=-1) for chain, _ in parts
-        ]
-        receivers = [np.zeros(0, np.int64), *(receiver for _, receiver in parts)]
-        return cls(np.concatenate(chains), np.concatenate(receivers))
+        receiver = np.concatenate([receiver for _, receiver in parts])
+        joined, end = np.full((len(receiver), depth), -1), 0
+        for chain, _ in parts:
+            begin, end = end, end + len(chain)
+            joined[begin:end, : chain.shape[1]] = chain
+        return cls(joined, receiver)
 
 
 def chain_pairs(
@@ -328,9 +282,10 @@ def chain_pairs(
     if depth > 1:
         # The last reflection needs no beams of its own: its faces are tested with the receivers at once.
         add(scenery_beams(targets, beams, scenery[length == depth]))
-        for beam, face, receiver in (
-            ends_by_scenery(targets, beams, receivers, views),
-            ends_by_bodies(targets, beams, receivers).T,
-        ):
-            found.append((np.concatenate([beams.chain[beam], face[:, None]], axis=1), receiver))
+        seen = receivers[views.receiver]
+        images = reflected_beams(targets, views.face[:, None], seen).rows
+        beam, view = kernels.ends_by_scenery(beams.rows, beams.first_by_body, images, targets.arrays, seen).T
+        ends = np.column_stack([beam, views.face[view], views.receiver[view]])
+        ends = np.concatenate([ends, kernels.ends_by_bodies(beams.rows, targets.arrays, receivers)])
+        found.append((np.column_stack([beams.chain[ends[:, 0]], ends[:, 1]]), ends[:, 2]))
     return ChainPairs.joined(found, depth)

@@ -143,7 +143,8 @@ class PathFinder:
         known_options = replace(options, max_depth=depth)
         earlier = before._scenery if before is not None and before._enumerated is not None else None
         transmitters = [d for d in self._run.devices if d.kind == "antenna" and d.role in ("tx", "both")]
-        moving = any(device.on for device in transmitters)
+        # Of transmitters that only frames tell of, any may move.
+        moving = not transmitters or any(device.on for device in transmitters)
         self._scenery = SceneryChains(
             scene, known_options, launch, s.samples_per_frame, moving, cache, earlier
         )
