@@ -7,11 +7,19 @@ needs no update of the ray tracer's scene.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.image_beams import path_kernels
 from caviar_services.channel.sionna.scene import SionnaScene
+
+OFF_SURFACE = 2e-4
+"""[m]; rays from face to face start this far from the first face, whose points are rounded."""
+
+AT_END = 1e-3
+"""[m]; what a ray meets this near to its end is what it ends at: two faces meet there, or are one."""
 
 
 class ObstacleTrees:
@@ -41,12 +49,20 @@ class ObstacleTrees:
             own[own[:, 0] >= 0, 0] += first
             own[:, 1:] += offset
             order[own[0, 1] : own[0, 2]] += offset
-        self._made = nodes, order, np.zeros((len(nodes), 6)), np.zeros((len(self._corners), 9))
+        self._all = nodes, order, np.zeros((len(nodes), 6)), np.zeros((len(self._corners), 9))
         self._fit(self._trees[:1])
         self._version, self._standing = -1, self._trees[:1]
 
     def _fit(self, trees: Int64Array) -> None:
-        path_kernels.fit(*self._made, trees, self._scene.relative, self._corners)
+        path_kernels.fit(self._all, trees, self._scene.relative, self._corners)
+
+    def _fitted(self) -> tuple[Int64Array, Any]:
+        """First and last node of the trees of what stands, and all trees, as the scene stands."""
+        if self._version != self._scene.version:
+            bodies = 1 + np.array(self._scene.standing_bodies, np.int64)
+            self._version, self._standing = self._scene.version, self._trees[np.append(0, bodies)]
+            self._fit(self._standing[1:])
+        return self._standing, self._all
 
     def first_triangle(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
         """Look along segments.
@@ -58,21 +74,14 @@ class ObstacleTrees:
             How much farther than a segment's end [m] the first triangle along it is, at most 0 and infinite
             where there is none, and its number, −1 where there is none; each of Shape ``[Q]``.
         """
-        if self._version != self._scene.version:
-            bodies = 1 + np.array(self._scene.standing_bodies, np.int64)
-            self._version, self._standing = self._scene.version, self._trees[np.append(0, bodies)]
-            self._fit(self._standing[1:])
         start, end = np.ascontiguousarray(start), np.ascontiguousarray(end)
-        found: tuple[Float64Array, Int64Array] = path_kernels.first_met(
-            start, end, self._standing, *self._made
+        behind, triangle = path_kernels.first_met(start, end, *self._fitted())
+        return behind, triangle
+
+    def unhidden(self, *paths: Float64Array | Int64Array) -> BoolArray:
+        """Mask of paths without an obstacle; the arguments are the first ones of `path_kernels.unhidden`."""
+        planes = self._scene.plane_table
+        free: BoolArray = path_kernels.unhidden(
+            *paths, *self._fitted(), self._scene.surface_of, planes.normal, planes.origin
         )
-        return found
-
-    def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """As `first_triangle`, with the number of the triangle's surface, anything where there is none.
-
-        Args:
-            start, end: [m], Shape ``[Q, 3]``.
-        """
-        behind, triangle = self.first_triangle(start, end)
-        return behind, self._scene.surface_of[triangle]
+        return free

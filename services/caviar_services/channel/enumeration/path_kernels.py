@@ -15,7 +15,19 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.compiled_loops import compiled, loop
+from caviar_services.channel.enumeration.obstacle_trees import AT_END, OFF_SURFACE
+from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE
 from caviar_space.rectangles import RIM
+
+Ray = tuple[float, float, float, float, float, float]
+Trees = tuple[Int64Array, Int64Array, Float64Array, Float64Array]
+_TREES = "Tuple((i8[:,::1], i8[::1], f8[:,::1], f8[:,::1]))"
+
+# Nodes of a tree that wait, at most: one for each level.
+_DEEPEST = 64
+
+# Cosine between the normals of planes that count as parallel.
+_PARALLEL = 1 - 1e-6
 
 # [m] by which rectangles are larger; more than the rim of their triangles.
 _SLACK = 2e-3
@@ -148,20 +160,13 @@ def build(corners: Float64Array) -> tuple[Int64Array, Int64Array]:
     return nodes[:made].copy(), order
 
 
-@loop("void(i8[:,::1], i8[::1], f8[:,::1], f8[:,::1], i8[:,::1], f8[:,::1], i8[:,::1])")
-def fit(
-    nodes: Int64Array,
-    order: Int64Array,
-    boxes: Float64Array,
-    triangles: Float64Array,
-    trees: Int64Array,
-    vertices: Float64Array,
-    corners: Int64Array,
-) -> None:
+@loop(f"void({_TREES}, i8[:,::1], f8[:,::1], i8[:,::1])")
+def fit(trees: Trees, standing: Int64Array, vertices: Float64Array, corners: Int64Array) -> None:
     """Fit trees, by their first node and the one past their last, Shape ``[M, 2]``, and their triangles to
     vertices [m], Shape ``[V, 3]``; ``corners`` are the vertices of each triangle, Shape ``[T, 3]``."""
-    for tree in range(len(trees)):
-        first, past = trees[tree, 0], trees[tree, 1]
+    nodes, order, boxes, triangles = trees
+    for tree in range(len(standing)):
+        first, past = standing[tree, 0], standing[tree, 1]
         for k in range(nodes[first, 1], nodes[first, 2]):
             t = order[k]
             for c in range(3):
@@ -184,7 +189,7 @@ def fit(
 
 
 @compiled
-def _entry(boxes: Float64Array, i: int, ray: Float64Array, most: float) -> float:
+def _entry(boxes: Float64Array, i: int, ray: Ray, most: float) -> float:
     """Distance at which a ray, its start and the inverse of its direction, enters a box; infinite beyond
     ``most``, or where it misses the box."""
     near, far = 0.0, most
@@ -197,67 +202,138 @@ def _entry(boxes: Float64Array, i: int, ray: Float64Array, most: float) -> float
     return near if near <= far * (1 + 1e-12) + 1e-12 else np.inf
 
 
-@loop("Tuple((f8[::1], i8[::1]))(f8[:,::1], f8[:,::1], i8[:,::1], i8[:,::1], i8[::1], f8[:,::1], f8[:,::1])")
-def first_met(
-    start: Float64Array,
-    end: Float64Array,
-    trees: Int64Array,
-    nodes: Int64Array,
-    order: Int64Array,
-    boxes: Float64Array,
-    triangles: Float64Array,
-) -> tuple[Float64Array, Int64Array]:
-    """First triangle of trees on each segment, Shape ``[Q, 3]``: its distance from the start less the
-    segment's length [m], and its number; infinite and −1 where there is none before the end (T. Möller and B.
-    Trumbore, "Fast, minimum storage ray/triangle intersection", 1997)."""
-    behind, met = np.full(len(start), np.inf), np.full(len(start), -1)
-    ray, stack = np.empty(6), np.empty(128, np.int64)
-    for q in range(len(start)):
-        ox, oy, oz = start[q, 0], start[q, 1], start[q, 2]
-        dx, dy, dz = end[q, 0] - ox, end[q, 1] - oy, end[q, 2] - oz
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        if not length > 0:
-            continue
-        dx, dy, dz = dx / length, dy / length, dz / length
-        ray[0], ray[1], ray[2], ray[3], ray[4], ray[5] = ox, oy, oz, 1 / dx, 1 / dy, 1 / dz
-        least = length
-        for tree in range(len(trees)):
-            root = trees[tree, 0]
-            if _entry(boxes, root, ray, least) == np.inf:
+@compiled
+def _first_met(
+    start: Float64Array, end: Float64Array, standing: Int64Array, trees: Trees, stack: Int64Array
+) -> tuple[float, int]:
+    """First triangle of trees on a segment between two points: its distance from the start less the segment's
+    length [m], and its number; infinite and −1 where there is none before the end (T. Möller and B. Trumbore,
+    "Fast, minimum storage ray/triangle intersection", 1997)."""
+    nodes, order, boxes, triangles = trees
+    ox, oy, oz = start[0], start[1], start[2]
+    dx, dy, dz = end[0] - ox, end[1] - oy, end[2] - oz
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if not length > 0:
+        return np.inf, -1
+    dx, dy, dz = dx / length, dy / length, dz / length
+    ray = (ox, oy, oz, 1 / dx, 1 / dy, 1 / dz)
+    least, met = length, -1
+    for tree in range(len(standing)):
+        stack[0], depth = standing[tree, 0], 1
+        while depth:
+            depth -= 1
+            i = stack[depth]
+            if _entry(boxes, i, ray, least) == np.inf:
                 continue
-            stack[0], depth = root, 1
-            while depth:
-                depth -= 1
-                i = stack[depth]
-                if _entry(boxes, i, ray, least) == np.inf:
+            child = nodes[i, 0]
+            if child >= 0:
+                # The nearer one is looked at first.
+                nearer = _entry(boxes, child, ray, least) <= _entry(boxes, child + 1, ray, least)
+                stack[depth], stack[depth + 1] = (child + 1, child) if nearer else (child, child + 1)
+                depth += 2
+                continue
+            for k in range(nodes[i, 1], nodes[i, 2]):
+                t = order[k]
+                ax, ay, az = triangles[t, 3], triangles[t, 4], triangles[t, 5]
+                bx, by, bz = triangles[t, 6], triangles[t, 7], triangles[t, 8]
+                px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+                volume = ax * px + ay * py + az * pz
+                if volume == 0:
                     continue
-                child = nodes[i, 0]
-                if child >= 0:
-                    # The nearer one is looked at first.
-                    nearer = _entry(boxes, child, ray, least) <= _entry(boxes, child + 1, ray, least)
-                    stack[depth], stack[depth + 1] = (child + 1, child) if nearer else (child, child + 1)
-                    depth += 2
+                sx, sy, sz = ox - triangles[t, 0], oy - triangles[t, 1], oz - triangles[t, 2]
+                u = (sx * px + sy * py + sz * pz) / volume
+                if u < 0 or u > 1:
                     continue
-                for k in range(nodes[i, 1], nodes[i, 2]):
-                    t = order[k]
-                    ax, ay, az = triangles[t, 3], triangles[t, 4], triangles[t, 5]
-                    bx, by, bz = triangles[t, 6], triangles[t, 7], triangles[t, 8]
-                    px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-                    volume = ax * px + ay * py + az * pz
-                    if volume == 0:
-                        continue
-                    sx, sy, sz = ox - triangles[t, 0], oy - triangles[t, 1], oz - triangles[t, 2]
-                    u = (sx * px + sy * py + sz * pz) / volume
-                    if u < 0 or u > 1:
-                        continue
-                    qx, qy, qz = sy * az - sz * ay, sz * ax - sx * az, sx * ay - sy * ax
-                    v = (dx * qx + dy * qy + dz * qz) / volume
-                    if v < 0 or u + v > 1:
-                        continue
-                    along = (bx * qx + by * qy + bz * qz) / volume
-                    # Of triangles that coincide the one of the lowest number.
-                    if 0 < along < least or (along == least and 0 <= t < met[q]):
-                        least, met[q] = along, t
-        if met[q] >= 0:
-            behind[q] = least - length
+                qx, qy, qz = sy * az - sz * ay, sz * ax - sx * az, sx * ay - sy * ax
+                v = (dx * qx + dy * qy + dz * qz) / volume
+                if v < 0 or u + v > 1:
+                    continue
+                along = (bx * qx + by * qy + bz * qz) / volume
+                # Of triangles that coincide the one of the lowest number.
+                if 0 < along < least or (along == least and t < met):
+                    least, met = along, t
+    return (least - length if met >= 0 else np.inf), met
+
+
+@loop(f"Tuple((f8[::1], i8[::1]))(f8[:,::1], f8[:,::1], i8[:,::1], {_TREES})")
+def first_met(
+    start: Float64Array, end: Float64Array, standing: Int64Array, trees: Trees
+) -> tuple[Float64Array, Int64Array]:
+    """`_first_met` of each segment, Shape ``[Q, 3]``."""
+    behind, met, stack = np.empty(len(start)), np.empty(len(start), np.int64), np.empty(_DEEPEST, np.int64)
+    for q in range(len(start)):
+        behind[q], met[q] = _first_met(start[q], end[q], standing, trees, stack)
     return behind, met
+
+
+@loop(
+    "b1[::1](f8[:,:,::1], i8[::1], i8[::1], f8[:,:,::1], i8[:,:,::1], i8[:,::1], "
+    f"i8[:,::1], {_TREES}, i8[::1], f8[:,::1], f8[:,::1])"
+)
+def unhidden(
+    corners: Float64Array,
+    count: Int64Array,
+    bend: Int64Array,
+    normals: Float64Array,
+    surfaces: Int64Array,
+    planes: Int64Array,
+    standing: Int64Array,
+    trees: Trees,
+    surface_of: Int64Array,
+    plane_normals: Float64Array,
+    plane_origins: Float64Array,
+) -> BoolArray:
+    """Mask of paths without an obstacle on their segments.
+
+    A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
+    that does not stand in front of it: rays that end before would lose what grazes. Both faces of an edge are
+    no obstacle to a segment that ends there: what a ray meets of them is rounding.
+
+    Args:
+        corners: Transmitter, interactions, and the receiver in all places past the last [m], Shape ``[P, D +
+            2, 3]``.
+        count: Interactions of each path, Shape ``[P]``.
+        bend: Which of them is at an edge, −1 for none, Shape ``[P]``.
+        normals: At corners: unit normals of faces, of edges between those of both faces, else 0.
+        surfaces: At corners: surfaces that a ray may meet there, −1 for none, Shape ``[P, D + 2, 2]``.
+        planes: At corners: plane of a face, −1 elsewhere, Shape ``[P, D + 2]``.
+        standing: First and last node of the trees of what stands.
+        trees: All trees.
+        surface_of: Surface of each triangle.
+        plane_normals: Unit normals of planes; ``plane_origins`` has a point of each.
+        plane_origins: See ``plane_normals``.
+    """
+    free, start, end = np.ones(len(corners), np.bool_), np.empty(3), np.empty(3)
+    stack = np.empty(_DEEPEST, np.int64)
+    for p in range(len(corners)):
+        for d in range(count[p] + 1):
+            # The last ray goes from the receiver, which is off every surface and needs no lift.
+            a, b = (d + 1, d) if d == count[p] and d else (d, d + 1)
+            along = 0.0
+            for c in range(3):
+                along += (corners[p, b, c] - corners[p, a, c]) * normals[p, a, c]
+            # Off a face on the ray's side. A ray ends on a face, but beside an edge: rounding would put its
+            # end into one of both faces.
+            lift = OFF_SURFACE * (1.0 if a == bend[p] + 1 else np.sign(along))
+            beside = OFF_SURFACE if b == bend[p] + 1 else 0.0
+            for c in range(3):
+                start[c] = corners[p, a, c] + lift * normals[p, a, c]
+                end[c] = corners[p, b, c] + beside * normals[p, b, c]
+            behind, triangle = _first_met(start, end, standing, trees, stack)
+            if triangle < 0:
+                continue
+            met, wanted = surface_of[triangle], planes[p, b]
+            if met == surfaces[p, b, 0] or met == surfaces[p, b, 1]:
+                continue
+            free[p] = behind >= -AT_END
+            if free[p] and wanted >= 0:
+                # Of parallel faces that are farther apart than rounding, the one in front hides the other.
+                dot, height, most = 0.0, 0.0, 0.0
+                for c in range(3):
+                    dot += plane_normals[met, c] * plane_normals[wanted, c]
+                    height += (end[c] - plane_origins[met, c]) * plane_normals[met, c]
+                    most = max(most, abs(end[c]))
+                free[p] = abs(dot) <= _PARALLEL or abs(height) <= COPLANAR + COPLANAR_RELATIVE * most
+            if not free[p]:
+                break
+    return free
