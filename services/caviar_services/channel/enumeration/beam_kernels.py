@@ -14,6 +14,16 @@ reflected last, −1 for none. Targets are a tuple of
 5. ``sight_begin``, and 6. ``sights``: face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``,
 7. ``slack`` by which every target is larger [m].
 
+Edges are a tuple of
+
+0. ``pieces``: spheres around the edges of each piece of the scene, Shape ``[4, P]``,
+1. ``begin``: the edges of piece p are ``begin[p]`` to ``begin[p + 1]``,
+2. ``spheres`` around each edge, Shape ``[4, E]``,
+3. ``ends``, Shape ``[E, 2, 3]``,
+4. ``normals`` of both faces, Shape ``[E, 2, 3]``,
+5. ``surfaces`` of these, Shape ``[E, 2]``,
+6. ``moves``: which edges are of a body, Shape ``[E]``.
+
 Pairs are found in a fixed order, by their first index first.
 """
 
@@ -30,6 +40,9 @@ Targets = tuple[
     Float64Array, Float64Array, Float64Array, Float64Array, Int64Array, Int64Array, Int64Array, float
 ]
 _TARGETS = "Tuple((f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], i8[::1], i8[::1], i8[::1], f8))"
+
+Edges = tuple[Float64Array, Int64Array, Float64Array, Float64Array, Float64Array, Int64Array, BoolArray]
+_EDGES = "Tuple((f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], b1[::1]))"
 
 AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 37
 """Columns of beams, and how many there are."""
@@ -477,73 +490,41 @@ def ends_by_scenery(
 
 
 @compiled
-def _lights_edge(
-    beams: Float64Array, b: int, ends: Float64Array, normals: Float64Array, slack: float
-) -> bool:
-    """Test whether an edge may be lit: the image is in front of one of its faces at least, and no side of the
-    beam has both ends beyond it."""
+def _near_edges(
+    beams: Float64Array, b: int, own: int, edges: Edges, slack: float, near: BoolArray, lit: Int64Array
+) -> int:
+    """Write the edges whose spheres reach into the cone of beam b, whose image is in front of a face of them,
+    and return how many they are; but for edges of the surface ``own``, which reflected the beam last: they
+    lie in the mirror's plane, and no wave goes from there to them."""
+    pieces, begin, spheres, ends, normals, surfaces, _ = edges
     x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
-    front = -np.inf
-    for i in range(2):
-        front = max(
-            front,
-            (x - ends[0, 0]) * normals[i, 0]
-            + (y - ends[0, 1]) * normals[i, 1]
-            + (z - ends[0, 2]) * normals[i, 2],
-        )
-    if front <= -slack:
-        return False
-    for k in range(SIDES, LAST, 3):
-        most = -np.inf
-        for i in range(2):
-            tx, ty, tz = ends[i, 0] - x, ends[i, 1] - y, ends[i, 2] - z
-            most = max(most, beams[b, k] * tx + beams[b, k + 1] * ty + beams[b, k + 2] * tz)
-        if most <= -slack:
-            return False
-    return _on_lit_side(beams, b, ends[0, 0], ends[0, 1], ends[0, 2], slack) or _on_lit_side(
-        beams, b, ends[1, 0], ends[1, 1], ends[1, 2], slack
-    )
+    count, piece = 0, np.empty(pieces.shape[1], np.int64)
+    for i in range(_lit_spheres(beams, b, pieces, 0, len(piece), slack, near, piece)):
+        low, high = begin[piece[i]], begin[piece[i] + 1]
+        _near_cone(beams, b, spheres, low, high, 2 * slack, near)
+        for e in range(low, high):
+            if not near[e - low] or surfaces[e, 0] == own or surfaces[e, 1] == own:
+                continue
+            dx, dy, dz = x - ends[e, 0, 0], y - ends[e, 0, 1], z - ends[e, 0, 2]
+            first = dx * normals[e, 0, 0] + dy * normals[e, 0, 1] + dz * normals[e, 0, 2]
+            second = dx * normals[e, 1, 0] + dy * normals[e, 1, 1] + dz * normals[e, 1, 2]
+            if first > -slack or second > -slack:
+                lit[count] = e
+                count += 1
+    return count
 
 
-@loop("i8[:,::1](f8[:,::1], f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,::1], i8[::1], f8)")
-def lit_edges(
-    beams: Float64Array,
-    pieces: Float64Array,
-    begin: Int64Array,
-    spheres: Float64Array,
-    ends: Float64Array,
-    normals: Float64Array,
-    surfaces: Int64Array,
-    own: Int64Array,
-    slack: float,
-) -> Int64Array:
-    """Pairs of a beam and an edge that it may light, but edges of the surface that reflected it last.
-
-    Args:
-        beams: Beams.
-        pieces: Spheres around the edges of each piece, Shape ``[4, P]``; those of piece p are ``begin[p]`` to
-            ``begin[p + 1]``.
-        begin: See ``pieces``.
-        spheres: Around each edge, Shape ``[4, E]``.
-        ends: Of the edges, Shape ``[E, 2, 3]``.
-        normals: Of their faces, Shape ``[E, 2, 3]``.
-        surfaces: Of these, Shape ``[E, 2]``.
-        own: Surface that reflected each beam last, −2 for none.
-        slack: By which all targets are larger [m].
-    """
+@loop(f"i8[:,::1](f8[:,::1], i8[::1], {_EDGES}, f8)")
+def lit_edges(beams: Float64Array, own: Int64Array, edges: Edges, slack: float) -> Int64Array:
+    """Pairs of a beam and an edge that it may light; ``own`` are the surfaces that reflected the beams last,
+    −2 for none."""
     found, count = np.empty((1024, 2), np.int64), 0
-    near_piece, near = np.empty(pieces.shape[1], np.int64), np.empty(len(ends), np.bool_)
+    near, lit = np.empty(len(edges[3]), np.bool_), np.empty(len(edges[3]), np.int64)
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, pieces, 0, len(near_piece), slack, near, near_piece)):
-            low, high = begin[near_piece[i]], begin[near_piece[i] + 1]
-            _near_cone(beams, b, spheres, low, high, 2 * slack, near)
-            for e in range(low, high):
-                if not near[e - low] or surfaces[e, 0] == own[b] or surfaces[e, 1] == own[b]:
-                    continue
-                if _lights_edge(beams, b, ends[e], normals[e], slack):
-                    found = _grown(found, count)
-                    found[count, 0], found[count, 1] = b, e
-                    count += 1
+        for i in range(_near_edges(beams, b, own[b], edges, slack, near, lit)):
+            found = _grown(found, count)
+            found[count, 0], found[count, 1] = b, lit[i]
+            count += 1
     return found[:count].copy()
 
 
@@ -558,68 +539,62 @@ def _unfolded(
     return s, math.sqrt(x * x + y * y + z * z)
 
 
-@loop("i8[:,::1](f8[:,::1], i8[:,::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], f8[:,:,::1], b1[::1], f8)")
+@loop(f"i8[:,::1](f8[:,::1], i8[::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], {_EDGES}, f8)")
 def meetings(
-    sent: Float64Array,
+    beams: Float64Array,
+    own: Int64Array,
+    moves: BoolArray,
+    others: Float64Array,
     lit: Int64Array,
-    sent_moves: BoolArray,
-    taken: Float64Array,
-    taken_lit: Int64Array,
-    taken_moves: BoolArray,
-    ends: Float64Array,
-    edge_moves: BoolArray,
+    others_move: BoolArray,
+    edges: Edges,
     slack: float,
 ) -> Int64Array:
-    """Sent beam, edge and taken beam wherever both beams meet at the edge, at the point of Keller's law.
+    """Beam, edge and other beam wherever beams from both sides meet at an edge, at the point of Keller's law.
 
     Args:
-        sent: Beams from one side.
-        lit: Pairs of one of these and an edge that it lights.
-        sent_moves: Which beams are by way of a body; likewise ``taken_moves``, and ``edge_moves`` of edges.
-            One of the three is of a body.
-        taken: Beams from the other side; likewise ``taken_lit``.
-        taken_lit: See ``taken``.
-        taken_moves: See ``sent_moves``.
-        ends: Of the edges, Shape ``[E, 2, 3]``.
-        edge_moves: See ``sent_moves``.
+        beams: Beams from one side.
+        own: Surface that reflected each of them last, −2 for none.
+        moves: Which of them are by way of a body; likewise ``others_move``. One of both beams and of the edge
+            has to be of a body.
+        others: Beams from the other side.
+        lit: Pairs of an edge and one of these that may light it, in the order of edges.
+        others_move: See ``moves``.
+        edges: All edges.
         slack: By which all targets are larger [m].
     """
+    ends, edge_moves = edges[3], edges[6]
     found, count = np.empty((256, 3), np.int64), 0
-    # Taken beams edge by edge.
-    taken_begin, beam = np.zeros(len(ends) + 1, np.int64), np.empty(len(taken_lit), np.int64)
-    for k in range(len(taken_lit)):
-        taken_begin[taken_lit[k, 1] + 1] += 1
+    near, reached = np.empty(len(ends), np.bool_), np.empty(len(ends), np.int64)
+    begin = np.searchsorted(lit[:, 0], np.arange(len(ends) + 1))
+    # Unit vectors along edges and their lengths; where the others are along them, and how far from them.
+    units, along = np.empty((len(ends), 4)), np.empty((len(lit), 2))
     for e in range(len(ends)):
-        taken_begin[e + 1] += taken_begin[e]
-    place_of = taken_begin.copy()
-    for k in range(len(taken_lit)):
-        e = taken_lit[k, 1]
-        beam[place_of[e]] = taken_lit[k, 0]
-        place_of[e] += 1
-    for k in range(len(lit)):
-        b, e = lit[k]
-        if taken_begin[e] == taken_begin[e + 1]:
-            continue
-        x, y, z = ends[e, 0, 0], ends[e, 0, 1], ends[e, 0, 2]
-        ux, uy, uz = ends[e, 1, 0] - x, ends[e, 1, 1] - y, ends[e, 1, 2] - z
+        ux, uy, uz = (
+            ends[e, 1, 0] - ends[e, 0, 0],
+            ends[e, 1, 1] - ends[e, 0, 1],
+            ends[e, 1, 2] - ends[e, 0, 2],
+        )
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
-        ux, uy, uz = ux / length, uy / length, uz / length
-        s, from_source = _unfolded(sent, b, ends[e], ux, uy, uz)
-        moves = sent_moves[b] or edge_moves[e]
-        for i in range(taken_begin[e], taken_begin[e + 1]):
-            o = beam[i]
-            if not (moves or taken_moves[o]):
-                continue
-            t, from_target = _unfolded(taken, o, ends[e], ux, uy, uz)
-            # Keller's law: s − place over from_source is place − t over from_target.
-            place = (s * from_target + t * from_source) / (from_source + from_target)
-            if not -slack < place < length + slack:
-                continue
-            px, py, pz = x + place * ux, y + place * uy, z + place * uz
-            if not (_on_lit_side(sent, b, px, py, pz, slack) and _on_lit_side(taken, o, px, py, pz, slack)):
-                continue
-            if _in_pyramid(sent, b, px, py, pz, slack) and _in_pyramid(taken, o, px, py, pz, slack):
-                found = _grown(found, count)
-                found[count, 0], found[count, 1], found[count, 2] = b, e, o
-                count += 1
+        units[e, 0], units[e, 1], units[e, 2], units[e, 3] = ux / length, uy / length, uz / length, length
+        for k in range(begin[e], begin[e + 1]):
+            along[k] = _unfolded(others, lit[k, 1], ends[e], units[e, 0], units[e, 1], units[e, 2])
+    for b in range(len(beams)):
+        for i in range(_near_edges(beams, b, own[b], edges, slack, near, reached)):
+            e = reached[i]
+            ux, uy, uz, length = units[e, 0], units[e, 1], units[e, 2], units[e, 3]
+            s, away = _unfolded(beams, b, ends[e], ux, uy, uz)
+            for k in range(begin[e], begin[e + 1]):
+                o, t, other_away = lit[k, 1], along[k, 0], along[k, 1]
+                # Keller's law: s − place over the one distance is place − t over the other.
+                place = (s * other_away + t * away) / (away + other_away)
+                if not -slack < place < length + slack or not (moves[b] or edge_moves[e] or others_move[o]):
+                    continue
+                x, y, z = ends[e, 0, 0] + place * ux, ends[e, 0, 1] + place * uy, ends[e, 0, 2] + place * uz
+                if not (_on_lit_side(beams, b, x, y, z, slack) and _on_lit_side(others, o, x, y, z, slack)):
+                    continue
+                if _in_pyramid(beams, b, x, y, z, slack) and _in_pyramid(others, o, x, y, z, slack):
+                    found = _grown(found, count)
+                    found[count, 0], found[count, 1], found[count, 2] = b, e, o
+                    count += 1
     return found[:count].copy()

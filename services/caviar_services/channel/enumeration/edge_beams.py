@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -83,6 +84,13 @@ class EdgeTargets:
     def __len__(self) -> int:
         return len(self.number)
 
+    def arrays(self, wanted: Int64Array) -> tuple[Float64Array | Int64Array | BoolArray, ...]:
+        """These edges, in ascending order, as `beam_kernels` takes them."""
+        ends, piece = self.ends[wanted], self.piece[wanted]
+        begin = np.append(np.flatnonzero(np.diff(piece, prepend=-2)), len(wanted))
+        around = spheres(ends, begin), begin, spheres(ends, np.arange(len(wanted) + 1))
+        return *around, ends, self.normals[wanted], self.surfaces[wanted], piece >= 0
+
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:
         """Test whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge,
         ``[N]``."""
@@ -133,36 +141,64 @@ def edge_chains(
     if not (depth and len(edges) and len(receivers)):
         return []
     # Reflections of both sides and the diffraction together are at most ``depth`` interactions.
-    sources = list(_from_transmitter(targets, scenery, transmitter))
-    sinks = list(_from_receivers(targets, views, receivers, depth))
-    every = np.arange(len(edges))
-    sent = [_lit(targets, edges, every, sources[0], np.zeros(1, np.int64))]
-    taken = [_lit(targets, edges, every, *sinks[0])]
-    # A side with all reflections that a path may have leaves none to the other side: only edges that the
-    # other side lights directly can be met there.
-    of_sent, of_taken = (np.unique(side[0].pairs[:, 1]) for side in (taken, sent))
-    for n, beams in enumerate(sources[1:], start=2):
-        owner = np.zeros(len(beams), np.int64)
-        sent.append(_lit(targets, edges, every if n < depth else of_sent, beams, owner))
-    for n, (beams, owner) in enumerate(sinks[1:], start=2):
-        taken.append(_lit(targets, edges, every if n < depth else of_taken, beams, owner))
-    return [
-        _meeting(targets, edges, one, other)
-        for i, one in enumerate(sent)
-        for j, other in enumerate(taken)
-        if i + j < depth
+    sent = [
+        _Side(targets, edges, beams, np.zeros(len(beams), np.int64))
+        for beams in _from_transmitter(targets, scenery, transmitter)
     ]
+    taken = [_Side(targets, edges, *side) for side in _from_receivers(targets, views, receivers, depth)]
+    found = []
+    for i, j in ((i, total - i) for total in range(depth) for i in range(total + 1)):
+        # Beams of more reflections are far more: edges are looked up for each of them.
+        if i > j:
+            one, edge, other = sent[i].meetings(taken[j])
+        else:
+            other, edge, one = taken[j].meetings(sent[i])
+        chains = sent[i].beams.chain[one], taken[j].beams.chain[other]
+        found.append(EdgeChains(chains[0], edge, chains[1], taken[j].owner[other]))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Lit:
-    """Pairs of a beam and an edge that the beam may light."""
+class _Side:
+    """Beams from one side after so many reflections."""
 
+    targets: Targets
+    edges: EdgeTargets
     beams: ImageBeams
     owner: Int64Array
     """Receiver of each beam, Shape ``[B]``; 0 for beams of the transmitter."""
-    pairs: Int64Array
-    """Shape ``[N, 2]``."""
+
+    @cached_property
+    def _own(self) -> Int64Array:
+        """Surface that reflected each beam last, −2 for none, Shape ``[B]``."""
+        if not self.beams.chain.shape[1]:
+            return np.full(len(self.beams), -2)
+        return self.edges.surface_of_face[self.beams.chain[:, -1]]
+
+    @cached_property
+    def _lit(self) -> Int64Array:
+        """Pairs of an edge and a beam that may light it, in the order of edges, Shape ``[N, 2]``."""
+        every = self.edges.arrays(np.arange(len(self.edges)))
+        beam, edge = kernels.lit_edges(self.beams.rows, self._own, every, self.targets.slack).T
+        order = np.argsort(edge, kind="stable")
+        return np.column_stack([edge[order], beam[order]])
+
+    def meetings(self, other: _Side) -> tuple[Int64Array, Int64Array, Int64Array]:
+        """Beams of this side, edges, and beams of the other side that meet there, within both beams."""
+        # Chains of scenery alone over an edge of scenery are left to rays.
+        lit = other._lit
+        wanted, edge = np.unique(lit[:, 0], return_inverse=True)
+        beam, met, beam_of_other = kernels.meetings(
+            self.beams.rows,
+            self._own,
+            self.beams.by_body,
+            other.beams.rows,
+            np.column_stack([edge, lit[:, 1]]),
+            other.beams.by_body,
+            self.edges.arrays(wanted),
+            self.targets.slack,
+        ).T
+        return beam, wanted[met], beam_of_other
 
 
 def _from_transmitter(
@@ -217,47 +253,3 @@ def _source_beams(points: Float64Array) -> ImageBeams:
     rows[:, :3], rows[:, kernels.COSINE], rows[:, kernels.LIT_FROM] = points, -1.0, _EVERYWHERE
     rows[:, kernels.LAST] = -1
     return ImageBeams(np.zeros((count, 0), np.int64), np.zeros(count, np.bool_), rows)
-
-
-def _lit(
-    targets: Targets, edges: EdgeTargets, wanted: Int64Array, beams: ImageBeams, owner: Int64Array
-) -> _Lit:
-    """Edges, of the wanted ones in ascending order, that beams may light, except for edges of the face that
-    reflected the beam last: they lie in the mirror's plane, and no wave goes from there to them."""
-    own = np.full(len(beams), -2)
-    if beams.chain.shape[1]:
-        own = edges.surface_of_face[beams.chain[:, -1]]
-    ends, every = edges.ends[wanted], np.arange(len(wanted) + 1)
-    begin = np.append(np.flatnonzero(np.diff(edges.piece[wanted], prepend=-2)), len(wanted))
-    pairs = kernels.lit_edges(
-        beams.rows,
-        spheres(ends, begin),
-        begin,
-        spheres(ends, every),
-        ends,
-        edges.normals[wanted],
-        edges.surfaces[wanted],
-        own,
-        targets.slack,
-    )
-    pairs[:, 1] = wanted[pairs[:, 1]]
-    return _Lit(beams, owner, pairs)
-
-
-def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> EdgeChains:
-    """Pairs of a beam from each side that meet at an edge within both beams."""
-    # Chains of scenery alone over an edge of scenery are left to rays.
-    sent, edge, taken = kernels.meetings(
-        one.beams.rows,
-        one.pairs,
-        one.beams.by_body,
-        other.beams.rows,
-        other.pairs,
-        other.beams.by_body,
-        edges.ends,
-        edges.piece >= 0,
-        targets.slack,
-    ).T
-    return EdgeChains(
-        before=one.beams.chain[sent], edge=edge, behind=other.beams.chain[taken], receiver=other.owner[taken]
-    )
