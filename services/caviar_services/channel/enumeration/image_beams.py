@@ -80,7 +80,7 @@ class Targets:
         self, chain: Int64Array, start: Float64Array, end: Float64Array
     ) -> tuple[Float64Array, BoolArray]:
         """Points where chains of faces reflect; see `path_kernels.reflections`."""
-        rows = [np.require(part, requirements="CW") for part in (chain, start, end)]
+        rows = [np.require(part, requirements=("C", "W")) for part in (chain, start, end)]
         found: tuple[Float64Array, BoolArray] = path_kernels.reflections(*self._mirrors, *rows)
         return found
 

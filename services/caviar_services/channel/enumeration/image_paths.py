@@ -47,7 +47,8 @@ class ImagePaths(Rows):
     @property
     def count(self) -> Int64Array:
         """Interactions of each path, Shape ``[P]``."""
-        return (self.chain >= 0).sum(1) + (self.bend >= 0)
+        count: Int64Array = (self.chain >= 0).sum(1) + (self.bend >= 0)
+        return count
 
 
 def image_paths(

@@ -9,7 +9,7 @@ little, are united, and a launch is traced in parts, whose memory is bounded.
 
 Where scenery has few faces, a transmitter that moves needs no launch: every sequence of faces that see one
 another is a chain, from wherever it is. From a place, the beams of its images leave most of them dark
-(`image_beams` has the same beams for the faces of a frame, on the ray tracer's side).
+(`image_beams` has the same beams for the faces of a frame).
 
 Of a thousand planes in a town each sees some thirty. Rays in all directions from points of each plane tell
 which; planes that are hidden but for less than one ray meets count as hidden.
