@@ -34,7 +34,7 @@ import math
 import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
-from caviar_services.channel.enumeration.compiled_loops import compiled, loop
+from caviar_services.channel.enumeration.compiled_loops import compiled, loop, vectorized
 
 Targets = tuple[
     Float64Array, Float64Array, Float64Array, Float64Array, Int64Array, Int64Array, Int64Array, float
@@ -64,7 +64,7 @@ def _grown(found: Int64Array, count: int) -> Int64Array:
     return larger
 
 
-@compiled
+@vectorized
 def _near_cone(
     beams: Float64Array, b: int, spheres: Float64Array, low: int, high: int, extra: float, near: BoolArray
 ) -> None:
@@ -106,6 +106,18 @@ def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach
     return True
 
 
+@vectorized
+def _facing(
+    beams: Float64Array, b: int, faces: Float64Array, low: int, high: int, slack: float, near: BoolArray
+) -> None:
+    """Keep near faces that reflect on the side of the image of beam b: of closed bodies, those towards it."""
+    x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
+    nx, ny, nz = faces[4, low:high], faces[5, low:high], faces[6, low:high]
+    offset, both = faces[7, low:high], faces[8, low:high]
+    for j in range(len(nx)):
+        near[j] &= (nx[j] * x + ny[j] * y + nz[j] * z - offset[j] > -slack) | (both[j] != 0)
+
+
 @compiled
 def _lit_spheres(
     beams: Float64Array,
@@ -121,11 +133,7 @@ def _lit_spheres(
     reflect on the image's side."""
     _near_cone(beams, b, spheres, low, high, 2 * slack, near)
     if len(spheres) > _SPHERE:
-        x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
-        nx, ny, nz = spheres[4, low:high], spheres[5, low:high], spheres[6, low:high]
-        offset, both = spheres[7, low:high], spheres[8, low:high]
-        for j in range(len(nx)):
-            near[j] &= (nx[j] * x + ny[j] * y + nz[j] * z - offset[j] > -slack) | (both[j] != 0)
+        _facing(beams, b, spheres, low, high, slack, near)
     count = 0
     for j in range(low, high):
         if near[j - low] and _in_pyramid(
@@ -326,7 +334,7 @@ def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
     return found[:count].copy()
 
 
-@compiled
+@vectorized
 def _crossing(
     beams: Float64Array,
     b: int,
@@ -411,20 +419,25 @@ def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) 
     return found[:count].copy()
 
 
-@compiled
+@vectorized
 def _cones_near(
     columns: Float64Array, low: int, high: int, x: float, y: float, z: float, reach: float, lit: BoolArray
 ) -> None:
     """`_near_cone` of one sphere with several beams, whose columns are rows here."""
-    some = columns[:, low:high]
-    for b in range(some.shape[1]):
-        tx, ty, tz = x - some[0, b], y - some[1, b], z - some[2, b]
-        along = some[AXIS, b] * tx + some[AXIS + 1, b] * ty + some[AXIS + 2, b] * tz
-        cosine = max(some[COSINE, b], 0.0)
-        within = reach + along * some[SINE, b]
-        across = (tx * tx + ty * ty + tz * tz - along * along) * (cosine * cosine)
-        side = some[LIT, b] * x + some[LIT + 1, b] * y + some[LIT + 2, b] * z
-        lit[b] = (within >= 0) & (across <= within * within) & (side - some[LIT_FROM, b] > -reach)
+    xs, ys, zs = columns[0, low:high], columns[1, low:high], columns[2, low:high]
+    ax, ay, az = columns[AXIS, low:high], columns[AXIS + 1, low:high], columns[AXIS + 2, low:high]
+    cosine, sine = columns[COSINE, low:high], columns[SINE, low:high]
+    for b in range(len(xs)):
+        tx, ty, tz = x - xs[b], y - ys[b], z - zs[b]
+        along = ax[b] * tx + ay[b] * ty + az[b] * tz
+        within = reach + along * sine[b]
+        across = (tx * tx + ty * ty + tz * tz - along * along) * (cosine[b] * cosine[b])
+        lit[b] = (within >= 0) & (across <= within * within)
+    # Of more arrays in one loop, a compiler does not look whether they overlap.
+    lx, ly, lz = columns[LIT, low:high], columns[LIT + 1, low:high], columns[LIT + 2, low:high]
+    lit_from = columns[LIT_FROM, low:high]
+    for b in range(len(lx)):
+        lit[b] &= lx[b] * x + ly[b] * y + lz[b] * z - lit_from[b] > -reach
 
 
 @loop(f"i8[:,::1](f8[:,::1], i8, f8[:,::1], {_TARGETS}, f8[:,::1])")
@@ -446,8 +459,8 @@ def ends_by_scenery(
     """
     faces, _, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 2), np.int64), 0
-    many = bodies.shape[1]
     # A group for each body, then one for each face of scenery.
+    many = bodies.shape[1]
     group_of = many + np.arange(faces.shape[1])
     for v in range(many):
         group_of[begin[v] : begin[v + 1]] = v
@@ -457,32 +470,38 @@ def ends_by_scenery(
     group_begin = np.cumsum(group_begin)
     order, filled = np.empty(len(beams) - first, np.int64), group_begin.copy()
     # Beams as columns: a view's image is held against several at once.
-    columns, lit = np.empty((SIDES, len(order))), np.empty(len(order) + many, np.bool_)
+    columns, near = np.empty((SIDES, len(order))), np.empty(len(order) + many, np.bool_)
     for b in range(first, len(beams)):
         group = group_of[int(beams[b, LAST])]
         order[filled[group]] = b
         columns[:, filled[group]] = beams[b, :SIDES]
+        columns[COSINE, filled[group]] = max(beams[b, COSINE], 0.0)
         filled[group] += 1
-    groups, shown = np.empty(len(group_begin), np.int64), np.empty(begin[0], np.int64)
-    seen, crosses = np.empty((3, 1)), np.empty(1, np.bool_)
+    shows = np.zeros((len(group_begin) - 1, len(views)), np.bool_)
+    lit_body, shown = np.empty(many, np.int64), np.empty(begin[0], np.int64)
+    seen, crosses = np.empty((len(views), 3, 1)), np.empty(1, np.bool_)
     for w in range(len(views)):
-        f = int(views[w, LAST])
-        ix, iy, iz = views[w, 0], views[w, 1], views[w, 2]
-        _fill_seen(targets, f, points[w : w + 1], seen)
-        if seen[2, 0] == 0:
+        _fill_seen(targets, int(views[w, LAST]), points[w : w + 1], seen[w])
+        if seen[w, 2, 0] == 0:
             continue
-        some = _lit_spheres(views, w, bodies, 0, many, slack, lit, groups)
+        for i in range(_lit_spheres(views, w, bodies, 0, many, slack, near, lit_body)):
+            shows[lit_body[i], w] = True
         for i in range(_shown_sights(views, w, targets, shown)):
-            groups[some] = many + shown[i]
-            some += 1
-        for i in range(some):
-            low, high = group_begin[groups[i]], group_begin[groups[i] + 1]
-            _cones_near(columns, low, high, ix, iy, iz, 2 * slack, lit)
+            shows[many + shown[i], w] = True
+    # Group by group, whose beams stay in the processor's cache while all views are tested.
+    for group in range(len(shows)):
+        low, high = group_begin[group], group_begin[group + 1]
+        for w in range(len(views)):
+            if low == high or not shows[group, w]:
+                continue
+            f = int(views[w, LAST])
+            ix, iy, iz = views[w, 0], views[w, 1], views[w, 2]
+            _cones_near(columns, low, high, ix, iy, iz, 2 * slack, near)
             for k in range(low, high):
                 b = order[k]
-                if not lit[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
+                if not near[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
                     continue
-                if _crossing(beams, b, targets, f, _height(beams, b, faces, f), seen, crosses):
+                if _crossing(beams, b, targets, f, _height(beams, b, faces, f), seen[w], crosses):
                     found = _grown(found, count)
                     found[count, 0], found[count, 1] = b, w
                     count += 1
@@ -491,15 +510,22 @@ def ends_by_scenery(
 
 @compiled
 def _near_edges(
-    beams: Float64Array, b: int, own: int, edges: Edges, slack: float, near: BoolArray, lit: Int64Array
+    beams: Float64Array,
+    b: int,
+    own: int,
+    edges: Edges,
+    slack: float,
+    near: BoolArray,
+    piece: Int64Array,
+    lit: Int64Array,
 ) -> int:
     """Write the edges whose spheres reach into the cone of beam b, whose image is in front of a face of them,
     and return how many they are; but for edges of the surface ``own``, which reflected the beam last: they
     lie in the mirror's plane, and no wave goes from there to them."""
     pieces, begin, spheres, ends, normals, surfaces, _ = edges
     x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
-    count, piece = 0, np.empty(pieces.shape[1], np.int64)
-    for i in range(_lit_spheres(beams, b, pieces, 0, len(piece), slack, near, piece)):
+    count = 0
+    for i in range(_lit_spheres(beams, b, pieces, 0, pieces.shape[1], slack, near, piece)):
         low, high = begin[piece[i]], begin[piece[i] + 1]
         _near_cone(beams, b, spheres, low, high, 2 * slack, near)
         for e in range(low, high):
@@ -519,9 +545,10 @@ def lit_edges(beams: Float64Array, own: Int64Array, edges: Edges, slack: float) 
     """Pairs of a beam and an edge that it may light; ``own`` are the surfaces that reflected the beams last,
     −2 for none."""
     found, count = np.empty((1024, 2), np.int64), 0
-    near, lit = np.empty(len(edges[3]), np.bool_), np.empty(len(edges[3]), np.int64)
+    near, piece = np.empty(len(edges[3]), np.bool_), np.empty(len(edges[3]), np.int64)
+    lit = np.empty(len(edges[3]), np.int64)
     for b in range(len(beams)):
-        for i in range(_near_edges(beams, b, own[b], edges, slack, near, lit)):
+        for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, lit)):
             found = _grown(found, count)
             found[count, 0], found[count, 1] = b, lit[i]
             count += 1
@@ -565,10 +592,11 @@ def meetings(
     """
     ends, edge_moves = edges[3], edges[6]
     found, count = np.empty((256, 3), np.int64), 0
-    near, reached = np.empty(len(ends), np.bool_), np.empty(len(ends), np.int64)
+    near, piece = np.empty(len(ends), np.bool_), np.empty(len(ends), np.int64)
+    reached = np.empty(len(ends), np.int64)
     begin = np.searchsorted(lit[:, 0], np.arange(len(ends) + 1))
     # Unit vectors along edges and their lengths; where the others are along them, and how far from them.
-    units, along = np.empty((len(ends), 4)), np.empty((len(lit), 2))
+    units, along, aways = np.empty((len(ends), 4)), np.empty(len(lit)), np.empty(len(lit))
     for e in range(len(ends)):
         ux, uy, uz = (
             ends[e, 1, 0] - ends[e, 0, 0],
@@ -578,17 +606,20 @@ def meetings(
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
         units[e, 0], units[e, 1], units[e, 2], units[e, 3] = ux / length, uy / length, uz / length, length
         for k in range(begin[e], begin[e + 1]):
-            along[k] = _unfolded(others, lit[k, 1], ends[e], units[e, 0], units[e, 1], units[e, 2])
+            along[k], aways[k] = _unfolded(others, lit[k, 1], ends[e], units[e, 0], units[e, 1], units[e, 2])
     for b in range(len(beams)):
-        for i in range(_near_edges(beams, b, own[b], edges, slack, near, reached)):
+        for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, reached)):
             e = reached[i]
             ux, uy, uz, length = units[e, 0], units[e, 1], units[e, 2], units[e, 3]
             s, away = _unfolded(beams, b, ends[e], ux, uy, uz)
             for k in range(begin[e], begin[e + 1]):
-                o, t, other_away = lit[k, 1], along[k, 0], along[k, 1]
-                # Keller's law: s − place over the one distance is place − t over the other.
-                place = (s * other_away + t * away) / (away + other_away)
-                if not -slack < place < length + slack or not (moves[b] or edge_moves[e] or others_move[o]):
+                # Keller's law: s − place over the one distance is place − t over the other. Most places are
+                # beyond the ends, and not divided.
+                place, total = s * aways[k] + along[k] * away, away + aways[k]
+                if not -slack * total < place < (length + slack) * total:
+                    continue
+                o, place = lit[k, 1], place / total
+                if not (moves[b] or edge_moves[e] or others_move[o]):
                     continue
                 x, y, z = ends[e, 0, 0] + place * ux, ends[e, 0, 1] + place * uy, ends[e, 0, 2] + place * uz
                 if not (_on_lit_side(beams, b, x, y, z, slack) and _on_lit_side(others, o, x, y, z, slack)):

@@ -31,8 +31,15 @@ _lock = Lock()
 
 
 def compiled(function: F) -> F:
-    """Have a function compiled with each loop that calls it; without Numba it stays as it is."""
+    """Have a function compiled into each loop that calls it; without Numba it stays as it is."""
     made: F = function if numba is None else numba.njit(forceinline=True, **_OPTIONS)(function)
+    return made
+
+
+def vectorized(function: F) -> F:
+    """As `compiled`, of a loop over arrays, compiled on its own: within another loop, a compiler cannot tell
+    that its arrays do not overlap, and takes one element at a time."""
+    made: F = function if numba is None else numba.njit(**_OPTIONS)(function)
     return made
 
 

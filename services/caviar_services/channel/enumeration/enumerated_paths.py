@@ -29,7 +29,7 @@ from caviar_services.channel.enumeration.image_paths import (
 from caviar_services.channel.enumeration.obstacle_trees import ObstacleTrees
 from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneFaces, seen_planes
 from caviar_services.channel.propagation.utd import reflection_fields
-from caviar_services.channel.sionna.candidates import Faces, first_of_each
+from caviar_services.channel.sionna.candidates import Faces, Met, bends_of, first_of_each
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.path_table import Traced, joined, nothing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
@@ -283,11 +283,32 @@ class EnumeratedTracer:
         if self._options.refraction:
             known |= self._is_known_through(launched.types, surfaces, chains)
         if self._edges is not None and over_edges:
-            known |= self._is_known_bent(self._edges, launched, surfaces, chains.shape[1])
-        by_body = surfaces >= scene.first_moving_plane
-        at_face = launched.types == Interaction.REFLECTION
-        known &= (~at_face | by_body | np.isin(surfaces, chains)).all(1)
+            known |= self._is_known_bent(
+                self._edges, launched.types, launched.edge, surfaces, chains.shape[1]
+            )
+        known &= self._has_faces(launched.types, surfaces, chains)
         return launched.take(wanted & (launched.hidden | ~known))
+
+    def known_bends(self, met: Met, scenery: KnownScenery) -> BoolArray:
+        """Mask of launched chains over an edge whose paths `trace` finds, Shape ``[C]``.
+
+        Args:
+            met: Of a launch.
+            scenery: As given to `trace`.
+        """
+        planes = met.chains.planes.astype(np.int64)
+        if self._edges is None or self._options.refraction:
+            return np.zeros(len(planes), np.bool_)
+        types, edge = bends_of(met)
+        known = self._is_known_bent(self._edges, types, edge, planes, scenery.chains.shape[1])
+        return known & self._has_faces(types, planes, scenery.chains.astype(np.int64))
+
+    def _has_faces(self, types: UInt8Array, surfaces: Int64Array, chains: Int64Array) -> BoolArray:
+        """Mask of paths whose reflections are at bodies, and at scenery of known chains."""
+        by_body = surfaces >= self._scene.first_moving_plane
+        at_face = types == Interaction.REFLECTION
+        known: BoolArray = (~at_face | by_body | np.isin(surfaces, chains)).all(1)
+        return known
 
     def _is_known_through(self, types: UInt8Array, surfaces: Int64Array, chains: Int64Array) -> BoolArray:
         """Mask of paths that are transmitted, and reflected only by enumerated chains: by way of bodies,
@@ -307,16 +328,16 @@ class EnumeratedTracer:
         return known
 
     def _is_known_bent(
-        self, edges: SceneEdges, traced: Traced, surfaces: Int64Array, depth: int
+        self, edges: SceneEdges, types: UInt8Array, edge: Int64Array, surfaces: Int64Array, depth: int
     ) -> BoolArray:
         """Mask of paths over an edge with reflections that `edge_beams` enumerates."""
-        bent, mirrors = (traced.types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
-        used = traced.types != 0
+        bent, mirrors = (types == kind for kind in (Interaction.DIFFRACTION, Interaction.REFLECTION))
+        used = types != 0
         of_scenery = surfaces < self._scene.first_moving_plane
         # Edges of bodies stand after those of scenery.
-        of_body = traced.edge >= len(edges) - len(edges.of_bodies[0])
+        of_body = edge >= len(edges) - len(edges.of_bodies[0])
         if enumerated_scenery(edges):
-            of_body |= (traced.edge >= 0) & (mirrors & ~of_scenery).any(1)
+            of_body |= (edge >= 0) & (mirrors & ~of_scenery).any(1)
         known: BoolArray = of_body & (bent | mirrors | ~used).all(1) & (used.sum(1) <= depth)
         after = np.cumsum(bent, axis=1) > 0
         for side in (mirrors & ~after, mirrors & after):

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array, UInt8Array, UInt64Array
+from caviar_protocol.topics import Interaction
 from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.ray_launcher import (
     DIFFRACTED,
@@ -197,6 +198,26 @@ def chains_of(launch: Launch, scene: SionnaScene, max_depth: int) -> Chains:
             )
         )
     return Chains.joined(found)
+
+
+def bends_of(met: Met) -> tuple[UInt8Array, Int64Array]:
+    """Interactions of chains of reflections and one diffraction, and the number of their edge.
+
+    Args:
+        met: Of a launch without refraction.
+
+    Returns:
+        `Interaction` of each, Shape ``[C, D]``, and the edge, −1 for none, Shape ``[C]``.
+    """
+    chains = met.chains
+    reflected = chains.planes >= 0
+    bent = ~reflected & (np.arange(chains.planes.shape[1]) < chains.depth[:, None])
+    types = np.where(reflected, Interaction.REFLECTION, np.where(bent, Interaction.DIFFRACTION, 0))
+    edge = np.full(len(bent), -1)
+    some = np.flatnonzero(bent.any(1))
+    if len(some):
+        edge[some] = _gathered([met.launch.wedges.local_edge], chains.ray[some])[0]
+    return types.astype(np.uint8), edge
 
 
 def _runs(launch: Launch) -> Iterator[Int64Array]:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import importlib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from caviar_protocol.arrays import Float64Array, Int64Array
+from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.assets import default_folder
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
@@ -28,7 +29,7 @@ from caviar_services.channel.enumeration.scenery_chains import (
     SceneryLaunch,
 )
 from caviar_services.channel.paths import Antenna, PathTable, path_ends
-from caviar_services.channel.sionna.candidates import Corners
+from caviar_services.channel.sionna.candidates import Corners, Met
 from caviar_services.channel.sionna.diffracting_edges import EdgeRange
 from caviar_services.channel.sionna.path_solver import Tracer
 from caviar_services.channel.sionna.path_table import Ends, Traced
@@ -329,12 +330,14 @@ class PathFinder:
             tracer, over_edges = self._unbent, False
             self._without_edge += 1
         found: list[tuple[Traced, Float64Array | None]] = []
+        known: Callable[[Met], BoolArray] | None = None
         if self._enumerated is not None:
             scenery = self._scenery.known_from(transmitter.name, source)
+            known = partial(self._enumerated.known_bends, scenery=scenery) if over_edges else None
             found.append((self._enumerated.trace(source, targets, scenery, over_edges), None))
         if self.launches:
             followed = None if self._following is None else self._following.chains_from(transmitter.name)
-            launched = tracer.trace(source, targets, at_once, followed, names, corners=corners)
+            launched = tracer.trace(source, targets, at_once, followed, names, corners=corners, known=known)
             if self._enumerated is not None:
                 launched = self._enumerated.unknown(launched, found[0][0], scenery, over_edges)
             found.append((launched, tracer.missed_by_half(source, launched) if with_missed else None))

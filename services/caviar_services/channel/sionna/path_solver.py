@@ -8,7 +8,7 @@ with positions as arrays instead of one device object each, and their flat buffe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,6 +178,7 @@ class Tracer:
         lanes: int = _LANES,
         corners: Corners | None = None,
         element: Element | None = None,
+        known: Callable[[Met], BoolArray] | None = None,
     ) -> Traced:
         """Find the paths from one transmitter to all receivers.
 
@@ -192,6 +193,7 @@ class Tracer:
             corners: Asks also for paths that only a part of the arrays has; nothing is then taken from an
                 earlier trace. None: the centres alone count.
             element: The transmitter's, by whose gain diffuse paths are chosen; None: by no gain.
+            known: Says which chains of a launch the caller finds itself, if the centres alone count.
         """
         if not len(receivers):
             return self.nothing
@@ -206,7 +208,7 @@ class Tracer:
         last = None if corners else self._last.get(key)
         if last is None:
             if followed is None:
-                offer = self._launched(transmitter, element)
+                offer = self._launched(transmitter, element, None if corners else known)
             else:
                 offer = followed.offer(self._launcher, transmitter, self._scene, names, self._options)
             offer.everywhere = corners is not None
@@ -222,7 +224,12 @@ class Tracer:
             del self._last[next(iter(self._last))]
         return traced
 
-    def _launched(self, transmitter: Float64Array, element: Element | None) -> Offer:
+    def _launched(
+        self,
+        transmitter: Float64Array,
+        element: Element | None,
+        known: Callable[[Met], BoolArray] | None,
+    ) -> Offer:
         """Offer of a launch of all rays."""
         source = positions(transmitter[None])
 
@@ -235,6 +242,8 @@ class Tracer:
             )
 
         met = united(self._launcher.each(look, source), self._scene)
+        if known is not None:
+            met = replace(met, chains=met.chains.take(~known(met)))
         points = None if self._thinning is None else ChosenPoints(self._thinning, met.scattered)
         return Offer(self._scene, met, source, self._options, points)
 
