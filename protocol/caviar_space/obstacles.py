@@ -353,6 +353,19 @@ class Surfaces:
         boxes = _boxes(triangles)
         self._low[:, rows], self._high[:, rows] = boxes[..., 0], boxes[..., 1]
 
+    def near(self, positions: Float64Array) -> BoolArray:
+        """Test whether boxes around triangles are within `CLEARANCE` of points [m], Shape ``[N, 3]``: only
+        these `cleared` may move."""
+        low, high = self._low - CLEARANCE, self._high + CLEARANCE
+        point, index = np.nonzero((low[0] <= positions[:, :1]) & (high[0] >= positions[:, :1]))
+        for axis in (1, 2):
+            along = positions[point, axis]
+            kept = (low[axis, index] <= along) & (high[axis, index] >= along)
+            point, index = point[kept], index[kept]
+        near = np.zeros(len(positions), np.bool_)
+        near[point] = True
+        return near
+
     def cleared(self, position: Float64Array) -> Float64Array:
         """A position [m], Shape ``[3]``, moved to `CLEARANCE` from surfaces that it is nearer to."""
         for index in self._within(position, position, CLEARANCE).tolist():

@@ -85,10 +85,11 @@ def refined_points(
         # Antennas at surfaces are traced from beside their place: the points found there are known to be the
         # path's, and serve as a start for those of the true positions.
         moved = good & ((one != start) | (other != end)).any(1)[some]
-        there = some[moved]
-        found[moved] = _found(
-            start[there], found[moved], end[there], kind[moved], triangles[there], edges[there]
-        )
+        if moved.any():
+            there = some[moved]
+            found[moved] = _found(
+                start[there], found[moved], end[there], kind[moved], triangles[there], edges[there]
+            )
         good &= np.isfinite(found).all((1, 2))
     refined = points.copy()
     refined[some[good]] = found[good]

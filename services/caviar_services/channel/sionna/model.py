@@ -399,8 +399,12 @@ class SionnaChannel(PathModel[SionnaSettings]):
 
     def _cleared(self, antennas: Sequence[Antenna]) -> list[Antenna]:
         """Antennas where they are traced from."""
-        cleared = self._scene.surfaces.cleared
-        return [replace(antenna, position=cleared(antenna.position)) for antenna in antennas]
+        surfaces = self._scene.surfaces
+        near = surfaces.near(np.array([antenna.position for antenna in antennas]).reshape(-1, 3))
+        return [
+            replace(antenna, position=surfaces.cleared(antenna.position)) if moves else antenna
+            for antenna, moves in zip(antennas, near, strict=True)
+        ]
 
     def _split_nmse(self, parts: Launched, antennas: Ends) -> Float64Array:
         """See `Found.split_nmse`; antennas count as isotropic."""
