@@ -202,32 +202,32 @@ def _fill_sides(beams: Float64Array, b: int, column: int, edge: Float64Array) ->
         beams[b, k], beams[b, k + 1], beams[b, k + 2] = x * scale, y * scale, z * scale
 
 
-@loop(f"f8[:,::1]({_TARGETS}, i8[::1], f8[:,::1], i8[::1])")
-def reflected(targets: Targets, last: Int64Array, source: Float64Array, before: Int64Array) -> Float64Array:
-    """Beams after a reflection of images ``[B, 3]`` at the faces ``last``; the faces of the reflections
-    ``before``, −1 for none, bound the beams too."""
+@loop(f"f8[:,::1]({_TARGETS}, f8[:,::1], i8[::1], i8[::1])")
+def reflected(targets: Targets, before: Float64Array, parent: Int64Array, last: Int64Array) -> Float64Array:
+    """Beams after a reflection of beams ``before``, by their number in ``parent``, at the faces ``last``; the
+    faces that reflected them before bound the beams, too."""
     faces, corners = targets[:2]
     beams = np.zeros((len(last), WIDTH))
     beams[:, LAST] = last
     edge, axis = np.empty((4, 3)), np.empty(3)
     for b in range(len(last)):
-        f = last[b]
+        f, source, g = last[b], before[parent[b]], int(before[parent[b], LAST])
         n0, n1, n2, offset = faces[4, f], faces[5, f], faces[6, f], faces[7, f]
-        height = source[b, 0] * n0 + source[b, 1] * n1 + source[b, 2] * n2 - offset
+        height = source[0] * n0 + source[1] * n1 + source[2] * n2 - offset
         image = beams[b]
-        image[0] = source[b, 0] - 2 * height * n0
-        image[1] = source[b, 1] - 2 * height * n1
-        image[2] = source[b, 2] - 2 * height * n2
+        image[0] = source[0] - 2 * height * n0
+        image[1] = source[1] - 2 * height * n1
+        image[2] = source[2] - 2 * height * n2
         # The image is behind the mirror, so the lit side is the other one.
         away = -1.0 if image[0] * n0 + image[1] * n1 + image[2] * n2 > offset else 1.0
         beams[b, LIT], beams[b, LIT + 1], beams[b, LIT + 2] = n0 * away, n1 * away, n2 * away
         beams[b, LIT_FROM] = offset * away
         narrowest = -2.0
-        for which in range(2 if before[b] >= 0 else 1):
-            g = before[b] if which else f
+        for which in range(2 if g >= 0 else 1):
+            h = g if which else f
             axis[:] = 0.0
             for i in range(4):
-                x, y, z = corners[g, i, 0], corners[g, i, 1], corners[g, i, 2]
+                x, y, z = corners[h, i, 0], corners[h, i, 1], corners[h, i, 2]
                 # The rectangle before this one bounds the beam, too, by its mirror image.
                 height = (x * n0 + y * n1 + z * n2 - offset) if which else 0.0
                 edge[i, 0] = x - 2 * height * n0 - image[0]
@@ -269,36 +269,23 @@ def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64
     return found[:count].copy()
 
 
-@loop(f"i8[:,::1](f8[:,::1], {_TARGETS})")
-def lit_bodies(beams: Float64Array, targets: Targets) -> Int64Array:
-    """Pairs of a beam and a face of a body that it lights."""
+@loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
+def lit_faces(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
+    """Pairs of a beam and a face that it lights: faces of bodies, and for beams from ``first`` on, faces of
+    scenery."""
     faces, corners, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
     many = bodies.shape[1]
     near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(many, np.int64)
     lit = np.empty(faces.shape[1], np.int64)
     for b in range(len(beams)):
+        some = _lit_spheres(beams, b, faces, 0, begin[0], slack, near, lit) if b >= first else 0
         for i in range(_lit_spheres(beams, b, bodies, 0, many, slack, near, lit_body)):
             v = lit_body[i]
-            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
-                f = lit[k]
-                # A plane does not reflect twice in a row.
-                if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
-                    found = _grown(found, count)
-                    found[count, 0], found[count, 1] = b, f
-                    count += 1
-    return found[:count].copy()
-
-
-@loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
-def lit_scenery(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
-    """Pairs of a beam from ``first`` on and a face of scenery that it lights."""
-    faces, corners, _, _, begin, _, _, slack = targets
-    found, count = np.empty((1024, 2), np.int64), 0
-    near, lit = np.empty(begin[0], np.bool_), np.empty(begin[0], np.int64)
-    for b in range(first, len(beams)):
-        for i in range(_lit_spheres(beams, b, faces, 0, begin[0], slack, near, lit)):
+            some += _lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit[some:])
+        for i in range(some):
             f = lit[i]
+            # A plane does not reflect twice in a row.
             if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                 found = _grown(found, count)
                 found[count, 0], found[count, 1] = b, f

@@ -24,15 +24,11 @@ from caviar_services.channel.enumeration.image_beams import (
     ImageBeams,
     SceneryViews,
     Targets,
-    by_scenery,
     first_beams,
     kernels,
-    lit_bodies,
-    longer_beams,
     next_beams,
     reflected_beams,
-    scenery_beams,
-    shown_scenery,
+    source_beams,
     spheres,
 )
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
@@ -41,9 +37,6 @@ from caviar_space.rectangles import FaceRectangles
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512
-
-# Offset of a plane that nothing is behind.
-_EVERYWHERE = -1e30
 
 
 class EdgeTargets:
@@ -206,14 +199,13 @@ def _from_transmitter(
 ) -> Iterator[ImageBeams]:
     """Beams of the transmitter after no reflection, one, and so on, up to one less than the depth."""
     depth, length = scenery.shape[1], (scenery >= 0).sum(1)
-    yield _source_beams(transmitter[None])
+    yield source_beams(transmitter[None])
     if depth == 1:
         return
     beams = first_beams(targets, transmitter, scenery[length == 1, 0])
     yield beams
     for n in range(2, depth):
-        onward = next_beams if n == 2 else scenery_beams
-        beams = onward(targets, beams, scenery[length == n, :n])
+        beams = next_beams(targets, beams, scenery[length == n, :n], by_bodies=n == 2)
         yield beams
 
 
@@ -221,7 +213,8 @@ def _from_receivers(
     targets: Targets, views: SceneryViews, receivers: Float64Array, depth: int
 ) -> Iterator[tuple[ImageBeams, Int64Array]]:
     """Beams of the receivers in the same order, with the receiver of each beam."""
-    yield _source_beams(receivers), np.arange(len(receivers))
+    beams, owner = source_beams(receivers), np.arange(len(receivers))
+    yield beams, owner
     if depth == 1:
         return
     faces = targets.faces
@@ -230,26 +223,13 @@ def _from_receivers(
     height = receivers @ faces.normal[bodies].T - faces.offset[bodies]
     receiver, place = np.nonzero((height > 0) | faces.two_sided[bodies])
     owner = np.concatenate([views.receiver, receiver])
-    chain = np.concatenate([views.face, bodies[place]])[:, None]
-    beams = reflected_beams(targets, chain, receivers[owner])
+    beams = reflected_beams(targets, beams, owner, np.concatenate([views.face, bodies[place]]))
     yield beams, owner
     for n in range(2, depth):
         # Beams of scenery alone come first; after the second reflection they are all that goes on.
-        pairs = [shown_scenery(targets, beams.scenery_alone())]
+        first = beams.first_by_body
+        pairs = kernels.shown_scenery(beams.rows[:first], targets.arrays)
         if n == 2:
-            pairs += [by_scenery(targets, beams), lit_bodies(targets, beams)]
-        none = np.zeros(0, np.int64)
-        beams, owner = (
-            longer_beams(targets, beams, none, np.zeros((0, n), np.int64), *pairs),
-            owner[np.concatenate(pairs)[:, 0]],
-        )
+            pairs = np.concatenate([pairs, kernels.lit_faces(beams.rows, first, targets.arrays)])
+        beams, owner = reflected_beams(targets, beams, *pairs.T), owner[pairs[:, 0]]
         yield beams, owner
-
-
-def _source_beams(points: Float64Array) -> ImageBeams:
-    """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
-    count = len(points)
-    rows = np.zeros((count, kernels.WIDTH))
-    rows[:, :3], rows[:, kernels.COSINE], rows[:, kernels.LIT_FROM] = points, -1.0, _EVERYWHERE
-    rows[:, kernels.LAST] = -1
-    return ImageBeams(np.zeros((count, 0), np.int64), np.zeros(count, np.bool_), rows)

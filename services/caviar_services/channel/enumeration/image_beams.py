@@ -39,6 +39,10 @@ _SLACK = 5e-3
 _RELATIVE_SLACK = 2e-6
 
 
+# Offset of a plane that nothing is behind.
+_EVERYWHERE = -1e30
+
+
 class Targets:
     """Targets of a frame's beams, as `beam_kernels` takes them: faces, and bodies by the spheres around them.
 
@@ -116,10 +120,23 @@ class ImageBeams:
         """Index of the first beam by way of a body: beams of scenery alone stand before it."""
         return int(np.argmax(self.by_body)) if self.by_body.any() else len(self)
 
-    def scenery_alone(self) -> ImageBeams:
-        """Beams before the first one by way of a body."""
-        first = slice(0, self.first_by_body)
-        return ImageBeams(self.chain[first], self.by_body[first], self.rows[first])
+
+def source_beams(points: Float64Array) -> ImageBeams:
+    """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
+    rows = np.zeros((len(points), kernels.WIDTH))
+    rows[:, :3], rows[:, kernels.COSINE], rows[:, kernels.LIT_FROM] = points, -1.0, _EVERYWHERE
+    rows[:, kernels.LAST] = -1
+    return ImageBeams(np.zeros((len(points), 0), np.int64), np.zeros(len(points), np.bool_), rows)
+
+
+def reflected_beams(targets: Targets, beams: ImageBeams, parent: Int64Array, face: Int64Array) -> ImageBeams:
+    """Beams after one more reflection of some beams, by their number, each at a face; Shape ``[B]`` both."""
+    parent, face = np.ascontiguousarray(parent), np.ascontiguousarray(face)
+    return ImageBeams(
+        np.column_stack([beams.chain[parent], face]),
+        beams.by_body[parent] | (face >= targets.first_body),
+        kernels.reflected(targets.arrays, beams.rows, parent, face),
+    )
 
 
 def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> ImageBeams:
@@ -129,10 +146,10 @@ def first_beams(targets: Targets, source: Float64Array, scenery: Int64Array) -> 
     bodies = np.arange(targets.first_body, len(faces))
     shown = faces.normal[bodies] @ source > faces.offset[bodies]
     first = np.concatenate([scenery, bodies[shown | faces.two_sided[bodies]]])
-    return reflected_beams(targets, first[:, None], np.tile(source, (len(first), 1)))
+    return reflected_beams(targets, source_beams(source[None]), np.zeros_like(first), first)
 
 
-def next_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageBeams:
+def next_beams(targets: Targets, beams: ImageBeams, known: Int64Array, by_bodies: bool = True) -> ImageBeams:
     """Beams after one more reflection.
 
     Args:
@@ -140,75 +157,21 @@ def next_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageB
         beams: Beams after n reflections.
         known: Chains of scenery alone, Shape ``[K, n + 1]``. Each begins with the chain of one of ``beams``.
             Beams by way of scenery alone continue along these and no others.
+        by_bodies: Whether beams by way of bodies are wanted.
 
     Returns:
-        Beams of ``known`` first, then those by way of a body.
+        Beams of ``known`` first, as everywhere: `ImageBeams.first_by_body` divides the list. Then those by
+        way of a body.
     """
-    # Beams of scenery alone come first, as everywhere: `ImageBeams.first_by_body` divides the list.
-    return longer_beams(
-        targets, beams, _begun_by(beams, known), known, by_scenery(targets, beams), lit_bodies(targets, beams)
+    first = beams.first_by_body
+    number = {tuple(row): number for number, row in enumerate(beams.chain[:first].tolist())}
+    begun = np.array([number[tuple(row)] for row in known[:, :-1].tolist()], np.int64)
+    if not by_bodies:
+        return reflected_beams(targets, beams, begun, known[:, -1])
+    parent, face = kernels.lit_faces(beams.rows, first, targets.arrays).T
+    return reflected_beams(
+        targets, beams, np.concatenate([begun, parent]), np.concatenate([known[:, -1], face])
     )
-
-
-def scenery_beams(targets: Targets, beams: ImageBeams, known: Int64Array) -> ImageBeams:
-    """Beams of `next_beams` whose chains are of scenery alone."""
-    return longer_beams(targets, beams, _begun_by(beams, known), known)
-
-
-def longer_beams(
-    targets: Targets, beams: ImageBeams, parent: Int64Array, chain: Int64Array, *more: Int64Array
-) -> ImageBeams:
-    """Beams of chains, Shape ``[B, n + 1]``, each one face longer than the chain of its parent beam, and of
-    pairs of a beam and a face that it lights, Shape ``[N, 2]``."""
-    for pairs in more:
-        parent = np.concatenate([parent, pairs[:, 0]])
-        chain = np.concatenate([chain, np.column_stack([beams.chain[pairs[:, 0]], pairs[:, 1]])])
-    return reflected_beams(targets, chain, beams.rows[parent, :3], beams.chain[parent, -1])
-
-
-def _begun_by(beams: ImageBeams, wanted: Int64Array) -> Int64Array:
-    """Index of the beam of scenery whose chain is the beginning of each wanted one."""
-    known = {tuple(row): number for number, row in enumerate(beams.chain[: beams.first_by_body].tolist())}
-    return np.array([known[tuple(row)] for row in wanted[:, :-1].tolist()], np.int64)
-
-
-def reflected_beams(
-    targets: Targets, chain: Int64Array, image: Float64Array, before: Int64Array | None = None
-) -> ImageBeams:
-    """Beams after a reflection at the last face of each chain.
-
-    Args:
-        targets: Faces.
-        chain: All faces of each beam, Shape ``[B, n]``.
-        image: Image of the source before that reflection [m], Shape ``[B, 3]``.
-        before: Face of the reflection before that one, which bounds the beam, too; None: there is none.
-    """
-    if before is None:
-        before = np.full(len(chain), -1)
-    last, image = np.ascontiguousarray(chain[:, -1]), np.ascontiguousarray(image)
-    rows = kernels.reflected(targets.arrays, last, image, before)
-    by_body: BoolArray = np.logical_or.reduce(chain >= targets.first_body, axis=1)
-    return ImageBeams(chain, by_body, rows)
-
-
-def by_scenery(targets: Targets, beams: ImageBeams) -> Int64Array:
-    """Pairs of a beam by way of a body and a face of scenery that it lights, Shape ``[N, 2]``."""
-    # Only beams by way of a body: which chains of scenery alone exist is known (`scenery_chains`).
-    found: Int64Array = kernels.lit_scenery(beams.rows, beams.first_by_body, targets.arrays)
-    return found
-
-
-def lit_bodies(targets: Targets, beams: ImageBeams) -> Int64Array:
-    """Pairs of a beam and a face of a body that it lights, Shape ``[N, 2]``."""
-    found: Int64Array = kernels.lit_bodies(beams.rows, targets.arrays)
-    return found
-
-
-def shown_scenery(targets: Targets, views: ImageBeams) -> Int64Array:
-    """Pairs of a view, the beam of what a receiver sees in a face of scenery, and a face of scenery that
-    waves may come from, of those that the former sees, Shape ``[N, 2]``."""
-    found: Int64Array = kernels.shown_scenery(views.rows, targets.arrays)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +244,9 @@ def chain_pairs(
         add(beams)
     if depth > 1:
         # The last reflection needs no beams of its own: its faces are tested with the receivers at once.
-        add(scenery_beams(targets, beams, scenery[length == depth]))
+        add(next_beams(targets, beams, scenery[length == depth], by_bodies=False))
         seen = receivers[views.receiver]
-        images = reflected_beams(targets, views.face[:, None], seen).rows
+        images = reflected_beams(targets, source_beams(receivers), views.receiver, views.face).rows
         beam, view = kernels.ends_by_scenery(beams.rows, beams.first_by_body, images, targets.arrays, seen).T
         ends = np.column_stack([beam, views.face[view], views.receiver[view]])
         ends = np.concatenate([ends, kernels.ends_by_bodies(beams.rows, targets.arrays, receivers)])
