@@ -293,6 +293,15 @@ def lit_faces(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
     return found[:count].copy()
 
 
+@loop(f"b1[::1](f8[:,::1], i8[::1], i8[::1], {_TARGETS})")
+def lights(beams: Float64Array, beam: Int64Array, face: Int64Array, targets: Targets) -> BoolArray:
+    """Mask of pairs of a beam and a face that it may light."""
+    lit = np.empty(len(beam), np.bool_)
+    for k in range(len(beam)):
+        lit[k] = _lights_corner(beams, beam[k], targets[1], face[k], targets[7])
+    return lit
+
+
 @compiled
 def _shown_sights(views: Float64Array, w: int, targets: Targets, shown: Int64Array) -> int:
     """Write the faces of scenery that view w shows, of those that its face sees; return how many they are."""

@@ -8,8 +8,8 @@ rays or with 1e7, and the others only where the rays point elsewhere. So several
 little, are united, and a launch is traced in parts, whose memory is bounded.
 
 Where scenery has few faces, a transmitter that moves needs no launch: every sequence of faces that see one
-another is a chain, from wherever it is. From a place, the beams of its images leave most of them dark
-(`image_beams` has the same beams for the faces of a frame).
+another is a chain, from wherever it is. From a place, the beams of its images (`image_beams`) leave most of
+them dark.
 
 Of a thousand planes in a town each sees some thirty. Rays in all directions from points of each plane tell
 which; planes that are hidden but for less than one ray meets count as hidden.
@@ -37,6 +37,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
+from caviar_services.channel.enumeration.image_beams import Targets, first_beams, kernels, reflected_beams
 from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -224,12 +225,6 @@ def _points(faces: FaceRectangles, count: int, rng: np.random.Generator) -> Floa
 MOST_CHAINS = 20_000
 """Largest number of sequences that are enumerated."""
 
-# [m] around pyramids; more than the rim of triangles.
-_SLACK = 1e-3
-
-# [m]; walls of a building that meet at a corner do not show one another.
-_IN_FRONT = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class _Level:
@@ -253,9 +248,7 @@ class ChainTree:
 
     def __init__(self, faces: FaceRectangles, levels: list[_Level]) -> None:
         self._faces, self._levels = faces, levels
-        u, v = (faces.axes[:, i] * faces.half[:, i, None] for i in (0, 1))
-        around = np.stack([-u - v, u - v, u + v, v - u], axis=1)
-        self._corners: Float64Array = faces.centre[:, None] + around
+        self._targets = Targets(faces, np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
 
     @property
     def planes(self) -> Int64Array:
@@ -300,52 +293,19 @@ class ChainTree:
             Planes of each, −1 past the last, Shape ``[K, D]``: shorter sequences first, with the beginnings
             of each one among them.
         """
-        faces, level = self._faces, self._levels[0]
-        rows = last = np.flatnonzero(seen)
-        image = faces.mirrored(np.broadcast_to(source, (len(rows), 3)), last)
-        # The rectangle before the last one, mirrored in the last one: it bounds a beam, too.
-        through: Float64Array | None = None
-        found = [level.planes[rows]]
+        rows = np.flatnonzero(seen)
+        beams = first_beams(self._targets, source, rows)
+        found = [self._levels[0].planes[rows]]
         for shorter, level in pairwise(self._levels):
             place = np.full(len(shorter.face), -1)
             place[rows] = np.arange(len(rows))
             rows = np.flatnonzero(place[level.parent] >= 0)
             parent, face = place[level.parent[rows]], level.face[rows]
-            target = self._corners[face]
-            lit = self._in_front(image[parent], last[parent], target)
-            lit &= ~_beyond(image[parent], self._corners[last[parent]], target)
-            if through is not None:
-                lit &= ~_beyond(image[parent], through[parent], target)
-            rows, parent, face = rows[lit], parent[lit], face[lit]
-            through = self._mirrored(last[parent], face)
-            image, last = faces.mirrored(image[parent], face), face
+            lit = kernels.lights(beams.rows, parent, face, self._targets.arrays)
+            rows = rows[lit]
+            beams = reflected_beams(self._targets, beams, parent[lit], face[lit])
             found.append(level.planes[rows])
         return np.concatenate(found)
-
-    def _in_front(self, image: Float64Array, last: Int64Array, target: Float64Array) -> BoolArray:
-        """Test whether rectangles reach to the lit side of the planes of last faces, which images are
-        behind."""
-        away = np.where(self._faces.height(image, last) > 0, -1.0, 1.0)[:, None]
-        height = np.einsum("nkc,nc->nk", target, self._faces.normal[last]) - self._faces.offset[last, None]
-        in_front: BoolArray = (away * height > _IN_FRONT).any(1)
-        return in_front
-
-    def _mirrored(self, faces: Int64Array, mirrors: Int64Array) -> Float64Array:
-        """Corners of faces, mirrored in others, Shape ``[N, 4, 3]``."""
-        flat = self._corners[faces].reshape(-1, 3)
-        return self._faces.mirrored(flat, np.repeat(mirrors, 4)).reshape(-1, 4, 3)
-
-
-def _beyond(apex: Float64Array, corners: Float64Array, target: Float64Array) -> BoolArray:
-    """Test whether N rectangles lie beyond a side of the pyramids from apexes around other rectangles."""
-    edges = corners - apex[:, None]
-    normal = np.cross(edges, np.roll(edges, -1, axis=1))
-    length = np.sqrt(np.einsum("nsc,nsc->ns", normal, normal))
-    inwards = np.sign(np.einsum("nsc,nc->ns", normal, edges.sum(1)))
-    normal *= (inwards / np.where(length > 0, length, 1.0))[..., None]
-    height = np.einsum("nsc,nkc->nsk", normal, target - apex[:, None])
-    beyond: BoolArray = (height < -_SLACK).all(2).any(1)
-    return beyond
 
 
 # From each plane, to find which others it sees: before the first frame, and in each.
