@@ -17,10 +17,6 @@ RIM = 1e-4
 """[m]; a point this far outside of a triangle counts as inside, so that none falls between two triangles."""
 
 
-# [m] by which rectangles are larger; more than the rim of their triangles.
-_SLACK = 2e-3
-
-
 @dataclass(frozen=True, eq=False)
 class FaceRectangles(Rows):
     """F plane faces; coordinates in metres, relative to one origin.
@@ -113,31 +109,6 @@ class FaceRectangles(Rows):
         """Height of points [m], Shape ``[N, 3]``, above the planes of N faces [m], Shape ``[N]``."""
         height: Float64Array = np.einsum("nc,nc->n", points, self.normal[faces]) - self.offset[faces]
         return height
-
-    def in_rectangle(self, points: Float64Array, faces: Int64Array) -> BoolArray:
-        """Test whether points [m] of the planes of N faces lie in their rectangles; ``[N, 3]`` to ``[N]``."""
-        flat = np.einsum("nc,nac->na", points - self.centre[faces], self.axes[faces])
-        inside: BoolArray = (np.abs(flat) <= self.half[faces] + _SLACK).all(1)
-        return inside
-
-    def in_triangles(self, points: Float64Array, faces: Int64Array) -> BoolArray:
-        """Test whether points [m] of the planes of N faces lie in one of their triangles; ``[N, 3]`` to
-        ``[N]``."""
-        flat = np.einsum("nc,nac->na", points - self.centre[faces], self.axes[faces])
-        sizes = self.sizes[faces]
-        own, rows = ranges(np.cumsum(self.sizes)[faces] - sizes, sizes)
-        corners = self.triangles[rows]
-        sides = np.roll(corners, -1, axis=1) - corners
-        towards = flat[own][:, None] - corners
-        across = sides[..., 0] * towards[..., 1] - sides[..., 1] * towards[..., 0]
-        area = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-        length = np.sqrt((sides**2).sum(-1))
-        # Twice the area of the triangle of point and side over the side's length is the distance from the
-        # side.
-        within = (across * np.sign(area)[:, None] >= -RIM * length).all(1) & (area != 0)
-        held = np.zeros(len(faces), np.bool_)
-        held[own[within]] = True
-        return held
 
 
 def narrowest_sides(triangles: Float64Array, sizes: Int64Array) -> Int64Array:

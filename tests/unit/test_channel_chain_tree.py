@@ -9,7 +9,7 @@ import pytest
 
 from caviar_services.channel.enumeration import scenery_chains
 from caviar_services.channel.enumeration.scenery_chains import ChainTree
-from caviar_space.rectangles import FaceRectangles, narrowest_sides
+from caviar_space.rectangles import RIM, FaceRectangles, narrowest_sides
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])
 
@@ -79,7 +79,8 @@ def test_nothing_that_is_reflected_is_left_out() -> None:
                 good = good and near * far < 0
                 if good:
                     here = here + near / (near - far) * (image - here)
-                    good = bool(faces.in_triangles(here[None], np.array([face]))[0])
+                    flat = faces.axes[face] @ (here - faces.centre[face])
+                    good = bool((np.abs(flat) <= faces.half[face] + RIM).all())
             if good:
                 reflected.add(chain)
                 assert tuple(faces.plane[list(chain)].tolist()) in found

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from caviar_protocol.arrays import Float64Array
+from caviar_services.channel.enumeration.image_beams import Targets
 from caviar_space.meshes import Mesh, unit_box
 from caviar_space.planes import plane_numbers, two_sided_planes
 from caviar_space.rectangles import RIM, FaceRectangles, narrowest_sides
@@ -50,15 +52,26 @@ def test_a_rectangle_is_as_small_as_its_triangles_are() -> None:
 
 
 def test_points_are_held_by_triangles_and_not_by_the_rectangle_around_them() -> None:
-    """With a rim beyond the border, and none between two triangles."""
+    """With a rim beyond the border, and none between two triangles: waves there and back along the normal."""
+    pytest.importorskip("numba")
     made, frame, origin = faces()
     flat = np.array(
-        [[0.5, 2.9], [3.9, 0.5], [2.0, 0.5], [3.0, 2.0], [1.0 + RIM / 2, 2.0], [1.0 + 3 * RIM, 2.0]]
+        [
+            [0.5, 2.9],
+            [3.9, 0.5],
+            [2.0, 0.5],
+            [3.0, 2.0],
+            [1.0 + RIM / 2, 2.0],
+            [1.0 + 3 * RIM, 2.0],
+            [4.1, 0.5],
+        ]
     )
-    points, which = origin + flat @ frame[:2], np.ones(len(flat), np.int64)
-    assert made.in_rectangle(points, which).all()
-    assert made.in_triangles(points, which).tolist() == [True, True, True, False, True, False]
-    assert not made.in_rectangle(origin + np.array([[4.1, 0.5]]) @ frame[:2], which[:1]).any()
+    points = origin + flat @ frame[:2]
+    targets = Targets(made, np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
+    ends = points + 2.5 * frame[2]
+    met, held = targets.reflections(np.ones((len(flat), 1), np.int64), ends, ends)
+    assert held.tolist() == [True, True, True, False, True, False, False]
+    assert np.allclose(met[held, 0], points[held])
 
 
 def test_images_are_as_far_behind_as_points_are_in_front() -> None:
