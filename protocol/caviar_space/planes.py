@@ -568,6 +568,8 @@ class CoplanarFaces:
         body, still = self._with_scenery(moving)
         together = self._coplanar(body, still)
         body, still = body[together], still[together]
+        if not len(one) + len(body):  # the usual frame
+            return self.none
         triangle = self._touched(body, still)
         touching = triangle >= 0
         body, still, triangle = body[touching], still[touching], triangle[touching]

@@ -55,13 +55,16 @@ _WIDE = 0.01
 
 
 @compiled
-def _grown(found: Int64Array, count: int) -> Int64Array:
-    """Room for one more row after so many."""
-    if count < len(found):
-        return found
-    larger = np.empty((2 * count, found.shape[1]), np.int64)
-    larger[:count] = found
-    return larger
+def _added(found: Int64Array, count: int, one: int, two: int, three: int = 0) -> Int64Array:
+    """Rows with one more after so many; where there is no room for it, they are copied."""
+    if count == len(found):
+        larger = np.empty((2 * count, found.shape[1]), np.int64)
+        larger[:count] = found
+        found = larger
+    found[count, 0], found[count, 1] = one, two
+    if found.shape[1] > 2:
+        found[count, 2] = three
+    return found
 
 
 @vectorized
@@ -263,9 +266,7 @@ def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64
     near, lit = np.empty(many, np.bool_), np.empty(many, np.int64)
     for b in range(len(beams)):
         for i in range(_lit_spheres(beams, b, points, 0, many, slack, near, lit)):
-            found = _grown(found, count)
-            found[count, 0], found[count, 1] = b, lit[i]
-            count += 1
+            found, count = _added(found, count, b, lit[i]), count + 1
     return found[:count].copy()
 
 
@@ -287,9 +288,7 @@ def lit_faces(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
             f = lit[i]
             # A plane does not reflect twice in a row.
             if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
-                found = _grown(found, count)
-                found[count, 0], found[count, 1] = b, f
-                count += 1
+                found, count = _added(found, count, b, f), count + 1
     return found[:count].copy()
 
 
@@ -324,9 +323,7 @@ def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
     shown = np.empty(targets[0].shape[1], np.int64)
     for w in range(len(views)):
         for i in range(_shown_sights(views, w, targets, shown)):
-            found = _grown(found, count)
-            found[count, 0], found[count, 1] = w, shown[i]
-            count += 1
+            found, count = _added(found, count, w, shown[i]), count + 1
     return found[:count].copy()
 
 
@@ -409,9 +406,7 @@ def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) 
                     twice = 2 * seen[own, 2, r]
                     x, y = points[r, 0] - twice * faces[4, f], points[r, 1] - twice * faces[5, f]
                     if crosses[r] and _in_pyramid(beams, b, x, y, points[r, 2] - twice * faces[6, f], slack):
-                        found = _grown(found, count)
-                        found[count, 0], found[count, 1], found[count, 2] = b, f, r
-                        count += 1
+                        found, count = _added(found, count, b, f, r), count + 1
     return found[:count].copy()
 
 
@@ -498,9 +493,7 @@ def ends_by_scenery(
                 if not near[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
                     continue
                 if _crossing(beams, b, targets, f, _height(beams, b, faces, f), seen[w], crosses):
-                    found = _grown(found, count)
-                    found[count, 0], found[count, 1] = b, w
-                    count += 1
+                    found, count = _added(found, count, b, w), count + 1
     return found[:count].copy()
 
 
@@ -545,9 +538,7 @@ def lit_edges(beams: Float64Array, own: Int64Array, edges: Edges, slack: float) 
     lit = np.empty(len(edges[3]), np.int64)
     for b in range(len(beams)):
         for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, lit)):
-            found = _grown(found, count)
-            found[count, 0], found[count, 1] = b, lit[i]
-            count += 1
+            found, count = _added(found, count, b, lit[i]), count + 1
     return found[:count].copy()
 
 
@@ -621,7 +612,5 @@ def meetings(
                 if not (_on_lit_side(beams, b, x, y, z, slack) and _on_lit_side(others, o, x, y, z, slack)):
                     continue
                 if _in_pyramid(beams, b, x, y, z, slack) and _in_pyramid(others, o, x, y, z, slack):
-                    found = _grown(found, count)
-                    found[count, 0], found[count, 1], found[count, 2] = b, e, o
-                    count += 1
+                    found, count = _added(found, count, b, e, o), count + 1
     return found[:count].copy()

@@ -113,8 +113,8 @@ class SceneFaces:
             normal,
             self._two_sided[planes],
         )
-        _, counts = np.unique(self._body_of[planes], return_counts=True)
-        return faces, counts
+        counts = np.bincount(self._body_of[planes])
+        return faces, counts[counts > 0]
 
 
 def _faces_of(scene: SionnaScene, planes: Int64Array) -> FaceRectangles:
