@@ -163,7 +163,8 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
         Args:
             now: Time [s].
         """
-        said = (re.search(r"to prepare\b.*?\((.+?)\)", stall.text) for stall in self._standing_now(now).values())
+        texts = (stall.text for stall in self._standing_now(now).values())
+        said = (re.search(r"to prepare\b.*?\((.+?)\)", text) for text in texts)
         return next((found[1] for found in said if found), "")
 
     def look(
