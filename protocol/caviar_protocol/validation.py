@@ -255,8 +255,7 @@ class ProductCheck:
     def digest(self, entry: GrantInput, header: bytes | memoryview, body: bytes | memoryview) -> None:
         """Compare the digest of one of the first products of a source with the one it stated.
 
-        A service that computes digests wrongly does so from the first frame on; the recorder compares all of
-        them.
+        A service that computes digests wrongly does so from the first frame on.
 
         Raises:
             ProductError: They differ.

@@ -18,9 +18,10 @@ from recording_builders import PERIOD_NS, absent, frame, link, product, record, 
 
 from caviar_protocol.codec import decode_payload
 from caviar_protocol.digest import payload_digest
-from caviar_protocol.errors import AssetError, RunError
+from caviar_protocol.errors import AssetError, ProductError, RunError
 from caviar_protocol.messages import GrantInput, Status
 from caviar_protocol.recording import FrameEntry, Recording
+from caviar_protocol.validation import FIRST_LOOKS
 from caviar_services.recorder.base import copy_assets
 from caviar_services.recorder.mcap import McapRecorder
 from caviar_services.registry import load
@@ -99,6 +100,25 @@ def test_a_missing_digest_is_computed(tmp_path):
     bare = msgspec.structs.replace(item.provenance, digest="")
     record(tmp_path, [frame(0, FrameInput(bare, item.header, item.body))])
     assert Recording(tmp_path).frame(0, 0).inputs[0].digest == item.provenance.digest
+
+
+def test_a_false_digest_of_a_large_product_is_refused_at_first_and_read_as_damage_later(tmp_path):
+    header, body = bytes(300), bytes(1 << 17)
+
+    def large(number: int, digest: str):
+        entry = GrantInput(topic="hold", source="s", status=Status.FRESH, frame=number, digest=digest)
+        return frame(number, FrameInput(entry, header, body))
+
+    made, right = recorder(tmp_path), payload_digest(header, body)
+    for number in range(FIRST_LOOKS - 1):
+        made.step(large(number, right))
+    with pytest.raises(ProductError, match=f"hold of 's', frame {FIRST_LOOKS - 1}"):
+        made.step(large(FIRST_LOOKS - 1, "0" * 64))
+    made.step(large(FIRST_LOOKS - 1, right))
+    made.step(large(FIRST_LOOKS, "0" * 64))
+    made.close()
+    (damage,) = Recording(tmp_path).run_digest().damage
+    assert f"frame {FIRST_LOOKS}" in damage
 
 
 def test_a_payload_that_was_never_encoded_is_written_as_its_wire_bytes(tmp_path):

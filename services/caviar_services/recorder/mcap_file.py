@@ -8,10 +8,11 @@ library writes what stands once in a file: metadata, schemas, channels and the s
 from __future__ import annotations
 
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
+
+from isal.isal_zlib import crc32
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -32,7 +33,7 @@ _OPCODE_MESSAGE, _OPCODE_CHUNK, _OPCODE_INDEX = 5, 6, 7
 class Stream(Protocol):
     """Stream to which the file is written."""
 
-    def write(self, data: bytes, /) -> int:
+    def write(self, data: bytes | memoryview, /) -> int:
         """Write all of it."""
 
     def tell(self) -> int:
@@ -154,17 +155,22 @@ class McapFile:
         """Write the chunk and its index; nothing where it has no message."""
         if not self._entries:
             return
-        content = b"".join(self._pieces)
-        stored = self._compress(content)
+        pieces, crc = self._pieces, 0
+        for piece in pieces:
+            crc = crc32(piece, crc)
+        if self._compression:
+            pieces = [self._compress(b"".join(pieces))]
+        stored = sum(map(len, pieces))
         times = [time for entries in self._entries.values() for time, _ in entries]
         first, last, start = min(times), max(times), self._stream.tell()
         name = self._compression
-        length = _CHUNK_FIELDS + len(name) + len(stored)
-        head = _CHUNK.pack(_OPCODE_CHUNK, length, first, last, len(content), zlib.crc32(content))
+        length = _CHUNK_FIELDS + len(name) + stored
+        head = _CHUNK.pack(_OPCODE_CHUNK, length, first, last, self._length, crc)
         self._stream.write(
-            b"".join((head, len(name).to_bytes(4, "little"), name, len(stored).to_bytes(8, "little")))
+            b"".join((head, len(name).to_bytes(4, "little"), name, stored.to_bytes(8, "little")))
         )
-        self._stream.write(stored)
+        for piece in pieces:  # not joined first: a frame has megabytes
+            self._stream.write(piece)
         begin = self._stream.tell()
         offsets, index = self._packed_index(begin)
         self._stream.write(index)
@@ -177,8 +183,8 @@ class McapFile:
                 "message_index_offsets": offsets,
                 "message_index_length": len(index),
                 "compression": name.decode(),
-                "compressed_size": len(stored),
-                "uncompressed_size": len(content),
+                "compressed_size": stored,
+                "uncompressed_size": self._length,
             }
         )
         self._pieces, self._length, self._entries = [], 0, {}
@@ -213,7 +219,7 @@ class McapFile:
             offset.write(summary)
         packed = summary.end()
         # The CRC covers the footer up to its own place.
-        crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), zlib.crc32(packed))
+        crc = crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), crc32(packed))
         footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc)
         self._stream.write(packed + _packed(footer) + MCAP0_MAGIC)
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 import os
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import msgspec
+from isal.isal_zlib import crc32
 
 from caviar_protocol.files import SYNC_PERIOD_S, Durability, sync_file
 from caviar_protocol.messages import Status
@@ -54,8 +54,8 @@ class _ChecksummedStream:
         self.crc = 0
         """CRC-32 of all bytes so far."""
 
-    def write(self, data: bytes) -> int:
-        self.crc = zlib.crc32(data, self.crc)
+    def write(self, data: bytes | memoryview) -> int:
+        self.crc = crc32(data, self.crc)
         return self._stream.write(data)
 
     def tell(self) -> int:
