@@ -182,13 +182,16 @@ def test_a_worker_tells_since_when_the_last_frame_ended(monkeypatch: pytest.Monk
 def test_what_a_service_does_that_prepares_is_found_in_what_a_worker_tells() -> None:
     scenario, told, phase = load_scenario("smoke"), SimpleQueue[str](), "launching, part 3 of 40, 9 s left"
     plan, cluster = plan_run(scenario, "run", briefings(scenario, Path())), Cluster()
-    grant = m.Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0)
-    for task, found in ((m.Prepare(epoch=1, attempt=1), phase), (grant, "")):
+
+    def phase_while(task: m.Message) -> str:
         work = ("channel", task)
-        with Watchdog(plan, {}, lambda work=work: work, told.put) as watchdog:
+        with Watchdog(plan, {}, lambda: work, told.put) as watchdog:
             watchdog.progress("channel", phase)
             watchdog.stop()
             about = {"episode": 3, "text": told.get(timeout=30), "stands_s": 12.0, "worker": "w"}
         cluster.watch.tell((0.0, about))
-        assert cluster.watch.phase(cluster.now) == found, about
+        return cluster.watch.phase(cluster.now)
+
+    assert phase_while(m.Prepare(epoch=1, attempt=1)) == phase
     assert cluster.watch.phase(cluster.now + 2 * REPORTED_S) == ""
+    assert phase_while(m.Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0)) == ""
