@@ -6,6 +6,7 @@ rendered documentation. Pages of the reference are generated before the sources 
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from functools import cache
@@ -39,6 +40,9 @@ suppress_warnings = [
 ]
 nitpicky = False  # names in docstrings may be those of other libraries
 
+# Nearly all of the objects of a document stay: a search for garbage among all of them finds little.
+gc.set_threshold(100_000, 20, 100)
+
 # --- Markdown ---
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4
@@ -70,11 +74,17 @@ highlight_language = "none"
 
 
 class QuickPythonDomain(PythonDomain):
-    """The Python domain, with a search for names that skips the scan of all objects where none can match.
+    """The Python domain, which looks for a name among those that end with its last word.
 
-    Sphinx compares every builtin of every signature (``int``, ``str``) with each of some thousand objects,
-    which took most of the time of a build.
+    Sphinx compares every name of every signature (``int``, ``str``) with each of some thousand objects.
     """
+
+    _found: dict[str, Any] | None = None
+
+    @property
+    def objects(self) -> dict[str, Any]:
+        """Objects by full name; within `find_obj`, those that may be meant."""
+        return super().objects if self._found is None else self._found
 
     def find_obj(
         self, env: Any, modname: Any, classname: Any, name: str, kind: Any, searchmode: int = 0
@@ -82,10 +92,14 @@ class QuickPythonDomain(PythonDomain):
         """Objects that a name may mean."""
         if len(self.objects) != getattr(self, "_counted", -1):
             self._counted = len(self.objects)
-            self._last_words = {full.rpartition(".")[2] for full in self.objects}
-        if name.removesuffix("()").rpartition(".")[2] not in self._last_words:
-            return []
-        return super().find_obj(env, modname, classname, name, kind, searchmode)
+            self._by_last_word: dict[str, dict[str, Any]] = {}
+            for full, entry in self.objects.items():
+                self._by_last_word.setdefault(full.rpartition(".")[2], {})[full] = entry
+        self._found = self._by_last_word.get(name.removesuffix("()").rpartition(".")[2], {})
+        try:
+            return super().find_obj(env, modname, classname, name, kind, searchmode)
+        finally:
+            self._found = None
 
 
 def setup(app: Any) -> None:
