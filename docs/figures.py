@@ -144,8 +144,8 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         {"tradeoff-keyframes": "keyframes"},
     ),
     "learner": Measurement(
-        "python tests/bench/bench_learner.py --markdown {out}/learner.md",
-        "python tests/bench/bench_learner.py --markdown {out}/learner.md",
+        "python tests/bench/bench_learner.py district --frames 60 --seeds 2 --markdown {out}/learner.md",
+        "python tests/bench/bench_learner.py district --frames 200 --markdown {out}/learner.md",
         "learner.md",
         {"learner": ""},
     ),

@@ -30,6 +30,9 @@ from caviar_space.meshes import Mesh
 _Plane: TypeAlias = tuple[float, float, float, float]
 _Corners: TypeAlias = tuple[int, int, int]
 
+LARGEST_TOLERANCE = 1 / 16
+"""Of `with_few_faces`, in sides of the box."""
+
 # Cosine of the largest turn of a triangle's normal by one move: it is not turned inside out.
 _TURN = 0.2
 
@@ -73,6 +76,30 @@ def decimated(mesh: Mesh, tolerance_m: float) -> Mesh:
     """
     mesh = welded(mesh)
     return _used(_Decimation(mesh, tolerance_m).run())
+
+
+def with_few_faces(mesh: Mesh, most: int) -> tuple[Mesh, float]:
+    """Decimate a unit mesh by the least tolerance that leaves few enough faces: 1/2048, 1/1024, … of its box.
+
+    Args:
+        mesh: Within −½ … ½ on every axis.
+        most: Faces.
+
+    Returns:
+        The mesh, and the tolerance in sides of its box: 0 where it has as few already, at most
+        `LARGEST_TOLERANCE`, which may leave more faces.
+
+    Example:
+        >>> from caviar_space.meshes import unit_box
+        >>> with_few_faces(unit_box(), 12)[1]
+        0.0
+    """
+    if len(mesh.faces) <= most:
+        return mesh, 0.0
+    tolerance = 1 / 2048
+    while len((found := decimated(mesh, tolerance)).faces) > most and tolerance < LARGEST_TOLERANCE:
+        tolerance *= 2
+    return found, tolerance
 
 
 def _used(mesh: Mesh) -> Mesh:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from caviar_protocol.arrays import Float64Array
-from caviar_space.mesh_detail import decimated, welded
-from caviar_space.meshes import Mesh, box, unit_box
+from caviar_services.channel.sionna.scene_loading import BodyPool, ObjectMaterials
+from caviar_space.mesh_detail import LARGEST_TOLERANCE, decimated, welded, with_few_faces
+from caviar_space.meshes import Mesh, box, ply, unit_box
 
 pytestmark = pytest.mark.slow
 
@@ -141,3 +143,29 @@ def test_welding_joins_places_and_drops_what_collapses() -> None:
     mesh = welded(Mesh(corners, np.array([[0, 1, 2], [3, 4, 2], [0, 3, 1]], np.int32)))
     assert len(mesh.vertices) == 3
     assert len(mesh.faces) == 2
+
+
+def test_few_faces_take_the_least_tolerance_that_leaves_them() -> None:
+    ball = Mesh(sphere(4).vertices / 2, sphere(4).faces)
+    few, off = with_few_faces(ball, 300)
+    assert len(few.faces) <= 300 < len(decimated(ball, off / 2).faces)
+    assert 0 < off < LARGEST_TOLERANCE
+    # Corners that stay are those of the ball, and no side of a hole comes up.
+    assert {*map(tuple, few.vertices.tolist())} <= {*map(tuple, ball.vertices.tolist())}
+    assert set(sides(few).values()) == {2}
+    assert with_few_faces(ball, 8)[1] == LARGEST_TOLERANCE
+
+
+def test_bodies_of_objects_have_few_faces_and_say_so(tmp_path: Path) -> None:
+    assets = {}
+    for name, mesh in {"ball": Mesh(sphere(4).vertices / 2, sphere(4).faces), "brick": unit_box()}.items():
+        assets[f"objects/{name}.ply"] = tmp_path / name
+        assets[f"objects/{name}.ply"].write_bytes(ply(mesh))
+    pool = BodyPool(assets, dict.fromkeys(assets, 1), {}, ObjectMaterials(), {}, (), 300)
+    faces = {name: len(mesh.faces) for name, mesh in pool.meshes.items()}
+    assert faces["objects/brick.ply"] == 12
+    assert faces["objects/ball.ply"] <= 300
+    (note,) = pool.notes
+    assert f"'objects/ball.ply': 2,048 → {faces['objects/ball.ply']} faces" in note
+    pool.use_meshes({"objects/later.ply": assets["objects/ball.ply"]})
+    assert "'objects/later.ply': 2,048 →" in pool.notes[1]

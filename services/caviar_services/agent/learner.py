@@ -68,6 +68,7 @@ class Perceptron:
     Args:
         sizes: Number of features, of the units of each hidden layer, and of choices.
         generator: Draws the weights, of He et al. ("Delving deep into rectifiers", ICCV 2015).
+        first: Factor of those of the last layer; 0: every choice is worth 0 until something is learnt.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -79,14 +80,14 @@ class Perceptron:
         [0, 1]
     """
 
-    def __init__(self, sizes: Sequence[int], generator: np.random.Generator) -> None:
+    def __init__(self, sizes: Sequence[int], generator: np.random.Generator, first: float = 0.1) -> None:
         self._parameters: list[Float64Array] = []
         for inputs, outputs in pairwise(sizes):
             self._parameters += [
                 generator.standard_normal((inputs, outputs)) * np.sqrt(2 / inputs),
                 np.zeros(outputs),
             ]
-        self._parameters[-2] *= 0.1  # at first all choices are worth much the same
+        self._parameters[-2] *= first  # at first all choices are worth much the same
         self._means = [np.zeros_like(p) for p in self._parameters]
         self._squares = [np.zeros_like(p) for p in self._parameters]
         self.updates = 0
@@ -413,7 +414,9 @@ class LearnerAgent(PilotAgent[LearnerSettings]):
             seed, episode = self._episode
             stream = f"{self.run.name}/weights/{key.carrier}/{key.beams[0]}/{key.beams[1]}"
             sizes = features, *self.settings.hidden, key.beams[0] * key.beams[1]
-            network = Perceptron(sizes, generator(seed, episode, stream))
+            # With a policy it is what that lacks, and ranks nothing before it has learnt something.
+            first = 0.1 if self._policy is None else 0.0
+            network = Perceptron(sizes, generator(seed, episode, stream), first)
             model = self._models[key] = Model(network, features, self.settings.memory)
         return model
 

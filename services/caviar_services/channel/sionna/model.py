@@ -190,6 +190,7 @@ class SionnaChannel(PathModel[SionnaSettings]):
                 free_edges=s.free_edges,
                 solid_walls_m=s.solid_walls_m,
                 detail=s.detail,
+                object_faces=s.object_faces,
                 objects=self._keys["object_materials"],
                 foliage=foliage,
                 pool_keys={asset: s.pool_key(asset, place) for asset in self._room},

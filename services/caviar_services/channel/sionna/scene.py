@@ -100,6 +100,7 @@ class SceneSettings:
     free_edges: bool = False
     """Whether the rims of open surfaces are edges too."""
     detail: DetailSettings = field(default_factory=DetailSettings)
+    object_faces: int | None = None
     """What of the scenery is left out."""
     solid_walls_m: float | None = None
     """Closed plates up to this thickness are one slab of it; None: a slab for each of their faces."""
@@ -156,7 +157,10 @@ class SionnaScene(NumberedTriangles):
         shapes, self.detail_effect = with_detail(full, settings.detail, key)
         self.low, self.high = bounds(shapes)
         # Made after the scenery was read, whose faults are named first.
-        self._pool = BodyPool(assets, pool, settings.pool_keys, self._objects, own, made)
+        self._pool = BodyPool(
+            assets, pool, settings.pool_keys, self._objects, own, made, settings.object_faces
+        )
+        self.notes += self._pool.notes
         self._at_rest = shapes
         self._standing: frozenset[Body] = frozenset()
         self.turning: Turning | None = None

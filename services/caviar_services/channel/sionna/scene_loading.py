@@ -42,7 +42,7 @@ from caviar_space.materials import (
     of_thickness,
     without_thickness,
 )
-from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed
+from caviar_space.mesh_detail import DetailEffect, DetailSettings, detailed, with_few_faces
 from caviar_space.meshes import (
     Body,
     Mesh,
@@ -512,6 +512,7 @@ class BodyPool:
         objects: Materials of objects that differ from the others.
         own: Materials that meshes name in their files, by asset (`own_materials`).
         materials: Names of all materials that bodies may have: there are bodies for each.
+        most_faces: Of a mesh (`with_few_faces`); None: any.
 
     Raises:
         AssetError: A file is no mesh.
@@ -525,11 +526,15 @@ class BodyPool:
         objects: ObjectMaterials,
         own: Mapping[str, str],
         materials: Collection[str],
+        most_faces: int | None = None,
     ) -> None:
         self._objects = objects
         self._own_materials = own
         self._later = _LaterMeshes()
-        units = object_meshes(assets)
+        self._most_faces = most_faces
+        self.notes: tuple[str, ...] = ()
+        """What became of meshes with more faces."""
+        units = self._read(assets)
         # Each material of bodies is a shape of its own, with a pool of its own.
         kinds = {(asset, m): body_kind(asset, m) for m in ("", *materials) for asset in sorted(pool)}
         self._keys = {kind: keys.get(asset, "") for (asset, _), kind in kinds.items()}
@@ -582,10 +587,19 @@ class BodyPool:
             AssetError: A file is no mesh.
         """
         self._later = _LaterMeshes(
-            meshes=object_meshes(meshes),
+            meshes=self._read(meshes),
             materials=own_materials(meshes),
             changed=True,
         )
+
+    def _read(self, files: Mapping[str, Path]) -> dict[str, Mesh]:
+        meshes, most = object_meshes(files), self._most_faces
+        for name, mesh in meshes.items() if most else ():
+            meshes[name], off = with_few_faces(mesh, most or 0)
+            if off:
+                faces = f"{len(mesh.faces):,} → {len(meshes[name].faces):,} faces"
+                self.notes += (f"mesh {name!r}: {faces}, within {off:.2%} of its sides (object_faces)",)
+        return meshes
 
     def make_room(self, scene: Scene, solid: Sequence[int]) -> bool:
         """Make bodies where a frame has more objects of a kind than there are bodies.
