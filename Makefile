@@ -65,7 +65,7 @@ DOCS     := $(if $(wildcard $(STAMP)),$(BIN),.venvs/docs/bin)
 	@touch $@
 
 docs: $(DOCS)/sphinx-build ## Render the documentation; build/docs/index.html opens without a server
-	@$(DOCS)/sphinx-build --quiet --fail-on-warning --keep-going --jobs=auto -c docs . build/docs
+	@$(DOCS)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . build/docs
 	@echo "build/docs/index.html"
 
 doctor: setup ## What this machine has, and what mends what it lacks

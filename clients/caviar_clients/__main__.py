@@ -6,6 +6,7 @@ import sys
 if __name__ == "__main__" and not sys.flags.safe_path:
     del sys.path[0]
 
+import gc
 import os
 import signal
 from types import FrameType
@@ -22,8 +23,11 @@ def main() -> None:
     without a traceback: nothing runs yet that would have to be ended first.
     """
     signal.signal(signal.SIGINT, _leave)
+    gc.disable()
     from caviar_clients.cli.main import main as command
 
+    gc.freeze()  # what is loaded stays: no collection looks at it
+    gc.enable()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     command()
 

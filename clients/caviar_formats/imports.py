@@ -1,7 +1,7 @@
 """Datasets from files of other programs: what a format reads, and the one place that writes it.
 
-A format yields `ImportedScene`s. They are played as a run whose world and channel are those of the files, so
-that the product's own recorder writes them, and link and catalogue are made as of any other dataset.
+A format yields objects of `ImportedScene`. They are played as a run whose world and channel are those of
+the files, so that the product's own recorder writes them; link and catalogue are made as of other datasets.
 """
 
 from __future__ import annotations

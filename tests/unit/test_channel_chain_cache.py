@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
+import pytest
 
 from caviar_services.channel.enumeration.scenery_chains import ChainCache, cache_key
 
@@ -22,6 +25,36 @@ def test_what_was_saved_is_loaded(tmp_path: Path) -> None:
     assert all(np.array_equal(one, other) for one, other in zip(loaded, TABLES, strict=True))
     assert [path.name for path in (tmp_path / "chains").iterdir()] == [KEY]
     assert cache.notes == []
+
+
+def test_what_two_launch_at_once_is_launched_by_one(tmp_path: Path) -> None:
+    told, found = SimpleQueue[str](), list[object]()
+
+    def wait_for_the_other() -> None:
+        cache = ChainCache(tmp_path)
+        with cache.launching(KEY, told.put):
+            found.append(cache.load(KEY, (3, 2)))
+
+    other = threading.Thread(target=wait_for_the_other)
+    cache = ChainCache(tmp_path)
+    with cache.launching(KEY, lambda _: None) as tell, cache.launching(cache_key(b"another"), print):
+        tell("launching part 3")
+        other.start()
+        assert "launching part 3" in told.get(timeout=30)
+        assert found == []
+        cache.save(KEY, TABLES)
+    other.join(30)
+    assert found[0] is not None
+    assert [path.name for path in tmp_path.iterdir()] == [KEY]
+
+
+def test_where_no_lock_can_be_had_each_launches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    os.mkfifo(tmp_path / f"{KEY}.lock")
+    for folder in (tmp_path, tmp_path / "file" / "chains"):
+        with ChainCache(folder).launching(KEY, print) as tell:
+            tell("part 3")
+    assert capsys.readouterr().out == "part 3\npart 3\n"
 
 
 def test_empty_tables_too(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -130,6 +131,19 @@ def test_a_command_loads_no_other_and_the_help_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n[]\n"
+
+
+def test_the_list_of_commands_is_made_without_their_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    root: Any = typer.main.get_command(app)
+    context = root.context_class(root)
+    whole = {name: root.get_command(context, name) for name in commands._own}
+    assert len(whole) > 8
+    assert all(len(command.get_params(context)) > (name != "scenarios") for name, command in whole.items())
+    monkeypatch.setattr(commands, "get_command_from_info", None)
+    lines = "\n".join(help_lines())
+    for name, command in whole.items():
+        first = command.get_short_help_str(400)
+        assert re.search(rf" {name} +{re.escape(first)}", lines), name
 
 
 def test_help_is_shown_as_it_is_written() -> None:

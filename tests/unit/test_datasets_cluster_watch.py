@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 
+from caviar_broker.core.plan import briefings, plan_run
 from caviar_clients.datasets import cluster_watch
 from caviar_clients.datasets.cluster_watch import (
     LOOK_S,
@@ -16,7 +19,10 @@ from caviar_clients.datasets.cluster_watch import (
     ClusterWatch,
     StepWatch,
 )
+from caviar_clients.session.watchdog import Watchdog
+from caviar_protocol import messages as m
 from caviar_protocol.errors import RunError
+from caviar_protocol.scenario import load_scenario
 
 ADDRESS = "tcp://10.0.0.1:8786"
 
@@ -171,3 +177,21 @@ def test_a_worker_tells_since_when_the_last_frame_ended(monkeypatch: pytest.Monk
     watch.waits("waiting")
     about = {"episode": 3, "text": "waiting", "stands_s": 10.0, "worker": Worker.address}
     assert told == [(cluster_watch.TOPIC, about)]
+
+
+def test_what_a_service_does_that_prepares_is_found_in_what_a_worker_tells() -> None:
+    scenario, told, phase = load_scenario("smoke"), SimpleQueue[str](), "launching, part 3 of 40, 9 s left"
+    plan, cluster = plan_run(scenario, "run", briefings(scenario, Path())), Cluster()
+
+    def phase_while(task: m.Message) -> str:
+        work = ("channel", task)
+        with Watchdog(plan, {}, lambda: work, told.put) as watchdog:
+            watchdog.progress("channel", phase)
+            watchdog.stop()
+            about = {"episode": 3, "text": told.get(timeout=30), "stands_s": 12.0, "worker": "w"}
+        cluster.watch.tell((0.0, about))
+        return cluster.watch.phase(cluster.now)
+
+    assert phase_while(m.Prepare(epoch=1, attempt=1)) == phase
+    assert cluster.watch.phase(cluster.now + 2 * REPORTED_S) == ""
+    assert phase_while(m.Grant(epoch=1, attempt=1, episode=0, frame=3, t_ns=0)) == ""

@@ -8,14 +8,18 @@ imports stand in the function. A name that `caviar` itself has is not replaced.
 
 from __future__ import annotations
 
+import inspect
 import pkgutil
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import EntryPoint
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
 from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup, TyperOption
+from typer.main import get_command_from_info, get_group, solve_typer_info_help
+from typer.models import CommandInfo, TyperInfo
 
 from caviar_protocol.errors import DeclarationError, one_line
 from caviar_protocol.host import DISTRIBUTION
@@ -38,6 +42,26 @@ GROUPS = {
     "keys": (OPERATE, "caviar_clients.cli.keys:app", "Keys: who may take part in a run, and as what."),
 }  # fmt: skip
 """Panel, place and help of groups that are imported when one of their commands is typed."""
+
+F = TypeVar("F", bound=Callable[..., None])
+_own: dict[str, CommandInfo] = {}
+
+
+def command(panel: str, cls: type[TyperCommand] = TyperCommand) -> Callable[[F], F]:
+    """Make a function a command of `caviar` itself, by its name; what it takes is looked at when it is typed.
+
+    Args:
+        panel: Panel in the help.
+        cls: Of the command.
+    """
+
+    def keep(function: F) -> F:
+        name = function.__name__
+        _own[name] = CommandInfo(name, cls=cls, callback=function, rich_help_panel=panel)
+        return function
+
+    return keep
+
 
 _OWN_PANELS = {"caviar_labs": LABORATORIES, "caviar_formats": DATASETS, "caviar_scenes": RUN}
 
@@ -67,7 +91,7 @@ class LazyGroup(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         if not self.commands:
-            self.commands.update(typer.main.get_group(pkgutil.resolve_name(self._target)).commands)
+            self.commands.update(get_group(pkgutil.resolve_name(self._target)).commands)
         return super().list_commands(ctx)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -82,19 +106,29 @@ class Commands(TyperGroup):
         super().__init__(**attributes)
         self.commands.update({name: LazyGroup(name, *entry) for name, entry in GROUPS.items()})
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        for name, info in _own.items():  # their options, which are not shown, take as long as all the rest
+            text = inspect.getdoc(info.callback)
+            self.commands[name] = TyperCommand(name, help=text, rich_help_panel=info.rich_help_panel)
+        super().format_help(ctx, formatter)
+
     def list_commands(self, ctx: Any) -> list[str]:
-        names = dict.fromkeys([*self.commands, *sorted(added())])
+        names = dict.fromkeys([*_own, *self.commands, *sorted(added())])
         shown = {name: self.get_command(ctx, name) for name in names if name not in FORMER}
         return sorted(shown, key=lambda name: PANELS.index(shown[name].rich_help_panel))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         first, *rest = FORMER.get(cmd_name, cmd_name).split(" ")
-        command = self.commands.get(first) or added_command(first)
-        return command.get_command(ctx, *rest) if rest and isinstance(command, TyperGroup) else command
+        if first in _own and first not in self.commands:
+            self.commands[first] = get_command_from_info(
+                _own[first], pretty_exceptions_short=False, rich_markup_mode=self.rich_markup_mode
+            )
+        found = self.commands.get(first) or added_command(first)
+        return found.get_command(ctx, *rest) if rest and isinstance(found, TyperGroup) else found
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if self.get_command(ctx, args[0]) is None:  # Typer suggests what is in self.commands
-            self.commands.update({name: self.get_command(ctx, name) for name in (*FORMER, *added())})
+            self.commands.update({name: self.get_command(ctx, name) for name in (*_own, *FORMER, *added())})
         return super().resolve_command(ctx, args)
 
 
@@ -104,7 +138,11 @@ def added() -> dict[str, list[EntryPoint]]:
     found: dict[str, list[EntryPoint]] = {}
     for point in claims(ENTRY_POINT_GROUP):
         found.setdefault(point.name, []).append(point)
-    return {name: [p for p in points if _is_own(p)] or points for name, points in found.items()}
+    # A name that one claims needs no look at whose it is, which reads the metadata of that distribution.
+    return {
+        name: (len(points) > 1 and [p for p in points if _is_own(p)]) or points
+        for name, points in found.items()
+    }
 
 
 @cache
@@ -122,20 +160,25 @@ def added_command(name: str) -> Any:
     if points is None:
         return None
     panel = _OWN_PANELS.get(points[0].module.partition(".")[0], PLUG_INS)
-    sources = " and ".join(f"{p.value} of {p.dist.name} {p.dist.version}" for p in points if p.dist)
     if len(points) > 1:
-        return _refusing(name, panel, f"{name} is {sources}; uninstall one of them")
+        return _refusing(name, panel, f"{name} is {_sources(points)}; uninstall one of them")
     holder = typer.Typer()
     try:
         loaded = points[0].load()
+        if isinstance(loaded, typer.Typer) and panel != PLUG_INS:
+            return LazyGroup(name, panel, points[0].value, solve_typer_info_help(TyperInfo(loaded)))
         if isinstance(loaded, typer.Typer):
             holder.add_typer(loaded, name=name, rich_help_panel=panel)
         else:
             holder.command(name, rich_help_panel=panel)(loaded)
-        return typer.main.get_group(holder).commands[name]
+        return get_group(holder).commands[name]
     except (Exception, SystemExit) as error:  # whatever a module of others does when it is imported
         reason = f"{type(error).__name__}: {one_line(str(error))}"
-        return _refusing(name, panel, f"{name} is {sources}, which cannot be loaded: {reason}")
+        return _refusing(name, panel, f"{name} is {_sources(points)}, which cannot be loaded: {reason}")
+
+
+def _sources(points: list[EntryPoint]) -> str:
+    return " and ".join(f"{p.value} of {p.dist.name} {p.dist.version}" for p in points if p.dist)
 
 
 def _is_own(point: EntryPoint) -> bool:

@@ -368,11 +368,11 @@ class _Screen:
             self._bar.remove_task(self._traffic)
             self._traffic = None
 
-    def tried(self, done: int, of: int) -> None:
+    def tried(self, done: int, of: int, phase: str) -> None:
         """See `generate.Observer`."""
         if self._trials is None:
             self._trials = self._bar.add_task("workers ready", total=of, rate="", left="")
-        self._bar.update(self._trials, completed=done)
+        self._bar.update(self._trials, completed=done, left=phase)
 
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """See `generate.Observer`."""

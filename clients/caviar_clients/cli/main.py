@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from caviar_clients.cli.commands import LOOK, OPERATE, RUN, AttachingCommand, Commands
+from caviar_clients.cli.commands import LOOK, OPERATE, RUN, AttachingCommand, Commands, command
 from caviar_clients.cli.shared import (
     Attach,
     Embedded,
@@ -96,7 +96,7 @@ def _started_anew(resume: Path | None, scenario: Path | None, *others: object) -
     return scenario or Path()
 
 
-@app.command(cls=AttachingCommand, rich_help_panel=RUN)
+@command(RUN, AttachingCommand)
 def run(
     scenario: ScenarioOrNone = None,
     frames: Frames = None,
@@ -139,7 +139,7 @@ def run(
     raise typer.Exit(ended.status)
 
 
-@app.command(rich_help_panel=LOOK)
+@command(LOOK)
 def view(
     source: Shown,
     beside: Annotated[
@@ -180,7 +180,7 @@ def view(
         viewer.view(source, beside, http, keys, save, limit, episode, browser)
 
 
-@app.command(rich_help_panel=RUN)
+@command(RUN)
 def scenarios() -> None:
     """List the scenarios that ship: what each is, and which extras it needs."""
     from caviar_clients.cli.scenarios import list_scenarios
@@ -188,7 +188,7 @@ def scenarios() -> None:
     list_scenarios(_console)
 
 
-@app.command(rich_help_panel=RUN)
+@command(RUN)
 def new(
     name: Annotated[str, typer.Argument(help="name of the scenario, or path of its file")],
     scene: Annotated[
@@ -203,7 +203,7 @@ def new(
     typer.echo(f"{path} is a scenario to edit; run it with: caviar run {path}")
 
 
-@app.command(rich_help_panel=RUN)
+@command(RUN)
 def schema(
     out: Annotated[Path | None, typer.Option(help="write the schema to this file")] = None,
 ) -> None:
@@ -220,7 +220,7 @@ def schema(
         write_file(out, text + "\n")
 
 
-@app.command(rich_help_panel=OPERATE)
+@command(OPERATE)
 def broker(
     scenario: ScenarioOrNone = None,
     bind: Annotated[
@@ -249,7 +249,7 @@ def broker(
     raise typer.Exit(serve_broker(source, out, frames, seed, pace, bind, keys, options))
 
 
-@app.command(rich_help_panel=OPERATE)
+@command(OPERATE)
 def service(
     name: Annotated[str, typer.Argument(help="name of the service in the scenario")],
     use: Annotated[str, typer.Option(help="implementation, as ROLE:NAME, for example channel:sionna-rt")],
@@ -274,7 +274,7 @@ def service(
     raise typer.Exit(serve(name, use, broker, connect_timeout, key, broker_key, restarted=restarted))
 
 
-@app.command(rich_help_panel=LOOK)
+@command(LOOK)
 def status(
     run: Annotated[
         Path | None, typer.Argument(help="directory of a run; by default the newest in ./runs")
@@ -286,9 +286,13 @@ def status(
     why_command(run, _console)
 
 
-@app.command(rich_help_panel=OPERATE)
+@command(OPERATE)
 def doctor(
     run: Annotated[Path | None, typer.Argument(help="directory of a damaged run", show_default=False)] = None,
+    warm: Annotated[
+        bool,
+        typer.Option("--warm", help="compile the channel's loops, for which a first run else waits"),
+    ] = False,
 ) -> None:
     """Check what this machine has, or say what of a damaged RUN can be read, and save that beside it."""
     if run is not None:
@@ -297,12 +301,14 @@ def doctor(
         raise typer.Exit(rescue_run(run, _console))
     from caviar_clients.cli import doctor as checks
 
+    if warm:
+        checks.warm(_console)
     found = checks.doctor()
     checks.render(found, _console)
     raise typer.Exit(checks.exit_status(found))
 
 
-@app.command(rich_help_panel=LOOK)
+@command(LOOK)
 def inspect(
     run: RunDirectory,
     digest: Annotated[bool, typer.Option("--digest", help="only the digest, from the payloads")] = False,
@@ -411,7 +417,7 @@ def video(
     typer.echo(f"{film.file}: {film.frames} frames of {film.size[0]}×{film.size[1]}, {pace}")
 
 
-@app.command(rich_help_panel=RUN)
+@command(RUN)
 def replay(
     run: RunDirectory,
     replace: Annotated[

@@ -91,15 +91,15 @@ class Episodes:
         self,
         function: Callable[..., Any],
         *arguments: Any,
-        on_result: Callable[[int, int], None] = lambda done, of: None,
+        on_look: Callable[[int, int, str], None] = lambda done, of, phase: None,
     ) -> list[Any]:
         """Call a function once in every worker at the same time.
 
         Args:
             function: Which can be pickled.
             arguments: Of it.
-            on_result: Called at the beginning, and with each result, with their number so far and that of
-                the workers.
+            on_look: Called about every second with the number of results so far, that of the workers, and
+                what a service says that it does where it prepares for seconds.
 
         Returns:
             What it returned, by worker; those that are gone meanwhile are left out.
@@ -116,11 +116,11 @@ class Episodes:
         }
         self._watch.progressed(time.monotonic())
         found, workers = list[Any](), len(pending)
-        on_result(0, workers)
+        on_look(0, workers, "")
         try:
-            for result in self._tried(pending):
-                found.append(result)
-                on_result(len(found), workers)
+            while pending:
+                found += self._tried(pending)
+                on_look(len(found), workers, self._watch.phase(time.monotonic()))
         except (LostSchedulerError, OSError, TimeoutError) as error:
             raise RunError(
                 f"the Dask scheduler {self._where} was lost while scenes were tried "
@@ -133,19 +133,20 @@ class Episodes:
             )
         return found
 
-    def _tried(self, pending: dict[Future, str]) -> Iterator[Any]:
-        """Yield results of trials, as they end."""
+    def _tried(self, pending: dict[Future, str]) -> list[Any]:
+        """Results of the trials that have ended, which are no longer pending, after a second at most."""
+        ended = self._ended(pending)
+        for future in ended:
+            del pending[future]
+        found = [self._result_of_trial(future) for future in ended]
         what = "scenes have been tried beforehand, at every worker,"
-        while pending:
-            for future in self._ended(pending):
+        for stall in self._watch.look(time.monotonic(), what, None).values():
+            raise RunError(f"no scene can be played: {stall.error}")
+        # No other worker may have the task of one that is gone.
+        if there := self._watch.present:
+            for future in [one for one, address in pending.items() if address not in there]:
                 del pending[future]
-                yield self._result_of_trial(future)
-            for stall in self._watch.look(time.monotonic(), what, None).values():
-                raise RunError(f"no scene can be played: {stall.error}")
-            # No other worker may have the task of one that is gone.
-            if there := self._watch.present:
-                for future in [one for one, address in pending.items() if address not in there]:
-                    del pending[future]
+        return found
 
     def _result_of_trial(self, future: Future) -> Any:
         if future.status == "finished":

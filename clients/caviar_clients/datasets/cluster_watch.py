@@ -7,6 +7,7 @@ the command reads the clock.
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -155,6 +156,16 @@ had no worker for 30 s: start one with dask worker tcp://10.0.0.1:8786 --nthread
                 self._stalls[episode] = Stall(text, s, worker, self.clock())
             case _:  # of another version of CAVIAR at a worker: it tells nothing that could be used
                 pass
+
+    def phase(self, now: float) -> str:
+        """Name what a service does that has prepared for seconds, as it says; empty: none has.
+
+        Args:
+            now: Time [s].
+        """
+        texts = (stall.text for stall in self._standing_now(now).values())
+        said = (re.search(r"to prepare\b.*?\((.+?)\)", text) for text in texts)
+        return next((found[1] for found in said if found), "")
 
     def look(
         self, now: float, what: str, episodes: Collection[int] | None, *, mean_s: float = 0.0

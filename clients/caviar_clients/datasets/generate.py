@@ -42,8 +42,9 @@ class Observer(Protocol):
     def traffic(self, now_s: float, end_s: float) -> None:
         """Take the progress of the pass through the traffic [s]."""
 
-    def tried(self, done: int, of: int) -> None:
-        """Take the number of workers that have played their scenes for the estimate."""
+    def tried(self, done: int, of: int, phase: str) -> None:
+        """Take the number of workers that have played their scenes for the estimate, and what a service says
+        that it does, where that takes seconds: it launches rays, with the time that is left."""
 
     def estimated(self, found: Estimate, free: int | None, episodes: int, workers: int) -> None:
         """Take the estimate of what is left, and the free space of the disk [B]; None: of an address."""
@@ -221,7 +222,7 @@ def _estimate(
     observer.note(f"{workers} started: each loads the scenery and tries three scenes for an estimate …")
     cached = {name: data for number in tried for name, data in traffic.states_of(number).items()}
     trials = episodes.run_on_each(
-        try_worker, plan.scenario, ledger.place, tried, cached, on_result=observer.tried
+        try_worker, plan.scenario, ledger.place, tried, cached, on_look=observer.tried
     )
     good = [trial for trial in trials if trial.scenes]
     if not good:

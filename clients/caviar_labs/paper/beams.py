@@ -181,7 +181,7 @@ class _Silent:
     def traffic(self, now_s: float, end_s: float) -> None:
         self._progress(f"{self._what}: traffic", 0.0)
 
-    def tried(self, done: int, of: int) -> None:
+    def tried(self, done: int, of: int, phase: str) -> None:
         """Nothing is shown."""
 
     def estimated(self, found: object, free: int | None, episodes: int, workers: int) -> None:

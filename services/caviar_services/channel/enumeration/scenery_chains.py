@@ -22,9 +22,13 @@ tracer. Files are put in place in one step, and one that is damaged is launched 
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import math
-from collections.abc import Callable
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import astuple, dataclass, replace
 from functools import lru_cache, reduce
 from itertools import pairwise
@@ -382,13 +386,13 @@ class SceneryChains:
         )
         self._last: tuple[bytes, int, KnownScenery] | None = None
 
-    def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[int, int], None]) -> str:
+    def prepare(self, name: str, transmitter: Float64Array, progress: Callable[[str], None]) -> str:
         """Find the chains from where a transmitter stands, while no body is in the scene.
 
         Args:
             name: Of the transmitter.
             transmitter: Its position in the world [m], Shape ``[3]``.
-            progress: Called before each part with its number and the count of parts.
+            progress: Called with what is done, before each part of it.
 
         Returns:
             A note for the user on what was found.
@@ -397,14 +401,19 @@ class SceneryChains:
             return "there is no scenery"
         place = transmitter - self._scene.centre
         key = self._key(place)
-        known = self._cache.load(key, (self._options.max_depth, 2)) if self._cache else None
+        widths = (self._options.max_depth, 2)
+        known = self._cache.load(key, widths) if self._cache else None
         source = "of the cache"
         if known is None:
-            chains = launched_chains(self._scene, self._options, self._launch, place, progress)
-            known = chains, self._sights(chains, _SIGHT_RAYS)
-            source = f"of {self._launch.launches} launches of {self._launch.samples} rays"
-            if self._cache:
-                self._cache.save(key, known)
+            with self._cache.launching(key, progress) if self._cache else nullcontext(progress) as tell:
+                known = self._cache.load(key, widths) if self._cache else None
+                if known is None:
+                    parts = _Parts(f"launching scenery rays from {name!r}", tell)
+                    chains = launched_chains(self._scene, self._options, self._launch, place, parts)
+                    known = chains, self._sights(chains, _SIGHT_RAYS)
+                    source = f"of {self._launch.launches} launches of {self._launch.samples} rays"
+                    if self._cache:
+                        self._cache.save(key, known)
         chains, sights = known
         self._known[name] = transmitter, KnownScenery(chains, sights)
         return f"{len(chains)} chains of scenery {source}"
@@ -469,6 +478,18 @@ class SceneryChains:
         return cache_key(self._scene.scenery_digest, place.tobytes(), repr(options).encode())
 
 
+class _Parts:
+    """Tells before each part of a launch how many there are, and after the first how long they will take."""
+
+    def __init__(self, what: str, tell: Callable[[str], None]) -> None:
+        self._what, self._tell, self._began = what, tell, time.monotonic()
+
+    def __call__(self, part: int, parts: int) -> None:
+        left_s = (time.monotonic() - self._began) * (parts / part - 1) if part else 0.0
+        left = f", {left_s:.0f} s left" if part else ""
+        self._tell(f"{self._what}, part {part + 1} of {parts}{left}")
+
+
 def launched_chains(
     scene: SionnaScene,
     options: LaunchOptions,
@@ -529,6 +550,10 @@ def united(one: Int32Array, other: Int32Array) -> Int32Array:
 
 
 _FORMAT: Literal["caviar-chains-1"] = "caviar-chains-1"
+# [s] between looks at whether another process has launched, and for how long it is waited for: it may be
+# stopped. [B] of the file by which it tells what it does.
+_LOOK_S, _PATIENCE_S = 0.2, 600.0
+_TOLD_B = 200
 
 
 class _ChainFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -594,6 +619,39 @@ class ChainCache:
         self.notes.append(f"{WARNING}{path} is damaged; its chains are launched again")
         return None
 
+    @contextmanager
+    def launching(self, key: str, progress: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+        """A block in which no other process of this machine is with the same key, so that workers of a
+        dataset, which begin at once, launch the chains once.
+
+        Args:
+            key: From `cache_key`.
+            progress: Called with what the process does that is waited for, for `_PATIENCE_S` at most.
+
+        Yields:
+            What is called with what this process does: others are told it, too.
+        """
+        path, until = self._folder / f"{key}.lock", time.monotonic() + _PATIENCE_S
+        lock = -1
+
+        def tell(text: str) -> None:
+            with suppress(OSError):
+                os.pwrite(lock, text.encode().ljust(_TOLD_B), 0)
+            progress(text)
+
+        with ExitStack() as stack:
+            # Without a lock each launches for itself; `save` says what is wrong with the folder.
+            with suppress(OSError):
+                self._folder.mkdir(parents=True, exist_ok=True)
+                lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC)
+                stack.callback(os.close, lock)  # which unlocks it, as the end of the process does
+                while not _locked(lock) and time.monotonic() < until:
+                    told = os.pread(lock, _TOLD_B, 0).decode(errors="replace")
+                    progress(f"another process is {told.strip() or 'launching scenery rays'}")
+                    time.sleep(_LOOK_S)
+                stack.callback(path.unlink, missing_ok=True)
+            yield tell
+
     def save(self, key: str, tables: tuple[Int32Array, ...]) -> None:
         """Write the tables of a key; where that fails, a note says so."""
         packed = tuple([Packed.pack(table, "<i4") for table in tables])
@@ -606,6 +664,15 @@ class ChainCache:
                 f"{WARNING}chains cannot be kept in {self._folder} ({error.strerror}); the next run "
                 "launches them again, unless XDG_CACHE_HOME names a folder that can be written"
             )
+
+
+def _locked(file: int) -> bool:
+    """Lock an open file; whether no other process holds it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def cache_key(*parts: bytes) -> str:

@@ -151,19 +151,19 @@ class PathFinder:
         )
         if earlier is not None:
             return
+
+        def progress(phase: str) -> None:
+            self._run.progress(phase, COMPILE_GRACE_S)
+
         for device in transmitters:
             if not device.on:
                 name = device.name
-
-                def progress(part: int, parts: int, name: str = name) -> None:
-                    phase = f"launching scenery rays from {name!r}, part {part + 1} of {parts}"
-                    self._run.progress(phase, COMPILE_GRACE_S)
 
                 place = scene.surfaces.cleared(np.array(device.position_m))
                 with all_threads():
                     known = self._scenery.prepare(name, place, progress)
                 self.notes += (f"transmitter {name!r}: {known}",)
-        self.notes += tuple(cache.notes if cache else ())
+        self.notes += tuple(dict.fromkeys(cache.notes) if cache else ())
 
     def compile_kernels(self) -> None:
         """Trace above the scene, so that every kernel that frames need is compiled before the first one.
