@@ -61,7 +61,7 @@ def loop(signature: str) -> Callable[[F], F]:
 
 
 def compile_loops(progress: Callable[[int, int], None]) -> None:
-    """Compile all loops, some 20 s, or read from disk what was compiled before.
+    """Compile all loops, half a minute, or read from disk what was compiled before.
 
     Args:
         progress: Called before each loop with its number, from 0, and the count of loops.

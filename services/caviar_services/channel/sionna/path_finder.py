@@ -207,7 +207,8 @@ class PathFinder:
 
     def _compiling(self, number: int, count: int) -> None:
         phase = f"compiling kernels of enumeration {number + 1}/{count}"
-        self._run.progress(phase, COMPILE_GRACE_S)
+        # Up to ten seconds of a processor that other processes may share.
+        self._run.progress(phase, 3 * COMPILE_GRACE_S)
 
     def _enumerate_above(self, tracer: EnumeratedTracer, above: Float64Array) -> None:
         """Enumerate paths among two bodies of each mesh there, with a chain of scenery of each length."""
