@@ -77,6 +77,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "broker.md",
         {"broker-transports": ""},
     ),
+    "crowd": Measurement(
+        "python tests/bench/bench_crowd.py --frames 3 --markdown {out}/crowd.md",
+        "python tests/bench/bench_crowd.py --markdown {out}/crowd.md",
+        "crowd.md",
+        {"crowd": ""},
+    ),
     "datasets": Measurement(
         "python tests/bench/bench_datasets.py --seconds 20 --markdown {out}/datasets.md",
         "python tests/bench/bench_datasets.py --markdown {out}/datasets.md",

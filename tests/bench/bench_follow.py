@@ -84,7 +84,7 @@ def sionna_solver(model: Model, scene: Scene, samples: int) -> Callable[[Scene],
     import mitsuba as mi
     import sionna.rt as rt
 
-    traced = model.channel._scene._scene
+    traced = model.channel._scene.rt_scene
     traced.tx_array = traced.rx_array = rt.PlanarArray(
         num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
     )

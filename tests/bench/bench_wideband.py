@@ -168,7 +168,7 @@ def beside_sionna(frequency_hz: float, receivers: int = 10, rays: int = 1_000_00
 def _sionna_paths(model: Model, scene: Scene, r: int, rays: int) -> Any:
     import sionna.rt as rt
 
-    traced, (station,), ends = model.channel._scene._scene, antennas(scene, "tx"), antennas(scene, "rx")
+    traced, (station,), ends = model.channel._scene.rt_scene, antennas(scene, "tx"), antennas(scene, "rx")
     for name in (*traced.transmitters, *traced.receivers):
         traced.remove(name)
     traced.tx_array, traced.rx_array = (

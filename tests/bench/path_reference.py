@@ -93,13 +93,13 @@ class Sionna:
 
         self._channel = channel
         self._scene = channel._scene
-        self._traced = self._scene._scene
         self._rays, self._launches, self._depth = rays, launches, depth
         self._solver = rt.PathSolver()
 
     def __call__(self, scene: Scene) -> list[list[Path]]:
         """Paths of each receiver; the bodies are where the model placed them last."""
         self._channel._activate()
+        self._traced = self._scene.rt_scene
         self._arrange(scene)
         ends = [np.array(device_pose(scene, device).position) for device in self._devices(scene)]
         found: list[list[Path]] = [[] for _ in ends[1:]]

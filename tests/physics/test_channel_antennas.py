@@ -153,7 +153,7 @@ def solved(
         def __init__(self, patterns: list[Pattern]) -> None:
             self.patterns = patterns
 
-    traced, arrays = model._scene._scene, []  # type: ignore[attr-defined]
+    traced, arrays = model._scene.rt_scene, []  # type: ignore[attr-defined]
     for name, patterns, columns in (("given-tx", sent, 3), ("given-rx", taken, 1)):
         antenna_pattern_registry.register(lambda patterns=patterns: Given(patterns), name)
         arrays.append(rt.PlanarArray(num_rows=2, num_cols=columns, pattern=name))

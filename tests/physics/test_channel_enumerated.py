@@ -24,10 +24,11 @@ from caviar_labs.stability.lab import (
 )
 from caviar_protocol.codec import encode_payload
 from caviar_protocol.digest import payload_digest
+from caviar_protocol.errors import SetupError
 from caviar_protocol.scenario import DeviceSpec
 from caviar_protocol.topics import Channel, Interaction, Scene
 from caviar_services.channel.base import ChannelModel
-from caviar_services.channel.enumeration import scenery_chains
+from caviar_services.channel.enumeration import compiled_loops, scenery_chains
 from caviar_services.channel.sionna.model import SionnaChannel
 from caviar_services.channel.sionna.settings import SionnaSettings
 from caviar_services.service import Preparation, RunInfo
@@ -67,6 +68,14 @@ def street(
     folder.mkdir(exist_ok=True)
     prepared = model.prepare(Preparation(demand={}, assets=write_scenery(folder, plates)))
     return model, prepared.notes
+
+
+def test_a_missing_compiler_is_said_before_the_first_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiled_loops, "numba", None)
+    with pytest.raises(SetupError, match=r"Numba.*caviar-sim\[channel\]"):
+        street(tmp_path)
 
 
 def traffic(seed: int) -> Scene:

@@ -29,7 +29,8 @@ PACKAGES = (
 )
 HEAVY = (
     "mitsuba", "drjit", "sionna", "torch", "libsumo", "sumolib", "traci", "sumo", "matplotlib",
-    "scipy", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "nanoarrow", "PIL", "pyproj",
+    "scipy", "numba", "pytest", "hypothesis", "dask", "distributed", "duckdb", "h5py", "nanoarrow", "PIL",
+    "pyproj",
 )  # fmt: skip
 
 IMPORT_EVERYTHING = f"""
@@ -105,6 +106,7 @@ def _names(requirements: list[str]) -> set[str]:
 def test_users_are_asked_for_nothing_heavy_and_for_no_copyleft(repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
     heavy = {"sionna-rt", "mitsuba", "drjit", "eclipse-sumo", "libsumo", "torch", "matplotlib", "scipy"}
+    heavy.add("numba")
     assert not _names(project["dependencies"]) & heavy
     for extra, requirements in project["optional-dependencies"].items():
         if extra != "dev":  # GPL packages may at most be compared with in tests

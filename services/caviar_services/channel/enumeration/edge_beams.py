@@ -15,8 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 
@@ -26,36 +25,22 @@ from caviar_services.channel.enumeration.image_beams import (
     SceneryViews,
     Targets,
     by_scenery,
-    columns,
-    filtered,
     first_beams,
-    gathered,
-    indices,
-    lights_corner,
+    kernels,
     lit_bodies,
     longer_beams,
     next_beams,
-    numbers,
-    pairs,
-    places,
     reflected_beams,
     scenery_beams,
     shown_scenery,
+    spheres,
 )
-from caviar_services.channel.sionna import dr, mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.rectangles import FaceRectangles
-from caviar_space.vectors import ranges
 
 # Edges of scenery over which paths by way of bodies are enumerated; with more, rays look for such paths.
 _FEW = 512
-
-# Edges of a group at most; groups are tested by their spheres before edges are tested one by one.
-_GROUP = 12
-
-# Pairs of both sides that are tested together, so that memory is bounded.
-_AT_ONCE = 1 << 22
 
 # Offset of a plane that nothing is behind.
 _EVERYWHERE = -1e30
@@ -95,16 +80,16 @@ class EdgeTargets:
         """Surface of each face, Shape ``[F]``."""
         self.piece = piece[is_edge]
         """Of the body that each is of, −1 for scenery, in ascending order, Shape ``[E]``."""
-        line = self.ends[:, 1] - self.ends[:, 0]
-        length = np.sqrt((line**2).sum(1, keepdims=True))
-        rows = [self.ends[:, 0], self.ends[:, 1], line / length, length, *np.moveaxis(self.normals, 1, 0)]
-        column = columns(np.concatenate(rows, axis=1).T)
-        self.a, self.b, self.along = (mi.Vector3f(*column[i : i + 3]) for i in (0, 3, 6))
-        self.length = column[9]
-        self.one, self.other = mi.Vector3f(*column[10:13]), mi.Vector3f(*column[13:])
 
     def __len__(self) -> int:
         return len(self.number)
+
+    def arrays(self, wanted: Int64Array) -> tuple[Float64Array | Int64Array | BoolArray, ...]:
+        """These edges, in ascending order, as `beam_kernels` takes them."""
+        ends, piece = self.ends[wanted], self.piece[wanted]
+        begin = np.append(np.flatnonzero(np.diff(piece, prepend=-2)), len(wanted))
+        around = spheres(ends, begin), begin, spheres(ends, np.arange(len(wanted) + 1))
+        return *around, ends, self.normals[wanted], self.surfaces[wanted], piece >= 0
 
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:
         """Test whether points [m], Shape ``[N, 3]``, are in front of at least one face of their edge,
@@ -118,43 +103,6 @@ def enumerated_scenery(edges: SceneEdges) -> int:
     """Number of edges of scenery over which paths are enumerated; they are the first of all edges."""
     count = len(edges) - len(edges.of_bodies[0])
     return count if count <= _FEW else 0
-
-
-class _Groups:
-    """Edges in a hierarchy of spheres: pieces, and within these groups of neighbours."""
-
-    def __init__(self, edges: EdgeTargets, wanted: BoolArray) -> None:
-
-        rows = np.flatnonzero(wanted)
-        _, first, sizes = np.unique(edges.piece[rows], return_index=True, return_counts=True)
-        self.pieces = len(sizes)
-        if not self.pieces:
-            return
-        ends = edges.ends[rows]
-        low, high = np.minimum.reduceat(ends.min(1), first), np.maximum.reduceat(ends.max(1), first)
-        own = np.repeat(np.arange(self.pieces), sizes)
-        # Neighbours: edges of a piece in the order of their middles along the piece's longest side.
-        along = ends.sum(1)[np.arange(len(rows)), np.argmax(high - low, axis=1)[own]]
-        rows = rows[np.lexsort((along, own))]
-        counts = -(-sizes // _GROUP)
-        self.most = int(counts.max())
-        """Largest number of groups of a piece."""
-        of, number = ranges(np.zeros(self.pieces, np.int64), counts)
-        begin = first[of] + number * _GROUP
-        size = np.minimum(first[of] + sizes[of] - begin, _GROUP)
-        self.edge = indices(rows)
-        self.first_group, self.groups = indices(np.cumsum(counts) - counts), indices(counts)
-        self.begin, self.size = indices(begin), indices(size)
-        self.piece_sphere, self.group_sphere = (
-            _spheres(edges.ends[rows], column) for column in (first, begin)
-        )
-
-
-def _spheres(ends: Float64Array, begin: Int64Array) -> tuple[Any, Any]:
-    """Centres and radii of spheres around runs of edges that begin at these, in the ray tracer's arrays."""
-    low, high = np.minimum.reduceat(ends.min(1), begin), np.maximum.reduceat(ends.max(1), begin)
-    radius = np.sqrt(((high - low) ** 2).sum(1)) / 2
-    return places((low + high) / 2), columns(radius[None])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,43 +141,68 @@ def edge_chains(
     if not (depth and len(edges) and len(receivers)):
         return []
     # Reflections of both sides and the diffraction together are at most ``depth`` interactions.
-    sources = list(_from_transmitter(targets, scenery, views, transmitter))
-    sinks = list(_from_receivers(targets, views, receivers, depth))
-    every = _Groups(edges, np.ones(len(edges), np.bool_))
-    sent = [_lit(targets, edges, every, sources[0], np.zeros(1, np.int64))]
-    taken = [_lit(targets, edges, every, *sinks[0])]
-    # A side with all reflections that a path may have leaves none to the other side: only edges that the
-    # other side lights directly can be met there.
-    of_sent, of_taken = (
-        _Groups(edges, np.isin(np.arange(len(edges)), side[0].edge)) for side in (taken, sent)
-    )
-    for n, beams in enumerate(sources[1:], start=2):
-        owner = np.zeros(len(beams), np.int64)
-        sent.append(_lit(targets, edges, every if n < depth else of_sent, beams, owner))
-    for n, (beams, owner) in enumerate(sinks[1:], start=2):
-        taken.append(_lit(targets, edges, every if n < depth else of_taken, beams, owner))
-    return [
-        chains
-        for i, one in enumerate(sent)
-        for j, other in enumerate(taken)
-        if i + j < depth
-        for chains in _meeting(targets, edges, one, other)
+    sent = [
+        _Side(targets, edges, beams, np.zeros(len(beams), np.int64))
+        for beams in _from_transmitter(targets, scenery, transmitter)
     ]
+    taken = [_Side(targets, edges, *side) for side in _from_receivers(targets, views, receivers, depth)]
+    found = []
+    for i, j in ((i, total - i) for total in range(depth) for i in range(total + 1)):
+        # Beams of more reflections are far more: edges are looked up for each of them.
+        if i > j:
+            one, edge, other = sent[i].meetings(taken[j])
+        else:
+            other, edge, one = taken[j].meetings(sent[i])
+        chains = sent[i].beams.chain[one], taken[j].beams.chain[other]
+        found.append(EdgeChains(chains[0], edge, chains[1], taken[j].owner[other]))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Lit:
-    """Pairs of a beam and an edge that the beam may light."""
+class _Side:
+    """Beams from one side after so many reflections."""
 
+    targets: Targets
+    edges: EdgeTargets
     beams: ImageBeams
     owner: Int64Array
     """Receiver of each beam, Shape ``[B]``; 0 for beams of the transmitter."""
-    beam: Int64Array
-    edge: Int64Array
+
+    @cached_property
+    def _own(self) -> Int64Array:
+        """Surface that reflected each beam last, −2 for none, Shape ``[B]``."""
+        if not self.beams.chain.shape[1]:
+            return np.full(len(self.beams), -2)
+        return self.edges.surface_of_face[self.beams.chain[:, -1]]
+
+    @cached_property
+    def _lit(self) -> Int64Array:
+        """Pairs of an edge and a beam that may light it, in the order of edges, Shape ``[N, 2]``."""
+        every = self.edges.arrays(np.arange(len(self.edges)))
+        beam, edge = kernels.lit_edges(self.beams.rows, self._own, every, self.targets.slack).T
+        order = np.argsort(edge, kind="stable")
+        return np.column_stack([edge[order], beam[order]])
+
+    def meetings(self, other: _Side) -> tuple[Int64Array, Int64Array, Int64Array]:
+        """Beams of this side, edges, and beams of the other side that meet there, within both beams."""
+        # Chains of scenery alone over an edge of scenery are left to rays.
+        lit = other._lit
+        wanted, edge = np.unique(lit[:, 0], return_inverse=True)
+        beam, met, beam_of_other = kernels.meetings(
+            self.beams.rows,
+            self._own,
+            self.beams.by_body,
+            other.beams.rows,
+            np.column_stack([edge, lit[:, 1]]),
+            other.beams.by_body,
+            self.edges.arrays(wanted),
+            self.targets.slack,
+        ).T
+        return beam, wanted[met], beam_of_other
 
 
 def _from_transmitter(
-    targets: Targets, scenery: Int64Array, views: SceneryViews, transmitter: Float64Array
+    targets: Targets, scenery: Int64Array, transmitter: Float64Array
 ) -> Iterator[ImageBeams]:
     """Beams of the transmitter after no reflection, one, and so on, up to one less than the depth."""
     depth, length = scenery.shape[1], (scenery >= 0).sum(1)
@@ -239,13 +212,8 @@ def _from_transmitter(
     beams = first_beams(targets, transmitter, scenery[length == 1, 0])
     yield beams
     for n in range(2, depth):
-        if not len(beams):
-            return
-        known = scenery[length == n, :n]
-        two = n == 2
-        beams = (
-            next_beams(targets, beams, views.faces, known) if two else scenery_beams(targets, beams, known)
-        )
+        onward = next_beams if n == 2 else scenery_beams
+        beams = onward(targets, beams, scenery[length == n, :n])
         yield beams
 
 
@@ -262,165 +230,26 @@ def _from_receivers(
     height = receivers @ faces.normal[bodies].T - faces.offset[bodies]
     receiver, place = np.nonzero((height > 0) | faces.two_sided[bodies])
     owner = np.concatenate([views.receiver, receiver])
-    chain = np.concatenate([views.faces[views.place], bodies[place]])[:, None]
-    beams = reflected_beams(targets, chain, places(receivers[owner]), None)
+    chain = np.concatenate([views.face, bodies[place]])[:, None]
+    beams = reflected_beams(targets, chain, receivers[owner])
     yield beams, owner
     for n in range(2, depth):
-        if not len(beams):
-            return
-        parent, face = _onward(targets, beams, views) if n == 2 else shown_scenery(targets, beams, views)
-        if n > 2:
-            face = views.faces[face]
-        chain = np.concatenate([beams.chain[parent], face[:, None]], axis=1)
-        beams, owner = longer_beams(targets, beams, parent, chain), owner[parent]
-        scenery = ~beams.by_body
-        views = SceneryViews(
-            views.faces, views.sights, owner[scenery], np.searchsorted(views.faces, chain[scenery, -1])
+        # Beams of scenery alone come first; after the second reflection they are all that goes on.
+        pairs = [shown_scenery(targets, beams.scenery_alone())]
+        if n == 2:
+            pairs += [by_scenery(targets, beams), lit_bodies(targets, beams)]
+        none = np.zeros(0, np.int64)
+        beams, owner = (
+            longer_beams(targets, beams, none, np.zeros((0, n), np.int64), *pairs),
+            owner[np.concatenate(pairs)[:, 0]],
         )
         yield beams, owner
-
-
-def _onward(targets: Targets, beams: ImageBeams, views: SceneryViews) -> tuple[Int64Array, Int64Array]:
-    """Pairs of a beam and a face that it lights; beams of scenery alone, those of ``views``, come first."""
-    view, place = shown_scenery(targets, beams, views)
-    of_body = by_scenery(targets, beams, views.faces)
-    by_body = filtered(partial(lights_corner, targets, beams), lit_bodies(targets, beams))
-    parent = np.concatenate([view, numbers(of_body[0]), numbers(by_body[0])])
-    return parent, np.concatenate([views.faces[place], numbers(of_body[1]), numbers(by_body[1])])
 
 
 def _source_beams(points: Float64Array) -> ImageBeams:
     """Beams without a reflection, which light everything around points [m], Shape ``[N, 3]``."""
     count = len(points)
-    none = places(np.zeros((count, 3)))
-    cosine, lit_from = columns(np.tile([[-1.0], [_EVERYWHERE]], count))
-    return ImageBeams(
-        chain=np.zeros((count, 0), np.int64),
-        by_body=np.zeros(count, np.bool_),
-        image=places(points),
-        sides=(none,),
-        axis=places(np.tile([0.0, 0.0, 1.0], (count, 1))),
-        cosine=cosine,
-        last=indices(np.zeros(count, np.int64)),
-        lit=none,
-        lit_from=lit_from,
-    )
-
-
-def _lit(targets: Targets, edges: EdgeTargets, groups: _Groups, beams: ImageBeams, owner: Int64Array) -> _Lit:
-    """Edges that beams may light, except for edges of the face that reflected the beam last."""
-    none = np.zeros(0, np.int64)
-    if not (len(beams) and groups.pieces):
-        return _Lit(beams, owner, none, none)
-
-    def near(beam: Any, piece: Any) -> Any:
-        centre, radius = (gathered(column, piece) for column in groups.piece_sphere)
-        return beams.light_cone(beam, centre, radius, targets.slack)
-
-    def near_group(pair: Any, place: Any) -> Any:
-        its = gathered(piece, pair)
-        there = place < gathered(groups.groups, its)
-        group = dr.select(there, gathered(groups.first_group, its) + place, 0)
-        centre, radius = (gathered(column, group) for column in groups.group_sphere)
-        of = gathered(beam, pair)
-        there &= beams.light_cone(of, centre, radius, targets.slack)
-        return there & beams.light(of, centre, radius + targets.slack)
-
-    def shows(pair: Any, place: Any) -> Any:
-        its = gathered(group, pair)
-        there = place < gathered(groups.size, its)
-        edge = gathered(groups.edge, dr.select(there, gathered(groups.begin, its) + place, 0))
-        # The image is in front of at least one face of the edge.
-        back = gathered(beams.image, gathered(beam, pair)) - gathered(edges.a, edge)
-        one, other = dr.dot(back, gathered(edges.one, edge)), dr.dot(back, gathered(edges.other, edge))
-        return there & (dr.maximum(one, other) > -targets.slack)
-
-    def within(beam: Any, edge: Any) -> Any:
-        return _in_beam(targets, edges, beams, beam, edge)
-
-    beam, piece = pairs(len(beams), groups.pieces, near)
-    pair, place = pairs(dr.width(beam), groups.most, near_group)
-    if not dr.width(pair):
-        return _Lit(beams, owner, none, none)
-    beam, group = gathered(beam, pair), gathered(groups.first_group, gathered(piece, pair)) + place
-    dr.eval(beam, group)
-    pair, place = pairs(dr.width(beam), _GROUP, shows)
-    if not dr.width(pair):
-        return _Lit(beams, owner, none, none)
-    edge = gathered(groups.edge, gathered(groups.begin, gathered(group, pair)) + place)
-    of, at = (numbers(part) for part in filtered(within, (gathered(beam, pair), edge)))
-    if beams.chain.shape[1]:
-        # An edge of the mirror itself lies in the mirror's plane: no wave goes from there to it.
-        last = edges.surface_of_face[beams.chain[of, -1]]
-        own = (last[:, None] == edges.surfaces[at]).any(1)
-        of, at = of[~own], at[~own]
-    return _Lit(beams, owner, of, at)
-
-
-def _in_beam(targets: Targets, edges: EdgeTargets, beams: ImageBeams, beam: Any, edge: Any) -> Any:
-    """Test whether edges may be lit: no side of the beam has both ends beyond it."""
-    image, a, b = gathered(beams.image, beam), gathered(edges.a, edge), gathered(edges.b, edge)
-    normal = gathered(beams.lit, beam)
-    lit = dr.maximum(dr.dot(normal, a), dr.dot(normal, b)) > gathered(beams.lit_from, beam) - targets.slack
-    for side in beams.sides:
-        inward = gathered(side, beam)
-        lit &= dr.maximum(dr.dot(inward, a - image), dr.dot(inward, b - image)) > -targets.slack
-    return lit
-
-
-def _meeting(targets: Targets, edges: EdgeTargets, one: _Lit, other: _Lit) -> Iterator[EdgeChains]:
-    """Pairs of a beam from each side that meet at an edge within both beams."""
-    order = np.argsort(other.edge, kind="stable")
-    sizes = np.bincount(other.edge, minlength=len(edges))
-    begin, sizes = (np.cumsum(sizes) - sizes)[one.edge], sizes[one.edge]
-    part = np.cumsum(sizes) // _AT_ONCE
-    for rows in np.split(np.arange(len(sizes)), np.flatnonzero(np.diff(part)) + 1):
-        own, place = ranges(begin[rows], sizes[rows])
-        if not len(own):
-            continue
-        first, second = rows[own], order[place]
-        # Chains of scenery alone over an edge of scenery are left to rays.
-        moving = edges.piece[one.edge[first]] >= 0
-        moving |= one.beams.by_body[one.beam[first]] | other.beams.by_body[other.beam[second]]
-        first, second = first[moving], second[moving]
-        if not len(first):
-            continue
-        sent, taken = indices(one.beam[first]), indices(other.beam[second])
-        edge = indices(one.edge[first])
-        kept = _kept(targets, edges, (one.beams, sent), (other.beams, taken), edge)
-        kept = kept[kept < len(first)]
-        first, second = first[kept], second[kept]
-        yield EdgeChains(
-            before=one.beams.chain[one.beam[first]],
-            edge=one.edge[first],
-            behind=other.beams.chain[other.beam[second]],
-            receiver=other.owner[other.beam[second]],
-        )
-
-
-def _kept(
-    targets: Targets,
-    edges: EdgeTargets,
-    one: tuple[ImageBeams, Any],
-    other: tuple[ImageBeams, Any],
-    edge: Any,
-) -> Int64Array:
-    """Indices of the pairs of beams that meet at their edge, at the point of Keller's law."""
-    origin, along = gathered(edges.a, edge), gathered(edges.along, edge)
-    (s, from_source), (t, from_target) = (
-        _unfolded(gathered(beams.image, beam) - origin, along) for beams, beam in (one, other)
-    )
-    # Keller's law: s − place over from_source is place − t over from_target.
-    place = (s * from_target + t * from_source) / (from_source + from_target)
-    meets = (place > -targets.slack) & (place < gathered(edges.length, edge) + targets.slack)
-    point = origin + place * along
-    for beams, beam in (one, other):
-        meets &= beams.light(beam, point, targets.slack)
-        meets &= dr.dot(gathered(beams.lit, beam), point) > gathered(beams.lit_from, beam) - targets.slack
-    return numbers(dr.compress(meets))
-
-
-def _unfolded(point: Any, along: Any) -> tuple[Any, Any]:
-    """Coordinate of points along lines through the origin, and their distance from these lines."""
-    s = dr.dot(point, along)
-    return s, dr.norm(point - s * along)
+    rows = np.zeros((count, kernels.WIDTH))
+    rows[:, :3], rows[:, kernels.COSINE], rows[:, kernels.LIT_FROM] = points, -1.0, _EVERYWHERE
+    rows[:, kernels.LAST] = -1
+    return ImageBeams(np.zeros((count, 0), np.int64), np.zeros(count, np.bool_), rows)

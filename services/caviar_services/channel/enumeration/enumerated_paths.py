@@ -10,6 +10,8 @@ In the street canyon this finds the reflections that 3e7 rays find, in about hal
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -23,8 +25,8 @@ from caviar_services.channel.enumeration.image_paths import (
     edge_paths,
     image_paths,
     unhidden,
-    unhidden_over_edges,
 )
+from caviar_services.channel.enumeration.obstacle_trees import ObstacleTrees
 from caviar_services.channel.enumeration.scenery_chains import KnownScenery, SceneFaces, seen_planes
 from caviar_services.channel.propagation.utd import reflection_fields
 from caviar_services.channel.sionna.candidates import Faces, first_of_each
@@ -62,8 +64,15 @@ class EnumeratedTracer:
         self._depth = options.max_depth
         self._edges = scene.edges if options.diffraction else None
         self._faces = SceneFaces(scene, inner=options.refraction)
-        self._look = Faces(scene)
+        self._look = Faces(scene, still=True)
         self._bodies: tuple[int, FaceRectangles, Int64Array] | None = None
+        # Of transmitters that stand, it is the same in each frame.
+        self._known: WeakKeyDictionary[KnownScenery, tuple[FaceRectangles, Int64Array, Int64Array]]
+        self._known = WeakKeyDictionary()
+
+    @cached_property
+    def _obstacles(self) -> ObstacleTrees:
+        return ObstacleTrees(self._scene)
 
     def trace(
         self,
@@ -93,19 +102,17 @@ class EnumeratedTracer:
         if self._bodies is None or self._bodies[0] != scene.version:
             self._bodies = (scene.version, *self._faces.bodies())
         _, of_bodies, sizes = self._bodies
-        planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)
-        of_scenery = self._faces.scenery(planes[planes >= 0])
+        if scenery not in self._known:
+            self._known[scenery] = self._numbered(scenery)
+        of_scenery, chains, sights = self._known[scenery]
         faces = FaceRectangles.joined([of_scenery, of_bodies])
-        # A chain by way of a plane without area has no face to be mirrored in.
-        planes = planes[(np.isin(planes, of_scenery.plane) | (planes < 0)).all(1)]
-        chains = np.where(planes >= 0, np.searchsorted(of_scenery.plane, planes), -1)
-        views = self._views(of_scenery, sights, ends)
-        targets = Targets(faces, sizes)
+        views = self._views(of_scenery, ends)
+        targets = Targets(faces, sizes, sights)
         pairs = chain_pairs(targets, chains, views, start, ends)
-        paths = self._once(faces, image_paths(faces, pairs, start, ends))
+        paths = self._once(faces, image_paths(targets, pairs, start, ends))
         near = ((ends - start) ** 2).sum(1) <= _NEAREST**2
         paths = paths.take(~near[paths.receiver])
-        free = unhidden(scene, self._look, faces, paths, start, ends)
+        free = unhidden(scene, self._obstacles, faces, paths, start, ends)
         seen = paths.take(free)
         mirrors = self._mirrors(faces, seen.chain, seen.points)
         types = np.where(seen.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
@@ -115,9 +122,9 @@ class EnumeratedTracer:
         if self._edges is not None and over_edges:
             edges = EdgeTargets(scene, self._edges, faces)
             candidates = edge_chains(targets, edges, chains, views, start, ends)
-            bent = edge_paths(faces, edges, candidates, start, ends, self._depth)
+            bent = edge_paths(targets, edges, candidates, start, ends, self._depth)
             bent = bent.take(~near[bent.receiver])
-            bent = bent.take(unhidden_over_edges(scene, self._look, faces, edges, bent, start, ends))
+            bent = bent.take(unhidden(scene, self._obstacles, faces, bent, start, ends, edges))
             types = np.where(bent.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
             triangles, _ = self._mirrors(faces, bent.chain, bent.points)
             rows, edge = np.arange(len(bent.edge)), edges.number[bent.edge]
@@ -131,6 +138,15 @@ class EnumeratedTracer:
             parts.append(replace(traced.take(kept), lost=len(kept) - int(kept.sum())))
         return joined(parts, len(scene.wavelengths), self._depth)
 
+    def _numbered(self, scenery: KnownScenery) -> tuple[FaceRectangles, Int64Array, Int64Array]:
+        """Faces of scenery, and its chains and sights as numbers of these."""
+        planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)
+        faces = self._faces.scenery(planes[planes >= 0])
+        # A chain by way of a plane without area has no face to be mirrored in.
+        planes = planes[(np.isin(planes, faces.plane) | (planes < 0)).all(1)]
+        chains = np.where(planes >= 0, np.searchsorted(faces.plane, planes), -1)
+        return faces, chains, np.searchsorted(faces.plane, sights[np.isin(sights, faces.plane).all(1)])
+
     def _once(self, faces: FaceRectangles, paths: ImagePaths) -> ImagePaths:
         """Paths of which no earlier one runs by way of the same surfaces: coplanar faces that touch are
         one."""
@@ -142,22 +158,22 @@ class EnumeratedTracer:
         keys = np.column_stack([paths.receiver, surfaces])
         return paths.take(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
-    def _views(self, scenery: FaceRectangles, sights: Int64Array, receivers: Float64Array) -> SceneryViews:
+    def _views(self, scenery: FaceRectangles, receivers: Float64Array) -> SceneryViews:
         """Faces of scenery that may reflect last before each receiver."""
-        pairs = np.searchsorted(scenery.plane, sights[np.isin(sights, scenery.plane).all(1)])
         if len(scenery) <= _FEW:
             seen = np.ones((len(receivers), len(scenery)), np.bool_)
         else:
             seen = seen_planes(self._look, receivers, scenery.plane, _RAYS)
-        receiver, place = np.nonzero(seen)
-        return SceneryViews(np.arange(len(scenery)), pairs, receiver, place)
+        return SceneryViews(*np.nonzero(seen))
 
     def _transmitted(
         self, faces: FaceRectangles, paths: ImagePaths, start: Float64Array, ends: Float64Array
     ) -> Traced:
         """Hidden paths that go through their obstacles."""
         count = (paths.chain >= 0).sum(1)
-        found, through = crossings(self._scene, self._look, faces, paths, start, ends, self._depth - count)
+        found, through = crossings(
+            self._scene, self._obstacles, faces, paths, start, ends, self._depth - count
+        )
         number = np.cumsum(through) - 1
         paths, count, crossing = paths.take(through), count[through], number[found.path]
         # Transmissions stand between the reflections: each moves what follows by one place.
@@ -204,28 +220,30 @@ class EnumeratedTracer:
     ) -> Traced:
         """Paths of these interactions; fields are computed where normals are given, and 0 where they are
         None."""
-        scene = self._scene
+        scene, width = self._scene, types.shape[1]
         used = types != 0
         count = used.sum(1)
-        shapes, primitives = (np.full(used.shape, _NO_SHAPE, np.int64) for _ in range(2))
-        shapes[used], primitives[used] = scene.shapes_of(triangles[used])
+        shape = len(count), self._depth
+        shapes, primitives = (np.full(shape, _NO_SHAPE, np.int64) for _ in range(2))
+        at = np.nonzero(used)
+        shapes[at], primitives[at] = scene.shapes_of(triangles[at])
         transfer = np.zeros((len(scene.wavelengths), len(count), 3, 3), np.complex128)
         if normals is not None:
             through = types == Interaction.TRANSMISSION
             corners = np.concatenate(
                 [np.broadcast_to(start, (len(count), 1, 3)), points, ends[receiver][:, None]], axis=1
             )
-            transfer = reflection_fields(
-                corners, count, normals, through, scene.media(shapes), scene.wavelengths
-            )
-        rest = ((0, 0), (0, self._depth - used.shape[1]))
+            media = scene.media(shapes[:, :width])
+            transfer = reflection_fields(corners, count, normals, through, media, scene.wavelengths)
+        kinds, places = np.zeros(shape, np.uint8), np.zeros((*shape, 3))
+        kinds[at], places[at] = types[at], points[at] + scene.centre
         return Traced(
             receiver=receiver,
             transfer=transfer,
-            types=np.pad(types, rest),
-            shapes=np.pad(shapes, rest, constant_values=_NO_SHAPE),
-            primitives=np.pad(primitives, rest, constant_values=_NO_SHAPE),
-            points=np.pad(np.where(used[..., None], points + scene.centre, 0.0), (*rest, (0, 0))),
+            types=kinds,
+            shapes=shapes,
+            primitives=primitives,
+            points=places,
             edge=np.full(len(count), -1),
             hidden=np.zeros(len(count), np.bool_),
             settled=np.zeros(len(count), np.bool_),

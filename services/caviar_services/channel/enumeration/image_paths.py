@@ -19,45 +19,45 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_services.channel.enumeration.edge_beams import EdgeChains, EdgeTargets
-from caviar_services.channel.enumeration.image_beams import ChainPairs
+from caviar_services.channel.enumeration.image_beams import ChainPairs, Targets
+from caviar_services.channel.enumeration.obstacle_trees import AT_END, OFF_SURFACE, ObstacleTrees
 from caviar_services.channel.propagation.image_method import keller_point
 from caviar_services.channel.propagation.utd import beyond_edges, slab
-from caviar_services.channel.sionna.candidates import Faces
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.materials import DRAWN
-from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE, PlaneTable
 from caviar_space.rectangles import FaceRectangles
 from caviar_space.vectors import Rows
-
-OFF_SURFACE = 2e-4
-"""[m]; rays from face to face start this far from the first face, whose points float32 rounds."""
-
-# Cosine between the normals of planes that count as parallel.
-_PARALLEL = 1 - 1e-6
-
-AT_END = 1e-3
-"""[m]; what a ray meets this near to its end is what it ends at: two faces meet there, or are one."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImagePaths(Rows):
-    """P paths of at most D reflections."""
+    """P paths of at most D interactions: reflections, and a diffraction at most."""
 
     chain: Int64Array
-    """Faces that reflect, −1 past the last, Shape ``[P, D]``."""
+    """Face at each reflection, −1 at an edge and past the last, Shape ``[P, D]``."""
+    bend: Int64Array
+    """Which interaction is at an edge, −1 for none, Shape ``[P]``."""
+    edge: Int64Array
+    """Edge among `EdgeTargets`, −1 for none, Shape ``[P]``."""
     receiver: Int64Array
     """Index of the receiver, Shape ``[P]``."""
     points: Float64Array
-    """Points of the reflections, the receiver's position past the last [m], Shape ``[P, D, 3]``."""
+    """Points of the interactions, the receiver's position past the last [m], Shape ``[P, D, 3]``."""
+
+    @property
+    def count(self) -> Int64Array:
+        """Interactions of each path, Shape ``[P]``."""
+        count: Int64Array = (self.chain >= 0).sum(1) + (self.bend >= 0)
+        return count
 
 
 def image_paths(
-    faces: FaceRectangles, pairs: ChainPairs, transmitter: Float64Array, receivers: Float64Array
+    targets: Targets, pairs: ChainPairs, transmitter: Float64Array, receivers: Float64Array
 ) -> ImagePaths:
     """Pairs whose reflections all lie in a triangle of their face, by the image method.
 
     Args:
-        faces: Faces of the chains.
+        targets: Faces of the chains.
         pairs: Candidates.
         transmitter: Position [m], Shape ``[3]``.
         receivers: Positions [m], Shape ``[R, 3]``.
@@ -69,138 +69,45 @@ def image_paths(
     # A fixed order, whatever order kernels found the pairs in: products have to be equal to the bit.
     order = np.lexsort((*chain.T[::-1], count, pairs.receiver))
     chain, receiver = chain[order], pairs.receiver[order]
-    points, good = reflection_points(
-        faces, chain, np.broadcast_to(transmitter, (len(chain), 3)), receivers[receiver]
+    points, good = targets.reflections(
+        chain, np.broadcast_to(transmitter, (len(chain), 3)), receivers[receiver]
     )
-    return ImagePaths(chain[good], receiver[good], points[good])
-
-
-def reflection_points(
-    faces: FaceRectangles, chain: Int64Array, start: Float64Array, end: Float64Array
-) -> tuple[Float64Array, BoolArray]:
-    """Points where chains of faces reflect a wave on its way from a start to an end.
-
-    Args:
-        faces: Faces of the chains.
-        chain: Faces in turn, −1 past the last, Shape ``[N, D]``.
-        start: Position [m], Shape ``[N, 3]``; ``end`` likewise.
-        end: See ``start``.
-
-    Returns:
-        Points, the end past the last [m], Shape ``[N, D, 3]``, and which rows have every point in a
-        triangle of its face, on the side that reflects, Shape ``[N]``. Points of other rows are undefined.
-    """
-    depth, count = chain.shape[1], (chain >= 0).sum(1)
-    images = [start]
-    for d in range(depth):
-        used = np.flatnonzero(count > d)
-        image = images[-1].copy()
-        image[used] = faces.mirrored(image[used], chain[used, d])
-        images.append(image)
-    # Back from the end: the line to the last image meets the last face at the last point, and so on. Rows
-    # that miss a rectangle drop out at once; triangles, which cost most, are tested for the rows that are
-    # left.
-    here = end.copy()
-    points = np.repeat(here[:, None], depth, axis=1)
-    good = np.ones(len(chain), np.bool_)
-    for d in reversed(range(depth)):
-        rows = np.flatnonzero(good & (count > d))
-        face, towards = chain[rows, d], images[d + 1][rows]
-        near, far = faces.height(here[rows], face), faces.height(towards, face)
-        # The line has to cross the plane between the end and the image, from the side that reflects.
-        crosses = (near * far < 0) & ((near > 0) | faces.two_sided[face])
-        good[rows[~crosses]] = False
-        rows, face, towards, near, far = (part[crosses] for part in (rows, face, towards, near, far))
-        met = here[rows] + (near / (near - far))[:, None] * (towards - here[rows])
-        within = faces.in_rectangle(met, face)
-        good[rows[~within]] = False
-        here[rows], points[rows, d] = met, met
-    rows = np.flatnonzero(good)
-    path, place = np.nonzero(chain[rows] >= 0)
-    path = rows[path]
-    held = faces.in_triangles(points[path, place], chain[path, place])
-    good[path[~held]] = False
-    return points, good
+    none = np.full(int(good.sum()), -1)
+    return ImagePaths(chain[good], none, none, receiver[good], points[good])
 
 
 def unhidden(
     scene: SionnaScene,
-    look: Faces,
+    obstacles: ObstacleTrees,
     faces: FaceRectangles,
     paths: ImagePaths,
     transmitter: Float64Array,
     receivers: Float64Array,
+    edges: EdgeTargets | None = None,
 ) -> BoolArray:
-    """Mask of paths without an obstacle on their segments, Shape ``[P]``.
-
-    A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
-    that does not stand in front of it: rays that end before would lose what grazes.
+    """Mask of paths without an obstacle on their segments (`path_kernels.unhidden`), Shape ``[P]``.
 
     Args:
         scene: The scene.
-        look: Casts the rays.
+        obstacles: Its obstacles.
         faces: Faces of the paths.
         paths: Paths of the image method.
         transmitter: Position [m], Shape ``[3]``.
         receivers: Positions [m], Shape ``[R, 3]``.
+        edges: Edges of the paths; None: they have none.
     """
-    count = (paths.chain >= 0).sum(1)
-    end = receivers[paths.receiver]
-    rows = np.arange(len(count))
-    first, last, wanted, owner = [], [], [], []
-    for d in range(paths.chain.shape[1] + 1):
-        lane = rows[count >= d]
-        before = paths.points[lane, d - 1] if d else np.broadcast_to(transmitter, (len(lane), 3))
-        ends = count[lane] == d
-        if d < paths.chain.shape[1]:
-            arriving, face = paths.points[lane, d], paths.chain[lane, d]
-        else:
-            arriving, face = end[lane], np.full(len(lane), -1)
-        plane = np.where(ends, -1, faces.plane[face] if len(faces) else -1)
-        if d:
-            # The last ray goes from the receiver, which is off every surface and needs no lift.
-            mirror = paths.chain[lane, d - 1]
-            normal = faces.normal[mirror]
-            side = np.sign(np.einsum("nc,nc->n", arriving - before, normal))[:, None]
-            lifted = before + OFF_SURFACE * side * normal
-            start = np.where(ends[:, None], arriving, lifted)
-            arriving = np.where(ends[:, None], before, arriving)
-            plane = np.where(ends, faces.plane[mirror], plane)
-        else:
-            start = before
-        first.append(start)
-        last.append(arriving)
-        wanted.append(plane)
-        owner.append(lane)
-    owners, planes = np.concatenate(owner), np.concatenate(wanted)
-    free = np.ones(len(count), np.bool_)
-    if len(owners):
-        ends = np.concatenate(last)
-        behind, met = look.nearest(np.concatenate(first), ends)
-        other = (behind < 0) & (met != np.where(planes >= 0, scene.joined.label[planes], -1))
-        hidden = other & (behind < -AT_END)
-        near = np.flatnonzero(other & ~hidden & (planes >= 0))
-        hidden[near] = in_front(scene.plane_table, met[near], planes[near], ends[near])
-        free[owners[hidden]] = False
-    return free
-
-
-def in_front(table: PlaneTable, met: Int64Array, wanted: Int64Array, points: Float64Array) -> BoolArray:
-    """Test whether planes hide points of other planes that rays met right behind them.
-
-    They do if both planes are parallel and farther apart than rounding.
-
-    Args:
-        table: Planes of the scene.
-        met: Plane that each ray met first, Shape ``[N]``.
-        wanted: Plane that each point lies in, Shape ``[N]``.
-        points: Points [m], Shape ``[N, 3]``.
-    """
-    normal = table.normal[met]
-    parallel = np.abs(np.einsum("nc,nc->n", normal, table.normal[wanted])) > _PARALLEL
-    height = np.abs(np.einsum("nc,nc->n", points - table.origin[met], normal))
-    hidden: BoolArray = parallel & (height > COPLANAR + COPLANAR_RELATIVE * np.abs(points).max(1))
-    return hidden
+    start = np.broadcast_to(transmitter, (len(paths.chain), 1, 3))
+    corners = np.concatenate([start, paths.points, receivers[paths.receiver][:, None]], axis=1)
+    planes, normals = np.full(corners.shape[:2], -1), np.zeros(corners.shape)
+    surfaces = np.full((*planes.shape, 2), -1)
+    path, d = np.nonzero(paths.chain >= 0)
+    face, corner = paths.chain[path, d], (path, d + 1)
+    planes[corner], normals[corner] = faces.plane[face], faces.normal[face]
+    surfaces[corner] = scene.joined.label[faces.plane[face]][:, None]
+    if edges is not None:
+        corner = np.arange(len(paths.bend)), paths.bend + 1
+        normals[corner], surfaces[corner] = edges.outward[paths.edge], edges.surfaces[paths.edge]
+    return obstacles.unhidden(corners, paths.count, paths.bend, normals, surfaces, planes)
 
 
 # Surfaces at both ends of a segment, each of which a ray may meet once more by rounding.
@@ -225,7 +132,7 @@ class Crossings(Rows):
 
 def crossings(
     scene: SionnaScene,
-    look: Faces,
+    obstacles: ObstacleTrees,
     faces: FaceRectangles,
     paths: ImagePaths,
     transmitter: Float64Array,
@@ -236,7 +143,7 @@ def crossings(
 
     Args:
         scene: The scene.
-        look: Casts the rays.
+        obstacles: Its obstacles.
         faces: Faces of the paths.
         paths: Paths of the image method that something hides.
         transmitter: Position [m], Shape ``[3]``.
@@ -256,7 +163,7 @@ def crossings(
         alive = alive[good[segments.path[alive]]]
         if not len(alive):
             break
-        behind, triangle = look.first_triangle(start[alive], segments.last[alive])
+        behind, triangle = obstacles.first_triangle(start[alive], segments.last[alive])
         on = behind < -AT_END
         alive, triangle = alive[on], triangle[on]
         along, points, side = segments.met(scene, alive, triangle)
@@ -361,37 +268,19 @@ def _lets_through(scene: SionnaScene, triangle: Int64Array, direction: Float64Ar
     return through
 
 
-@dataclass(frozen=True, eq=False)
-class EdgePaths(Rows):
-    """P paths of at most D interactions, one of which is a diffraction."""
-
-    chain: Int64Array
-    """Face at each reflection, −1 at the edge and past the last, Shape ``[P, D]``."""
-    bend: Int64Array
-    """Which interaction is at the edge, Shape ``[P]``."""
-    count: Int64Array
-    """Interactions, Shape ``[P]``."""
-    edge: Int64Array
-    """Among `EdgeTargets`, Shape ``[P]``."""
-    receiver: Int64Array
-    """Shape ``[P]``."""
-    points: Float64Array
-    """The receiver past the last [m], Shape ``[P, D, 3]``."""
-
-
 def edge_paths(
-    faces: FaceRectangles,
+    targets: Targets,
     edges: EdgeTargets,
     candidates: Sequence[EdgeChains],
     transmitter: Float64Array,
     receivers: Float64Array,
     depth: int,
-) -> EdgePaths:
+) -> ImagePaths:
     """Candidates that are paths: reflections lie in triangles of their faces, and both segments at the edge
     run outside of its wedge.
 
     Args:
-        faces: Faces of the chains.
+        targets: Faces of the chains.
         edges: Edges of the chains.
         candidates: From `edge_chains`.
         transmitter: Position [m], Shape ``[3]``.
@@ -402,10 +291,10 @@ def edge_paths(
         Paths sorted by receiver, number of interactions, edge and surfaces. Of paths by way of faces that are
         one surface, the first one.
     """
-    parts = [_with_points(faces, edges, chains, transmitter, receivers, depth) for chains in candidates]
+    parts = [_with_points(targets, edges, chains, transmitter, receivers, depth) for chains in candidates]
     none = np.zeros(0, np.int64)
-    parts.append(EdgePaths(np.zeros((0, depth), np.int64), none, none, none, none, np.zeros((0, depth, 3))))
-    found = EdgePaths.joined(parts)
+    parts.append(ImagePaths(np.zeros((0, depth), np.int64), none, none, none, np.zeros((0, depth, 3))))
+    found = ImagePaths.joined(parts)
     # Surfaces instead of faces: coplanar faces that touch give the same path once each.
     surfaces = np.full(found.chain.shape, -1)
     surfaces[found.chain >= 0] = edges.surface_of_face[found.chain[found.chain >= 0]]
@@ -415,20 +304,20 @@ def edge_paths(
 
 
 def _with_points(
-    faces: FaceRectangles,
+    targets: Targets,
     edges: EdgeTargets,
     chains: EdgeChains,
     transmitter: Float64Array,
     receivers: Float64Array,
     depth: int,
-) -> EdgePaths:
+) -> ImagePaths:
     start = np.broadcast_to(transmitter, (len(chains.edge), 3))
     ends = receivers[chains.receiver]
     source, target = start, ends
     for column in chains.before.T:
-        source = faces.mirrored(source, column)
+        source = targets.faces.mirrored(source, column)
     for column in chains.behind.T:
-        target = faces.mirrored(target, column)
+        target = targets.faces.mirrored(target, column)
     wedge = edges.ends[chains.edge]
     with np.errstate(invalid="ignore", divide="ignore"):  # of what lies on the line of an edge
         place = keller_point(source, target, wedge)
@@ -436,9 +325,9 @@ def _with_points(
     # Both rays at the edge have to run outside of the wedge, in front of one of its faces at least.
     good &= edges.outside(source, chains.edge) & edges.outside(target, chains.edge)
     rows = np.flatnonzero(good)
-    before, one = reflection_points(faces, chains.before[rows], start[rows], place[rows])
+    before, one = targets.reflections(chains.before[rows], start[rows], place[rows])
     rows, before = rows[one], before[one]
-    behind, other = reflection_points(faces, chains.behind[rows], ends[rows], place[rows])
+    behind, other = targets.reflections(chains.behind[rows], ends[rows], place[rows])
     rows, before, behind = rows[other], before[other], behind[other]
     # In the order of the path: reflections before, the edge, reflections after, which count from the
     # receiver.
@@ -447,109 +336,10 @@ def _with_points(
     chain[:, :i], chain[:, i + 1 : i + 1 + j] = chains.before[rows], chains.behind[rows, ::-1]
     points = np.repeat(ends[rows][:, None], depth, axis=1)
     points[:, :i], points[:, i], points[:, i + 1 : i + 1 + j] = before, place[rows], behind[:, ::-1]
-    return EdgePaths(
+    return ImagePaths(
         chain,
         np.full(len(rows), i),
-        np.full(len(rows), i + j + 1),
         chains.edge[rows],
         chains.receiver[rows],
         points,
     )
-
-
-def unhidden_over_edges(
-    scene: SionnaScene,
-    look: Faces,
-    faces: FaceRectangles,
-    edges: EdgeTargets,
-    paths: EdgePaths,
-    transmitter: Float64Array,
-    receivers: Float64Array,
-) -> BoolArray:
-    """Mask of paths without an obstacle on their segments, Shape ``[P]``; the arguments are those of
-    `unhidden`.
-
-    Both faces of an edge are no obstacle to a segment that ends there: what a ray meets of them is rounding.
-    """
-    total, depth = paths.chain.shape
-    free = np.ones(total, np.bool_)
-    if not total:
-        return free
-    rows = np.arange(total)
-    start, end = np.broadcast_to(transmitter, (total, 1, 3)), receivers[paths.receiver][:, None]
-    corners = np.concatenate([start, paths.points, end], axis=1)
-    segments = []
-    for d in range(depth + 1):
-        lane = rows[paths.count >= d]
-        one, other = (
-            _Ends.of(scene, faces, edges, paths, lane, d),
-            _Ends.of(scene, faces, edges, paths, lane, d + 1),
-        )
-        before, after = corners[lane, d], corners[lane, d + 1]
-        # The last ray goes from the receiver, which is off every surface and needs no lift.
-        backward = paths.count[lane] == d if d else np.zeros(len(lane), np.bool_)
-        lifted = one.lifted(before, after), other.lifted(after, before)
-        first = np.where(backward[:, None], lifted[1], lifted[0])
-        # A ray ends on a face, but beside an edge: on it, rounding would put the end into one of both faces.
-        last = np.where(
-            backward[:, None],
-            np.where(one.bends[:, None], lifted[0], before),
-            np.where(other.bends[:, None], lifted[1], after),
-        )
-        wanted = np.where(backward[:, None], one.surfaces, other.surfaces)
-        plane = np.where(backward, one.plane, other.plane)
-        segments.append((lane, first, last, wanted, plane))
-    owner, first, last, wanted, plane = (np.concatenate(column) for column in zip(*segments, strict=True))
-    behind, met = look.nearest(first, last)
-    other = (behind < 0) & (met[:, None] != wanted).all(1)
-    hidden = other & (behind < -AT_END)
-    near = np.flatnonzero(other & ~hidden & (plane >= 0))
-    hidden[near] = in_front(scene.plane_table, met[near], plane[near], last[near])
-    free[owner[hidden]] = False
-    return free
-
-
-@dataclass(frozen=True, eq=False)
-class _Ends:
-    """Face, edge or antenna at one end of each of N segments."""
-
-    normals: Float64Array
-    """Unit normals of faces, for edges between both faces, 0 at antennas, Shape ``[N, 3]``."""
-    bends: BoolArray
-    """Which of them are at an edge."""
-    plane: Int64Array
-    """Of a face, −1 elsewhere."""
-    surfaces: Int64Array
-    """Surfaces that a ray may meet there, −1 for none, Shape ``[N, 2]``."""
-
-    @classmethod
-    def of(
-        cls,
-        scene: SionnaScene,
-        faces: FaceRectangles,
-        edges: EdgeTargets,
-        paths: EdgePaths,
-        rows: Int64Array,
-        corner: int,
-    ) -> _Ends:
-        """Ends at a corner of paths by its index; 0 is the transmitter."""
-        count = len(rows)
-        inner = (paths.count[rows] >= corner) & (corner > 0)
-        d = min(max(corner - 1, 0), paths.chain.shape[1] - 1)
-        bends = inner & (paths.bend[rows] == d)
-        at_face = np.flatnonzero(inner & ~bends)
-        normals, surfaces = np.zeros((count, 3)), np.full((count, 2), -1)
-        plane = np.full(count, -1)
-        face = paths.chain[rows[at_face], d]
-        normals[at_face], plane[at_face] = faces.normal[face], faces.plane[face]
-        surfaces[at_face] = scene.joined.label[faces.plane[face]][:, None]
-        edge = paths.edge[rows[bends]]
-        normals[bends], surfaces[bends] = edges.outward[edge], edges.surfaces[edge]
-        return cls(normals, bends, plane, surfaces)
-
-    def lifted(self, points: Float64Array, towards: Float64Array) -> Float64Array:
-        """Points `OFF_SURFACE` off faces, on the side of ``towards``; off edges, away from the wedge."""
-        side = np.sign(np.einsum("nc,nc->n", towards - points, self.normals))
-        side = np.where(self.bends, 1.0, side)
-        off: Float64Array = points + OFF_SURFACE * side[:, None] * self.normals
-        return off

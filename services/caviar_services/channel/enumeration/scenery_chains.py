@@ -9,7 +9,7 @@ little, are united, and a launch is traced in parts, whose memory is bounded.
 
 Where scenery has few faces, a transmitter that moves needs no launch: every sequence of faces that see one
 another is a chain, from wherever it is. From a place, the beams of its images leave most of them dark
-(`image_beams` has the same beams for the faces of a frame, on the ray tracer's side).
+(`image_beams` has the same beams for the faces of a frame).
 
 Of a thousand planes in a town each sees some thirty. Rays in all directions from points of each plane tell
 which; planes that are hidden but for less than one ray meets count as hidden.
@@ -189,9 +189,11 @@ def seen_planes(look: Faces, points: Float64Array, planes: Int64Array, rays: int
     seen = np.zeros((len(points), len(planes) + 1), np.bool_)
     start = np.repeat(points, rays, axis=0)
     behind, plane = look.nearest(start, start + np.tile(_directions(rays), (len(points), 1)))
-    place = np.searchsorted(planes, plane)
-    known = np.isfinite(behind) & (np.append(planes, -1)[place] == plane)
-    seen[np.repeat(np.arange(len(points)), rays), np.where(known, place, len(planes))] = True
+    # By a table: bisection of so many rays among a thousand planes takes longer than the rays.
+    place = np.full(max(plane.max(initial=0), planes.max(initial=0)) + 1, len(planes))
+    place[planes] = np.arange(len(planes))
+    met = np.where(np.isfinite(behind), place[plane], len(planes))
+    seen[np.repeat(np.arange(len(points)), rays), met] = True
     return seen[:, :-1]
 
 
@@ -410,8 +412,8 @@ class SceneryChains:
         before: SceneryChains | None = None,
     ) -> None:
         self._scene, self._options, self._launch, self._cache = scene, options, launch, cache
-        self._launcher = PartedLauncher(scene.mi_scene, only_reflected(options, per_frame))
-        self._look = Faces(scene)
+        self._launcher = PartedLauncher(scene, only_reflected(options, per_frame))
+        self._look = Faces(scene, still=True)
         self._faces = SceneFaces(scene)
         # By the name of a transmitter that stands: its place in the world [m], and what is known from there.
         # Each has its own: however near to another one it stands, a wall may be between them.
@@ -557,7 +559,7 @@ def launched_chains(
     # holds one part at a time.
     for index in range(parts):
         rays = (index * part, min((index + 1) * part, launch.samples))
-        launcher = Launcher(scene.mi_scene, reflected, rays)
+        launcher = Launcher(scene, reflected, rays)
         for number in range(launch.launches):
             progress(index * launch.launches + number, parts * launch.launches)
             chains = scenery_of(launcher(source, number=number), scene, options.max_depth)

@@ -10,8 +10,8 @@ from importlib import import_module
 from typing import Any
 
 
-class _Library:
-    """A library that is imported at its first use."""
+class LateModule:
+    """A module that is imported at its first use."""
 
     def __init__(self, name: str, keeps: bool) -> None:
         self._name, self._keeps = name, keeps
@@ -26,6 +26,6 @@ class _Library:
         return value
 
 
-dr: Any = _Library("drjit", keeps=True)
+dr: Any = LateModule("drjit", keeps=True)
 # Names of Mitsuba stand for other things after each change of its variant.
-mi: Any = _Library("mitsuba", keeps=False)
+mi: Any = LateModule("mitsuba", keeps=False)

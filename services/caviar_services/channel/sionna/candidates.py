@@ -16,7 +16,7 @@ the launch, in one kernel (`at_corners`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -538,10 +538,11 @@ class Faces:
 
     Args:
         scene: Its bodies are where they were placed last.
+        still: Whether rays meet the scenery alone.
     """
 
-    def __init__(self, scene: SionnaScene) -> None:
-        self._scene = scene
+    def __init__(self, scene: SionnaScene, still: bool = False) -> None:
+        self._scene, self._still = scene, still
         self._offset = mi.UInt(aligned_indices(scene.offset_by_shape))
         self._surface_of = scene.surface_of
         self._surface = mi.UInt(aligned_indices(scene.surface_of))
@@ -560,20 +561,15 @@ class Faces:
         if self._surface_of is not self._scene.surface_of:
             self._surface_of = self._scene.surface_of
             self._surface = mi.UInt(aligned_indices(self._surface_of))
-        behind, triangle, hit = self._met(start, end, active)
-        return behind, dr.gather(mi.UInt, self._surface, triangle, hit)
-
-    def _met(self, start: Any, end: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Distance [m] from a segment's end to the first triangle along it, its number, and whether
-        there is one."""
         line = end - start
         length = dr.norm(line)
         active &= length > 0.0
         ray = mi.Ray3f(start, line / dr.select(length > 0.0, length, 1.0))
-        met = self._scene.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        mi_scene = self._scene.mi_scenery if self._still else self._scene.mi_scene
+        met = mi_scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         hit = active & met.is_valid()
         offset = dr.gather(mi.UInt, self._offset, mi.UInt(dr.reinterpret_array(mi.UInt, met.shape)), hit)
-        return met.t - length, offset + met.prim_index, hit
+        return met.t - length, dr.gather(mi.UInt, self._surface, offset + met.prim_index, hit)
 
     def nearest(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
         """Look along segments.
@@ -585,28 +581,14 @@ class Faces:
             How much farther than a segment's end [m] the first surface along it is, infinite where there is
             none, and its number, anything where there is none; each of Shape ``[Q]``.
         """
-        return _looked(self.along, start, end)
-
-    def first_triangle(self, start: Float64Array, end: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """As `nearest`, with the number of the triangle.
-
-        Args:
-            start, end: [m], Shape ``[Q, 3]``.
-        """
-        return _looked(self._met, start, end)
-
-
-def _looked(
-    look: Callable[[Any, Any, Any], tuple[Any, ...]], start: Float64Array, end: Float64Array
-) -> tuple[Float64Array, Int64Array]:
-    # One lane alone would be another kernel to Dr.Jit.
-    lanes = several(len(start))
-    behind, number, *_ = look(
-        positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
-    )
-    dr.eval(behind, number)
-    behind, number = behind.numpy()[: len(start)], number.numpy()[: len(start)]
-    return behind.astype(np.float64), number.astype(np.int64)
+        # One lane alone would be another kernel to Dr.Jit.
+        lanes = several(len(start))
+        behind, number = self.along(
+            positions(start[lanes]), positions(end[lanes]), dr.full(mi.Bool, True, len(lanes))
+        )
+        dr.eval(behind, number)
+        behind, number = behind.numpy()[: len(start)], number.numpy()[: len(start)]
+        return behind.astype(np.float64), number.astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,7 +143,8 @@ class PathFinder:
         known_options = replace(options, max_depth=depth)
         earlier = before._scenery if before is not None and before._enumerated is not None else None
         transmitters = [d for d in self._run.devices if d.kind == "antenna" and d.role in ("tx", "both")]
-        moving = any(device.on for device in transmitters)
+        # Of transmitters that only frames tell of, any may move.
+        moving = not transmitters or any(device.on for device in transmitters)
         self._scenery = SceneryChains(
             scene, known_options, launch, s.samples_per_frame, moving, cache, earlier
         )
@@ -164,7 +165,11 @@ class PathFinder:
         self.notes += tuple(dict.fromkeys(cache.notes) if cache else ())
 
     def compile_kernels(self) -> None:
-        """Trace above the scene, so that every kernel that frames need is compiled before the first one."""
+        """Trace above the scene, so that every kernel that frames need is compiled before the first one.
+
+        Raises:
+            SetupError: A library is missing (`compiled_loops.compile_loops`).
+        """
         scene, options, s = self._scene, self.options, self._settings
         # Of an episode before this one, in the same scene.
         if (s, options) in scene.compiled:
@@ -190,12 +195,18 @@ class PathFinder:
             for tracer in tracers:
                 tracer.trace(above, receivers, corners=corners)
         if self._enumerated is not None:
+            loops = importlib.import_module("caviar_services.channel.enumeration.compiled_loops")
+            loops.compile_loops(self._compiling)
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
             look = self.tracer.look
             look.nearest(receivers, receivers - 1.0)
             chains = np.full((len(receivers), options.max_depth), -1)
             look.reflected(chains, receivers, receivers - 1.0)
+
+    def _compiling(self, number: int, count: int) -> None:
+        phase = f"compiling kernels of enumeration {number + 1}/{count}"
+        self._run.progress(phase, COMPILE_GRACE_S)
 
     def _enumerate_above(self, tracer: EnumeratedTracer, above: Float64Array) -> None:
         """Enumerate paths among two bodies of each mesh there, with a chain of scenery of each length."""

@@ -98,7 +98,7 @@ class Tracer:
         self._patterns = antenna_pattern_registry.get("iso")(polarization="VH").patterns
         self._faces = Faces(scene)
         generator = edge_generator(scene.edges) if scene.edges and options.diffraction else None
-        self._launcher = PartedLauncher(scene.mi_scene, options, generator)
+        self._launcher = PartedLauncher(scene, options, generator)
         self._thinning: Thinning | None = None
         if options.diffuse_paths is not None:
             self._thinning = Thinning(scene.mi_scene, options.diffuse_paths, options.seed)

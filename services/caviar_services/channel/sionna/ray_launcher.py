@@ -39,6 +39,7 @@ from caviar_protocol.seeding import derive_seed
 from caviar_services.channel.paths import Antenna
 from caviar_services.channel.propagation.patterns import FormulaPattern
 from caviar_services.channel.sionna import dr, mi
+from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_services.drjit_setup import aligned_columns, aligned_indices, several
 from caviar_space.materials import EPSILON_0
 
@@ -199,24 +200,24 @@ class PartedLauncher:
     """Launches the rays in parts, so that memory is bounded whatever their number.
 
     Args:
-        mi_scene: Where they go, a `mitsuba.Scene`.
+        scene: Where they go.
         options: What is traced.
         generator: See `Launcher`.
     """
 
-    def __init__(self, mi_scene: Any, options: LaunchOptions, generator: Any = None) -> None:
-        self._made_of = mi_scene, options, generator
+    def __init__(self, scene: SionnaScene, options: LaunchOptions, generator: Any = None) -> None:
+        self._made_of = scene, options, generator
 
     @cached_property
     def _parts(self) -> list[tuple[int, int, Launcher]]:
         """First ray of each part, the one past its last, and what launches it; made at the first launch,
         which where all is enumerated never comes."""
-        mi_scene, options, generator = self._made_of
+        scene, options, generator = self._made_of
         # All passes of a ray are lanes of one launch.
         at_once = max(1, options.rays_at_once // max(len(options.passes), 1))
         begins = range(0, options.samples, at_once)
         bounds = [(begin, min(begin + at_once, options.samples)) for begin in begins]
-        return [(begin, end, Launcher(mi_scene, options, (begin, end), generator)) for begin, end in bounds]
+        return [(begin, end, Launcher(scene, options, (begin, end), generator)) for begin, end in bounds]
 
     @property
     def in_parts(self) -> bool:
@@ -260,7 +261,7 @@ class Launcher:
     """Launches the rays; one kernel serves every depth.
 
     Args:
-        mi_scene: Where they go, a `mitsuba.Scene`.
+        scene: Where they go.
         options: What is traced.
         part: Numbers of the first ray and of the one past the last; absent: all rays.
         generator: What says how rays go on, a `SBCandidateGenerator` of Sionna RT; absent: that itself.
@@ -268,7 +269,7 @@ class Launcher:
 
     def __init__(
         self,
-        mi_scene: Any,
+        scene: SionnaScene,
         options: LaunchOptions,
         part: tuple[int, int] | None = None,
         generator: Any = None,
@@ -276,7 +277,7 @@ class Launcher:
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
         from sionna.rt.utils import fibonacci_lattice
 
-        self._mi_scene = mi_scene
+        self._scene = scene
         self._options = options
         self._generator = SBCandidateGenerator() if generator is None else generator
         self._sampler = self._generator._sampler
@@ -337,7 +338,8 @@ class Launcher:
         """Next interaction of all rays, and how they go on. Rules of what may follow what are Sionna RT's."""
         ray = mi.Ray3f(origin, direction)
         # Coherent: lanes are in the order of the curve, so neighbours walk the tree together.
-        hit = self._mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
+        mi_scene = self._scene.mi_scene
+        hit = mi_scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
         active &= hit.is_valid()
         sampler = self._sampler
         drawn = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()

@@ -33,6 +33,7 @@ from caviar_protocol.space.scene import object_pose
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import Media
+from caviar_services.channel.sionna import mi
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene_loading import (
     BodyPool,
@@ -163,6 +164,8 @@ class SionnaScene(NumberedTriangles):
         self.notes += self._pool.notes
         self._at_rest = shapes
         self._standing: frozenset[Body] = frozenset()
+        # Vertices of bodies that the ray tracer has, and the version of the scene that they are of.
+        self._shown, self._shown_version = np.zeros((0, 3)), -1
         self.turning: Turning | None = None
         """How the objects turn that bodies stand for, by the names that `place` returned; None: none does."""
         self._skin = RadioMaterial(
@@ -258,13 +261,32 @@ class SionnaScene(NumberedTriangles):
 
     @property
     def mi_scene(self) -> Any:
-        """The Mitsuba scene, in metres relative to `centre`."""
-        return self._scene.mi_scene
+        """The Mitsuba scene as it stands, in metres relative to `centre`."""
+        return self.rt_scene.mi_scene
 
     @property
     def rt_scene(self) -> Any:
-        """The `sionna.rt.Scene`, in metres relative to `centre`."""
+        """The `sionna.rt.Scene` as it stands, in metres relative to `centre`.
+
+        Bodies are moved in it when it is asked for: an update takes a fifth of a frame of enumerated paths.
+        """
+        if self._shown_version != self.version:
+            bodies = self.relative[len(self.vertices) - len(self._vertices) :]
+            end, params = 0, self._scene.mi_scene_params
+            for shape in self._moving:
+                begin, end = end, end + sum(len(mesh.vertices) for mesh in shape.meshes)
+                # Each update rebuilds the tree of a shape: only of those that moved.
+                if not np.array_equal(self._shown[begin:end], bodies[begin:end]):
+                    params[f"{shape.id}.vertex_positions"] = floats(bodies[begin:end])
+            params.update()
+            self._shown, self._shown_version = bodies.copy(), self.version
         return self._scene
+
+    @cached_property
+    def mi_scenery(self) -> Any:
+        """The scenery alone, a `mitsuba.Scene` in metres relative to `centre`."""
+        shapes = {shape.id: item.mi_mesh for shape, item in self._rt_objects if shape in self._at_rest}
+        return mi.load_dict({"type": "scene", **shapes})
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
@@ -381,7 +403,7 @@ class SionnaScene(NumberedTriangles):
             self._shapes, ids, self._pool.bodies, self._pool.meshes, self.centre, len(self._moving)
         )
         self.version = version + 1
-        self._standing = frozenset()
+        self._standing, self._shown_version = frozenset(), -1
         self.bodies_version += 1
         self.__dict__.pop("_surface_materials", None)
         if self.edges is not None:
@@ -473,16 +495,7 @@ class SionnaScene(NumberedTriangles):
                     turning.angular_velocity[number] = scene.angular_velocity[i]
             elif body in self._standing:
                 vertices[rows] = self._middle
-        # With several shapes, only those that moved are updated: each update rebuilds the tree of a shape.
-        before = self._vertices.copy() if len(self._moving) > 1 else None
-        if self.move(vertices):
-            params = self._scene.mi_scene_params
-            end = 0
-            for shape in self._moving:
-                begin, end = end, end + sum(len(mesh.vertices) for mesh in shape.meshes)
-                if before is None or not np.array_equal(before[begin:end], vertices[begin:end]):
-                    params[f"{shape.id}.vertex_positions"] = floats(vertices[begin:end] - self.centre)
-            params.update()
+        self.move(vertices)
         self._standing, self.turning = frozenset(standing), turning
         return tuple(names), velocity
 

@@ -141,7 +141,8 @@ class NumberedTriangles:
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
         # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
-        self._relative = self.vertices - centre
+        self.relative = self.vertices - centre
+        """All vertices as they stand, in the ray tracer's coordinates [m], Shape ``[V, 3]``."""
         self.joined: JoinedFaces
         """Which faces are one surface."""
         material = np.repeat(np.arange(len(shapes)), [len(shape.meshes) for shape in shapes])
@@ -178,13 +179,13 @@ class NumberedTriangles:
         self._vertices[:] = vertices
         self.version += 1
         first = len(self.vertices) - len(vertices)
-        self._relative[first:][changed] = vertices[changed] - self.centre
+        self.relative[first:][changed] = vertices[changed] - self.centre
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
         moved = changed[self.triangle_vertices[self._first_moving :] - first].any(1)
         triangles = self._first_moving + np.flatnonzero(moved)
         # Boxes of joined surfaces are around all of their planes: they are made anew.
         joined = np.array([group[0] for group in self.joined.groups], np.int64)
-        self.plane_table.update(self._relative, np.union1d(self.plane_of[triangles], joined))
+        self.plane_table.update(self.relative, np.union1d(self.plane_of[triangles], joined))
         # Find the faces that are one surface now.
         before, self.joined = self.joined, self._coplanar.find()
         self.plane_table.join(self.joined.groups)
@@ -429,7 +430,7 @@ class NumberedTriangles:
         parts = np.concatenate([number + first for number, first in zip(numbers, before, strict=True)])
         faces = self.triangle_vertices.astype(np.int64)
         apart = PlaneTable(parts.astype(np.int64), faces)
-        apart.update(self._relative)
+        apart.update(self.relative)
         self.part_of = parts.astype(np.int64)
         """Plane face of each triangle, numbered through all objects, of which none share any."""
         shared = shared_planes(apart, np.repeat(material[:still], counts[:still]))
@@ -438,7 +439,7 @@ class NumberedTriangles:
         self.first_moving_plane = int(len(apart.normal) and int(shared.max()) + 1 - int(counts[still:].sum()))
         """Number of the first plane of a body; those of scenery come before."""
         self.plane_table = PlaneTable(self.plane_of, faces)
-        self.plane_table.update(self._relative)
+        self.plane_table.update(self.relative)
         two_sided = {asset: two_sided_planes(mesh, of_asset[asset]) for asset, mesh in unit_meshes.items()}
         sides = [np.zeros(0, np.bool_), *(two_sided[asset] for asset, _ in self._bodies)]
         self._coplanar = CoplanarFaces(
