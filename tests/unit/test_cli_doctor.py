@@ -16,6 +16,7 @@ from caviar_clients.cli import doctor
 from caviar_clients.cli.doctor import Check
 from caviar_clients.cli.scenarios import extras_of
 from caviar_protocol.errors import SetupError
+from caviar_protocol.host import install_command
 from caviar_protocol.scenario import load_scenario, shipped_scenarios
 from caviar_services import drjit_setup
 
@@ -75,6 +76,12 @@ def test_the_exit_status_is_1_as_soon_as_one_thing_is_missing() -> None:
     good, bad = Check("a", True, "1"), Check("b", False, "none", "make b")
     assert doctor.exit_status([good, good]) == 0
     assert doctor.exit_status([good, bad]) == 1
+
+
+def test_warming_up_needs_numba_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("caviar_services.channel.enumeration.compiled_loops.numba", None)
+    with pytest.raises(SetupError, match=re.escape(install_command("channel"))):
+        doctor.warm(Console())
 
 
 def test_a_remedy_is_shown_whole_so_that_it_can_be_copied() -> None:

@@ -107,6 +107,22 @@ def doctor() -> list[Check]:
     return checks
 
 
+def warm(console: Console) -> None:
+    """Compile the loops of enumerated channels into the user's cache, where they are not there yet.
+
+    Args:
+        console: Where the progress goes.
+
+    Raises:
+        SetupError: Numba is not installed.
+    """
+    from caviar_services.channel.enumeration.compiled_loops import compile_loops
+
+    with console.status("compiling the channel's loops") as shown:
+        compile_loops(lambda number, count: shown.update(f"compiling loop {number + 1} of {count}"))
+    console.print("loops of enumerated channels are compiled")
+
+
 def exit_status(checks: list[Check]) -> int:
     """Work out the exit status: 1 where something is wrong. An extra that is not installed is optional."""
     return 0 if all(check.ok or check.extra for check in checks) else 1

@@ -289,6 +289,10 @@ def status(
 @command(OPERATE)
 def doctor(
     run: Annotated[Path | None, typer.Argument(help="directory of a damaged run", show_default=False)] = None,
+    warm: Annotated[
+        bool,
+        typer.Option("--warm", help="compile the channel's loops, for which a first run else waits"),
+    ] = False,
 ) -> None:
     """Check what this machine has, or say what of a damaged RUN can be read, and save that beside it."""
     if run is not None:
@@ -297,6 +301,8 @@ def doctor(
         raise typer.Exit(rescue_run(run, _console))
     from caviar_clients.cli import doctor as checks
 
+    if warm:
+        checks.warm(_console)
     found = checks.doctor()
     checks.render(found, _console)
     raise typer.Exit(checks.exit_status(found))
