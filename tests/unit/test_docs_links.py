@@ -57,6 +57,12 @@ def anchors(page: Path) -> frozenset[str]:
     return frozenset(found)
 
 
+def is_rendered(page: Path) -> bool:
+    """Whether `make docs` makes a page of a file."""
+    beside = (ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md")
+    return page in beside or any(page.is_relative_to(ROOT / folder) for folder in ("docs", "protocol"))
+
+
 def dead_links(page: Path) -> Iterator[str]:
     """Links and pictures of a page that lead nowhere in the repository."""
     for token in tokens(page.read_text("utf-8")):
@@ -69,6 +75,8 @@ def dead_links(page: Path) -> Iterator[str]:
             continue
         if not file.exists():
             yield f"{target}: there is no such file"
+        elif file.suffix == ".md" and is_rendered(page) and not is_rendered(file):
+            yield f"{target}: make docs renders {page.name} and not {file.name}"
         elif name and (file.suffix != ".md" or name not in anchors(file)):
             yield f"{target}: {file.name} has no heading of that name"
 

@@ -11,7 +11,8 @@ reflected last, −1 for none. Targets are a tuple of
 2. ``frames``, Shape ``[F, 3, 3]``: unit vectors along the sides of each rectangle, and their half lengths,
 3. ``bodies``, Shape ``[4, V]``: centre and radius of the sphere around each,
 4. ``begin``: the faces of body v are ``begin[v]`` to ``begin[v + 1]``,
-5. ``sight_begin``, and 6. ``sights``: face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``,
+5. ``sight_begin``: face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``,
+6. ``sights``,
 7. ``slack`` by which every target is larger [m].
 
 Edges are a tuple of

@@ -487,7 +487,7 @@ class _Parts:
     def __call__(self, part: int, parts: int) -> None:
         left_s = (time.monotonic() - self._began) * (parts / part - 1) if part else 0.0
         left = f", {left_s:.0f} s left" if part else ""
-        self._tell(f"{self._what}, part {part + 1} of {parts}{left}")
+        self._tell(f"{self._what}, {part + 1} of {parts}{left}")
 
 
 def launched_chains(
@@ -647,7 +647,7 @@ class ChainCache:
                 stack.callback(os.close, lock)  # which unlocks it, as the end of the process does
                 while not _locked(lock) and time.monotonic() < until:
                     told = os.pread(lock, _TOLD_B, 0).decode(errors="replace")
-                    progress(f"another process is {told.strip() or 'launching scenery rays'}")
+                    progress(f"{told.strip() or 'launching scenery rays'}, in another process")
                     time.sleep(_LOOK_S)
                 stack.callback(path.unlink, missing_ok=True)
             yield tell
