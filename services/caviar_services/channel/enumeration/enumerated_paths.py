@@ -138,6 +138,11 @@ class EnumeratedTracer:
             parts.append(replace(traced.take(kept), lost=len(kept) - int(kept.sum())))
         return joined(parts, len(scene.wavelengths), self._depth)
 
+    def compile_kernels(self) -> None:
+        """Have the ray tracer's kernel compiled that tells which scenery receivers see, if there is much."""
+        if self._scene.first_moving_plane > _FEW:
+            seen_planes(self._look, np.zeros((2, 3)), np.arange(1), rays=4)
+
     def _numbered(self, scenery: KnownScenery) -> tuple[FaceRectangles, Int64Array, Int64Array]:
         """Faces of scenery, and its chains and sights as numbers of these."""
         planes, sights = scenery.chains.astype(np.int64), scenery.sights.astype(np.int64)

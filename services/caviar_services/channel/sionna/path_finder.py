@@ -198,6 +198,7 @@ class PathFinder:
         if self._enumerated is not None:
             loops = importlib.import_module("caviar_services.channel.enumeration.compiled_loops")
             loops.compile_loops(self._compiling)
+            self._enumerated.compile_kernels()
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
             look = self.tracer.look
