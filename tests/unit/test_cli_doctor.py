@@ -138,7 +138,7 @@ def test_a_process_that_aborts_is_named_by_its_signal() -> None:
 
 
 def test_what_an_extra_lacks_becomes_one_pip_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    versions = {"sionna-rt": "2.2.0", "mitsuba": "3.5.0", "drjit": None, "scipy": "1.18.0"}
+    versions = {"sionna-rt": "2.2.0", "mitsuba": "3.5.0", "drjit": None, "numba": "0.68.1", "scipy": "1.18.0"}
     monkeypatch.setattr(doctor, "_version", versions.get)
     check = doctor.check_extra("channel")
     assert not check.ok
