@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -148,3 +149,24 @@ def test_each_pace_that_a_scenario_may_have_is_told_of_by_the_help_and_the_page(
     for word in words:
         assert re.search(rf"\b{word}\b", help_text), word
         assert f"`{word}`" in page
+
+
+def test_ctrl_c_that_comes_while_an_object_is_finalised_is_not_lost() -> None:
+    script = """
+import signal, time
+from caviar_clients.cli import main
+
+class Finalised:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def app():
+    Finalised()
+    for _ in range(600):
+        time.sleep(0.05)
+
+main.app = app
+main.main()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "")

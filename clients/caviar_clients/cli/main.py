@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
+import threading
 import warnings
 from contextlib import nullcontext
 from importlib import metadata
@@ -453,9 +455,20 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     _errors.print(Text.assemble(("caviar: warning:", "yellow"), f" {message}"), soft_wrap=True)
 
 
+def _give_again(lost: Any) -> None:
+    """Give an order to end again that came while an object was finalised: Python ignores it there."""
+    if lost.exc_type is KeyboardInterrupt:
+        again = threading.Timer(0.1, _thread.interrupt_main)
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
 def main() -> None:
     """Entry point: errors meant for the user become one line and status 1, warnings a line."""
     warnings.showwarning = _show_warning
+    sys.unraisablehook = _give_again
     # As Ctrl-C, so that temporary folders and child processes are not left; one that is ignored stays so.
     for order in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(order) is signal.SIG_DFL:
