@@ -166,7 +166,7 @@ def app():
         time.sleep(0.05)
 
 main.app = app
-signal.signal(signal.SIGINT, signal.default_int_handler)  # as `caviar` does; a job in the background ignores it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a job in the background ignores
 main.main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

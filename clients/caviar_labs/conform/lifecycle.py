@@ -239,7 +239,7 @@ def observe(kit: Kit) -> str:
 JOINING = (hello, observe, attach, heartbeats, ready, scenery, early_grant, reset)
 
 
-SILENCE_S = 0.5
+SILENCE_S = 1.5
 """[s] of liveness where the broker falls silent."""
 TOLERANCE_S = 2.0
 """[s] that an end may take beyond that: interpreters with many libraries take long to end."""
