@@ -23,7 +23,6 @@ from reference_pages import api  # noqa: E402
 from sphinx import addnodes  # noqa: E402
 from sphinx.domains.python import PythonDomain  # noqa: E402
 from sphinx.ext.napoleon import Config  # noqa: E402
-from sphinx.pycode.parser import Parser  # noqa: E402
 
 from caviar_services.registry import scenario_schema  # noqa: E402
 
@@ -59,8 +58,6 @@ autodoc_default_options = {
 }
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-# Lines at which functions begin and end, which no extension here asks for: a tenth of a build.
-Parser.parse_definition = lambda _: None  # type: ignore[method-assign]
 autodoc_use_type_comments = False  # there are none, and looking for them reads the source of every function
 maximum_signature_line_length = 88
 

@@ -108,7 +108,7 @@ def doctor() -> list[Check]:
 
 
 def warm(console: Console) -> None:
-    """Compile the loops of enumerated channels into the user's cache, where they are not there yet.
+    """Compile the loops of enumerated channels into Numba's cache, where they are not there yet.
 
     Args:
         console: Where the progress goes.

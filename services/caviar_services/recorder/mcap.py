@@ -255,7 +255,7 @@ class McapRecorder(Recorder[McapSettings]):
         return StepResult(measured={"write": time.perf_counter_ns() - begin})
 
     def _is_new_source(self, entry: GrantInput) -> bool:
-        """Whether this is one of the first large products of its source: a wrong way to hash shows there."""
+        """Count a large product; whether it is one of the first of its source, where wrong hashing shows."""
         key = entry.topic, entry.source
         self._compared[key] += 1
         return self._compared[key] <= FIRST_LOOKS

@@ -3,8 +3,9 @@
 No frame waits for a compiler, since a loop takes no other types than those of its signature. There are no
 threads, no reassociated sums and no fused products, so that results are the same bits on every processor.
 
-Numba's cache on disk looks at the date of a loop's own file and not at those of what the loop calls: so a
-module of loops calls no compiled function of another one.
+Numba's cache on disk looks at the date of a loop's own file and not at those of what the loop takes from
+elsewhere: so a module of loops calls no compiled function of another one, and has constants of others as
+arguments.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.sionna import LateModule
-from caviar_space.rectangles import FaceRectangles
+from caviar_space.rectangles import RIM, FaceRectangles
 
 kernels: Any = LateModule("caviar_services.channel.enumeration.beam_kernels", keeps=True)
 path_kernels: Any = LateModule("caviar_services.channel.enumeration.path_kernels", keeps=True)
@@ -78,7 +78,7 @@ class Targets:
         )
         """As `beam_kernels` takes them."""
         triangles = np.ascontiguousarray(faces.triangles), np.append(0, np.cumsum(faces.sizes))
-        self._mirrors = self.arrays[0], frames, *triangles
+        self._mirrors = self.arrays[0], frames, *triangles, RIM
 
     def reflections(
         self, chain: Int64Array, start: Float64Array, end: Float64Array

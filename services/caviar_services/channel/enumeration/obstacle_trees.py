@@ -14,6 +14,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.image_beams import path_kernels
 from caviar_services.channel.sionna.scene import SionnaScene
+from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE
 
 OFF_SURFACE = 2e-4
 """[m]; rays from face to face start this far from the first face, whose points are rounded."""
@@ -80,8 +81,9 @@ class ObstacleTrees:
 
     def unhidden(self, *paths: Float64Array | Int64Array) -> BoolArray:
         """Mask of paths without an obstacle; the arguments are the first ones of `path_kernels.unhidden`."""
-        planes = self._scene.plane_table
+        scene, planes = self._scene, self._scene.plane_table
+        tolerances = OFF_SURFACE, AT_END, COPLANAR, COPLANAR_RELATIVE
         free: BoolArray = path_kernels.unhidden(
-            *paths, *self._fitted(), self._scene.surface_of, planes.normal, planes.origin
+            *paths, *self._fitted(), scene.surface_of, planes.normal, planes.origin, *tolerances
         )
         return free

@@ -15,9 +15,6 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_services.channel.enumeration.compiled_loops import compiled, loop
-from caviar_services.channel.enumeration.obstacle_trees import AT_END, OFF_SURFACE
-from caviar_space.planes import COPLANAR, COPLANAR_RELATIVE
-from caviar_space.rectangles import RIM
 
 Ray = tuple[float, float, float, float, float, float]
 Trees = tuple[Int64Array, Int64Array, Float64Array, Float64Array]
@@ -34,8 +31,8 @@ _SLACK = 2e-3
 
 
 @compiled
-def _in_triangle(u: float, v: float, triangles: Float64Array, first: int, past: int) -> bool:
-    """Test whether a point of a plane lies in one of some triangles, to the rim."""
+def _in_triangle(u: float, v: float, triangles: Float64Array, first: int, past: int, rim: float) -> bool:
+    """Test whether a point of a plane lies in one of some triangles, or no farther outside than a rim [m]."""
     for t in range(first, past):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         area = (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])
@@ -46,7 +43,7 @@ def _in_triangle(u: float, v: float, triangles: Float64Array, first: int, past: 
             # Twice the area of the triangle of point and side over the side's length is the distance from the
             # side.
             across = x * (v - one[1]) - y * (u - one[0])
-            inside &= across * side >= -RIM * math.sqrt(x * x + y * y)
+            inside &= across * side >= -rim * math.sqrt(x * x + y * y)
         if inside:
             return True
     return False
@@ -54,13 +51,14 @@ def _in_triangle(u: float, v: float, triangles: Float64Array, first: int, past: 
 
 @loop(
     "Tuple((f8[:,:,::1], b1[::1]))"
-    "(f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[::1], i8[:,::1], f8[:,::1], f8[:,::1])"
+    "(f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[::1], f8, i8[:,::1], f8[:,::1], f8[:,::1])"
 )
 def reflections(
     faces: Float64Array,
     frames: Float64Array,
     triangles: Float64Array,
     begin: Int64Array,
+    rim: float,
     chain: Int64Array,
     start: Float64Array,
     end: Float64Array,
@@ -72,6 +70,7 @@ def reflections(
         frames: See ``faces``.
         triangles: Of the faces, in their frames [m], Shape ``[T, 3, 2]``.
         begin: Those of face f are ``begin[f]`` to ``begin[f + 1]``.
+        rim: Around triangles [m].
         chain: Faces in turn, −1 past the last, Shape ``[N, D]``.
         start: Position [m], Shape ``[N, 3]``; ``end`` likewise.
         end: See ``start``.
@@ -121,7 +120,7 @@ def reflections(
         # Triangles cost most: they are tested where all rectangles are met.
         for d in range(count):
             f = chain[n, d]
-            good[n] = good[n] and _in_triangle(flat[d, 0], flat[d, 1], triangles, begin[f], begin[f + 1])
+            good[n] = good[n] and _in_triangle(flat[d, 0], flat[d, 1], triangles, begin[f], begin[f + 1], rim)
     return points, good
 
 
@@ -268,7 +267,7 @@ def first_met(
 
 @loop(
     "b1[::1](f8[:,:,::1], i8[::1], i8[::1], f8[:,:,::1], i8[:,:,::1], i8[:,::1], "
-    f"i8[:,::1], {_TREES}, i8[::1], f8[:,::1], f8[:,::1])"
+    f"i8[:,::1], {_TREES}, i8[::1], f8[:,::1], f8[:,::1], f8, f8, f8, f8)"
 )
 def unhidden(
     corners: Float64Array,
@@ -282,12 +281,16 @@ def unhidden(
     surface_of: Int64Array,
     plane_normals: Float64Array,
     plane_origins: Float64Array,
+    off_surface: float,
+    at_end: float,
+    coplanar: float,
+    coplanar_relative: float,
 ) -> BoolArray:
     """Mask of paths without an obstacle on their segments.
 
-    A segment is free if a ray along it first meets the surface at its end, or something within `AT_END` of it
-    that does not stand in front of it: rays that end before would lose what grazes. Both faces of an edge are
-    no obstacle to a segment that ends there: what a ray meets of them is rounding.
+    A segment is free if a ray along it first meets the surface at its end, or something within ``at_end`` of
+    it that does not stand in front of it: rays that end before would lose what grazes. Both faces of an edge
+    are no obstacle to a segment that ends there: what a ray meets of them is rounding.
 
     Args:
         corners: Transmitter, interactions, and the receiver in all places past the last [m], Shape ``[P, D +
@@ -302,6 +305,11 @@ def unhidden(
         surface_of: Surface of each triangle.
         plane_normals: Unit normals of planes; ``plane_origins`` has a point of each.
         plane_origins: See ``plane_normals``.
+        off_surface: How far from a face the ray that leaves it starts [m].
+        at_end: See above [m].
+        coplanar: Distance between parallel planes that rounding may make [m], and ``coplanar_relative``, what
+            the largest coordinate adds to it.
+        coplanar_relative: See ``coplanar``.
     """
     free, start, end = np.ones(len(corners), np.bool_), np.empty(3), np.empty(3)
     stack = np.empty(_DEEPEST, np.int64)
@@ -314,8 +322,8 @@ def unhidden(
                 along += (corners[p, b, c] - corners[p, a, c]) * normals[p, a, c]
             # Off a face on the ray's side. A ray ends on a face, but beside an edge: rounding would put its
             # end into one of both faces.
-            lift = OFF_SURFACE * (1.0 if a == bend[p] + 1 else np.sign(along))
-            beside = OFF_SURFACE if b == bend[p] + 1 else 0.0
+            lift = off_surface * (1.0 if a == bend[p] + 1 else np.sign(along))
+            beside = off_surface if b == bend[p] + 1 else 0.0
             for c in range(3):
                 start[c] = corners[p, a, c] + lift * normals[p, a, c]
                 end[c] = corners[p, b, c] + beside * normals[p, b, c]
@@ -325,7 +333,7 @@ def unhidden(
             met, wanted = surface_of[triangle], planes[p, b]
             if met == surfaces[p, b, 0] or met == surfaces[p, b, 1]:
                 continue
-            free[p] = behind >= -AT_END
+            free[p] = behind >= -at_end
             if free[p] and wanted >= 0:
                 # Of parallel faces that are farther apart than rounding, the one in front hides the other.
                 dot, height, most = 0.0, 0.0, 0.0
@@ -333,7 +341,7 @@ def unhidden(
                     dot += plane_normals[met, c] * plane_normals[wanted, c]
                     height += (end[c] - plane_origins[met, c]) * plane_normals[met, c]
                     most = max(most, abs(end[c]))
-                free[p] = abs(dot) <= _PARALLEL or abs(height) <= COPLANAR + COPLANAR_RELATIVE * most
+                free[p] = abs(dot) <= _PARALLEL or abs(height) <= coplanar + coplanar_relative * most
             if not free[p]:
                 break
     return free

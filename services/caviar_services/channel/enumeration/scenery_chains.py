@@ -626,10 +626,12 @@ class ChainCache:
 
         Args:
             key: From `cache_key`.
-            progress: Called with what the process does that is waited for, for `_PATIENCE_S` at most.
+            progress: Called with the phase of the process that holds the lock, while this one waits for it,
+                for `_PATIENCE_S` at most.
 
         Yields:
-            What is called with what this process does: others are told it, too.
+            Function that takes each phase of this process: it calls ``progress``, and writes the phase to the
+            lock's file, from where processes that wait read it.
         """
         path, until = self._folder / f"{key}.lock", time.monotonic() + _PATIENCE_S
         lock = -1

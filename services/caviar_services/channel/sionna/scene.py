@@ -101,8 +101,9 @@ class SceneSettings:
     free_edges: bool = False
     """Whether the rims of open surfaces are edges too."""
     detail: DetailSettings = field(default_factory=DetailSettings)
-    object_faces: int | None = None
     """What of the scenery is left out."""
+    object_faces: int | None = None
+    """Faces of an object's mesh at most; None: any number."""
     solid_walls_m: float | None = None
     """Closed plates up to this thickness are one slab of it; None: a slab for each of their faces."""
     objects: ObjectMaterials = field(default_factory=ObjectMaterials)

@@ -593,9 +593,11 @@ class BodyPool:
         )
 
     def _read(self, files: Mapping[str, Path]) -> dict[str, Mesh]:
-        meshes, most = object_meshes(files), self._most_faces
-        for name, mesh in meshes.items() if most else ():
-            meshes[name], off = with_few_faces(mesh, most or 0)
+        meshes = object_meshes(files)
+        if self._most_faces is None:
+            return meshes
+        for name, mesh in meshes.items():
+            meshes[name], off = with_few_faces(mesh, self._most_faces)
             if off:
                 faces = f"{len(mesh.faces):,} → {len(meshes[name].faces):,} faces"
                 self.notes += (f"mesh {name!r}: {faces}, within {off:.2%} of its sides (object_faces)",)

@@ -161,7 +161,7 @@ class SionnaSettings(ChannelSettings, frozen=True, kw_only=True):
     0 and ``follow`` refuse it."""
     object_faces: Annotated[int, quantity("1", "faces of an object's mesh at most", ge=12)] | None = None
     """A mesh of a moving object with more is decimated, by no more than 1/16 of its sides; a note says by how
-    much. Absent: meshes are as they are."""
+    much, of meshes that are there at the beginning. Absent: meshes are as they are."""
     without_body: tuple[str, ...] = ()
     """Classes of objects that the waves pass through."""
     body_material: str = "metal"
