@@ -239,8 +239,10 @@ def observe(kit: Kit) -> str:
 JOINING = (hello, observe, attach, heartbeats, ready, scenery, early_grant, reset)
 
 
-SILENCE_S = 1.5
+SILENCE_S = 0.5
 """[s] of liveness where the broker falls silent."""
+ATTEMPTS = 5
+"""Lives of a client of which one has to be answered in time."""
 TOLERANCE_S = 2.0
 """[s] that an end may take beyond that: interpreters with many libraries take long to end."""
 SIGTERM_S = 2.0
@@ -303,12 +305,16 @@ def sigterm(kit: Kit) -> str:
 @case("silence", "clause 15", "an end with a status other than 0, after liveness_ns and not before")
 def silence(kit: Kit) -> str:
     """A client whose broker is silent ends by itself."""
-    session = kit.fresh()
-    # Twice the liveness with answers comes first: a client that counts from its start would pass otherwise.
-    session.welcome(heartbeat_s=SILENCE_S / 10, liveness_s=SILENCE_S)
-    session.prepare()
-    session.listen(2 * SILENCE_S)
-    early = session.client.ended()
+    for _ in range(ATTEMPTS):
+        session = kit.fresh()
+        # Twice the liveness with answers comes first: a client that counts from its start would pass else.
+        session.welcome(heartbeat_s=SILENCE_S / 10, liveness_s=SILENCE_S)
+        session.prepare()
+        longest = session.listen(2 * SILENCE_S)
+        early = session.client.ended()
+        # On a machine that is so busy that the kit was silent itself, the client may be right to end.
+        if early is None or longest < SILENCE_S / 2:
+            break
     if early is not None:
         raise Failed("a client that stays while it is answered", str(early))
     session.silent = True

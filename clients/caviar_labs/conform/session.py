@@ -195,11 +195,15 @@ class Session:
             self._inbox.append(received)
         return True
 
-    def listen(self, seconds: float) -> None:
-        """Answer heartbeats for a while [s]."""
-        until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0:
+    def listen(self, seconds: float) -> float:
+        """Answer heartbeats for a while [s]; the longest time in it without a look at them [s]."""
+        last = time.monotonic()
+        until, longest = last + seconds, 0.0
+        while (left := until - last) > 0:
             self.pump(min(left, 0.02))
+            before, last = last, time.monotonic()
+            longest = max(longest, last - before)
+        return longest
 
     def _take_heartbeat(self, received: Received) -> None:
         self.pulse.route = received.route
