@@ -10,7 +10,7 @@ cells define their planes at once: a greedy clustering over a hash grid. The res
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -323,7 +323,8 @@ class PlaneTable:
         self.high = np.zeros((count, 3))
         # Of triangles, over the axes: planes of thousands are searched, the ground with all floors on it.
         self._lows, self._highs = np.zeros((2, 3, len(numbers)))
-        self._joined: Sequence[Int64Array] = ()
+        # By each plane of a surface but the first, whose triangles come before those of the others.
+        self._joined: Mapping[int, Int64Array] = {}
 
     def update(self, corners: Float64Array, planes: Int64Array | None = None) -> None:
         """Find planes anew.
@@ -362,7 +363,7 @@ class PlaneTable:
         Args:
             groups: Planes of each surface, in ascending order.
         """
-        self._joined = groups
+        self._joined = {plane: group for group in groups for plane in group[1:].tolist()}
         for group in groups:
             self.low[group[0]] = self.low[group].min(0)
             self.high[group[0]] = self.high[group].max(0)
@@ -426,12 +427,13 @@ class PlaneTable:
         # Within a plane triangles are in ascending order.
         hits, where = np.unique(hit[held], return_index=True)
         first[hits] = candidate[held][where]
-        for group in self._joined:
-            for row in np.flatnonzero(np.isin(plane, group[1:])).tolist():
-                others = np.sort(self.triangles_of(group)[0])
-                others = others[others < first[row]]
-                holding = others[_holds(self.corners_of(others), points[np.full(len(others), row)])]
-                first[row] = holding[0] if len(holding) else first[row]
+        for row, group in enumerate(map(self._joined.get, plane.tolist()) if self._joined else ()):
+            if group is None:
+                continue
+            others = np.sort(self.triangles_of(group)[0])
+            others = others[others < first[row]]
+            holding = others[_holds(self.corners_of(others), points[np.full(len(others), row)])]
+            first[row] = holding[0] if len(holding) else first[row]
         return first
 
 

@@ -98,7 +98,8 @@ def rotation_matrix(q: Sequence[float]) -> Float64Array:
     """Rotation matrix R of a unit quaternion, Shape ``[3, 3]``: world = R · body.
 
     Args:
-        q: Unit quaternion (w, x, y, z).
+        q: Unit quaternion (w, x, y, z); of N an array of Shape ``[4, N]``, for matrices of Shape
+            ``[3, 3, N]``.
 
     Example:
         >>> north = rotation_matrix(quaternion_from_euler(math.pi / 2)) @ (1.0, 0.0, 0.0)

@@ -8,8 +8,10 @@ reflected last, −1 for none. Targets are a tuple of
 0. ``faces``, Shape ``[9, F]``: centre and radius of the sphere around each, unit normal, offset, and whether
    both sides reflect; those of scenery first,
 1. ``corners`` of the faces' rectangles, in turn, Shape ``[F, 4, 3]``,
-2. ``frames``, Shape ``[F, 3, 3]``: unit vectors along the sides of each rectangle, and their half lengths,
-3. ``bodies``, Shape ``[4, V]``: centre and radius of the sphere around each,
+2. ``frames``, Shape ``[F, 5, 3]``: unit vectors along the sides of each rectangle, their half lengths, its
+   centre and its unit normal,
+3. ``bodies``, Shape ``[7, V]``: centre and radius of the sphere around each, and half the sides of its box
+   along the axes,
 4. ``begin``: the faces of body v are ``begin[v]`` to ``begin[v + 1]``,
 5. ``sight_begin``: face f of scenery sees ``sights[sight_begin[f]:sight_begin[f + 1]]``,
 6. ``sights``,
@@ -17,9 +19,9 @@ reflected last, −1 for none. Targets are a tuple of
 
 Edges are a tuple of
 
-0. ``pieces``: spheres around the edges of each piece of the scene, Shape ``[4, P]``,
+0. ``pieces``: as ``bodies``, of the edges of each piece of the scene, Shape ``[7, P]``,
 1. ``begin``: the edges of piece p are ``begin[p]`` to ``begin[p + 1]``,
-2. ``spheres`` around each edge, Shape ``[4, E]``,
+2. ``boxes``: as ``bodies``, of each edge, Shape ``[7, E]``,
 3. ``ends``, Shape ``[E, 2, 3]``,
 4. ``normals`` of both faces, Shape ``[E, 2, 3]``,
 5. ``surfaces`` of these, Shape ``[E, 2]``,
@@ -47,9 +49,6 @@ _EDGES = "Tuple((f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,:
 
 AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 37
 """Columns of beams, and how many there are."""
-
-# Rows of spheres; faces have more.
-_SPHERE = 4
 
 # Cosine of the half angle of the widest cone that is tested; wider ones light everything.
 _WIDE = 0.01
@@ -123,26 +122,23 @@ def _facing(
 
 
 @compiled
-def _lit_spheres(
-    beams: Float64Array,
-    b: int,
-    spheres: Float64Array,
-    low: int,
-    high: int,
-    slack: float,
-    near: BoolArray,
-    lit: Int64Array,
+def _lit_boxes(
+    beams: Float64Array, b: int, boxes: Float64Array, slack: float, near: BoolArray, lit: Int64Array
 ) -> int:
-    """Write the numbers of the spheres that beam b lights, and return how many they are; of faces, those that
-    reflect on the image's side."""
-    _near_cone(beams, b, spheres, low, high, 2 * slack, near)
-    if len(spheres) > _SPHERE:
-        _facing(beams, b, spheres, low, high, slack, near)
+    """Write the numbers of the boxes that beam b lights, and return how many they are."""
+    many = boxes.shape[1]
+    _near_cone(beams, b, boxes, 0, many, 2 * slack, near)
     count = 0
-    for j in range(low, high):
-        if near[j - low] and _in_pyramid(
-            beams, b, spheres[0, j], spheres[1, j], spheres[2, j], spheres[3, j] + slack
-        ):
+    for j in range(many):
+        inside = near[j]
+        x, y, z = boxes[0, j] - beams[b, 0], boxes[1, j] - beams[b, 1], boxes[2, j] - beams[b, 2]
+        k = SIDES
+        while inside and k < LAST:
+            nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
+            reach = abs(nx) * boxes[4, j] + abs(ny) * boxes[5, j] + abs(nz) * boxes[6, j] + slack
+            inside = nx * x + ny * y + nz * z > -reach
+            k += 3
+        if inside:
             lit[count] = j
             count += 1
     return count
@@ -153,14 +149,6 @@ def _on_lit_side(beams: Float64Array, b: int, x: float, y: float, z: float, slac
     height = beams[b, LIT] * x + beams[b, LIT + 1] * y + beams[b, LIT + 2] * z
     lit: bool = height > beams[b, LIT_FROM] - slack
     return lit
-
-
-@compiled
-def _height(beams: Float64Array, b: int, faces: Float64Array, f: int) -> float:
-    """Height of the image of beam b above the plane of face f [m]."""
-    x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
-    height: float = faces[4, f] * x + faces[5, f] * y + faces[6, f] * z - faces[7, f]
-    return height
 
 
 @compiled
@@ -261,14 +249,37 @@ def reflected(targets: Targets, before: Float64Array, parent: Int64Array, last: 
 
 @loop("i8[:,::1](f8[:,::1], f8[:,::1], f8)")
 def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64Array:
-    """Pairs of a beam and a point that it lights; points as spheres of radius 0, Shape ``[4, R]``."""
+    """Pairs of a beam and a point that it lights; points as boxes without sides, Shape ``[7, R]``."""
     found, count = np.empty((64, 2), np.int64), 0
     many = points.shape[1]
     near, lit = np.empty(many, np.bool_), np.empty(many, np.int64)
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, points, 0, many, slack, near, lit)):
+        for i in range(_lit_boxes(beams, b, points, slack, near, lit)):
             found, count = _added(found, count, b, lit[i]), count + 1
     return found[:count].copy()
+
+
+@compiled
+def _lit_faces(
+    beams: Float64Array,
+    b: int,
+    faces: Float64Array,
+    low: int,
+    high: int,
+    slack: float,
+    near: BoolArray,
+    lit: Int64Array,
+) -> int:
+    """Write the numbers of the faces whose spheres reach into the cone of beam b and which reflect on its
+    image's side, and return how many they are."""
+    _near_cone(beams, b, faces, low, high, 2 * slack, near)
+    _facing(beams, b, faces, low, high, slack, near)
+    count = 0
+    for j in range(low, high):
+        if near[j - low]:
+            lit[count] = j
+            count += 1
+    return count
 
 
 @loop(f"i8[:,::1](f8[:,::1], i8, {_TARGETS})")
@@ -277,14 +288,13 @@ def lit_faces(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
     scenery."""
     faces, corners, _, bodies, begin, _, _, slack = targets
     found, count = np.empty((1024, 2), np.int64), 0
-    many = bodies.shape[1]
-    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(many, np.int64)
+    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(bodies.shape[1], np.int64)
     lit = np.empty(faces.shape[1], np.int64)
     for b in range(len(beams)):
-        some = _lit_spheres(beams, b, faces, 0, begin[0], slack, near, lit) if b >= first else 0
-        for i in range(_lit_spheres(beams, b, bodies, 0, many, slack, near, lit_body)):
+        some = _lit_faces(beams, b, faces, 0, begin[0], slack, near, lit) if b >= first else 0
+        for i in range(_lit_boxes(beams, b, bodies, slack, near, lit_body)):
             v = lit_body[i]
-            some += _lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit[some:])
+            some += _lit_faces(beams, b, faces, begin[v], begin[v + 1], slack, near, lit[some:])
         for i in range(some):
             f = lit[i]
             # A plane does not reflect twice in a row.
@@ -332,24 +342,26 @@ def shown_scenery(views: Float64Array, targets: Targets) -> Int64Array:
 def _crossing(
     beams: Float64Array,
     b: int,
-    targets: Targets,
+    frames: Float64Array,
     f: int,
-    height: float,
+    slack: float,
     seen: Float64Array,
+    own: int,
     crosses: BoolArray,
 ) -> bool:
-    """Test which receivers see the image of beam b in face f, within the rectangle.
+    """Test which receivers see the image of beam b in a face, within its rectangle.
 
-    Coordinates are those of the face's frame; ``height`` is the image's, and ``seen`` has the receivers'.
+    Coordinates are those of the face's ``frame``, also in ``seen``, which has the receivers'.
     """
-    faces, frame, slack = targets[0], targets[2][f], targets[7]
-    dx, dy, dz = beams[b, 0] - faces[0, f], beams[b, 1] - faces[1, f], beams[b, 2] - faces[2, f]
-    x = dx * frame[0, 0] + dy * frame[0, 1] + dz * frame[0, 2]
-    y = dx * frame[1, 0] + dy * frame[1, 1] + dz * frame[1, 2]
-    wide, tall = frame[2, 0] + slack, frame[2, 1] + slack
+    dx, dy, dz = beams[b, 0] - frames[f, 3, 0], beams[b, 1] - frames[f, 3, 1], beams[b, 2] - frames[f, 3, 2]
+    x = dx * frames[f, 0, 0] + dy * frames[f, 0, 1] + dz * frames[f, 0, 2]
+    y = dx * frames[f, 1, 0] + dy * frames[f, 1, 1] + dz * frames[f, 1, 2]
+    height = dx * frames[f, 4, 0] + dy * frames[f, 4, 1] + dz * frames[f, 4, 2]
+    wide, tall = frames[f, 2, 0] + slack, frames[f, 2, 1] + slack
     some = 0
-    for r in range(seen.shape[1]):
-        p, q, g = seen[0, r], seen[1, r], seen[2, r]
+    ps, qs, gs = seen[own, 0], seen[own, 1], seen[own, 2]
+    for r in range(len(ps)):
+        p, q, g = ps[r], qs[r], gs[r]
         # The line from the receiver to the image meets the plane at (p, q)·height + (x, y)·g over the sum of
         # both heights, of which none is divided by: most receivers see no image.
         total = abs(g + height)
@@ -386,22 +398,20 @@ def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) 
         targets: All targets.
         points: Receivers, Shape ``[R, 3]``.
     """
-    faces, _, _, bodies, begin, _, _, slack = targets
+    faces, _, frames, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 3), np.int64), 0
-    many = bodies.shape[1]
-    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(many, np.int64)
+    near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(bodies.shape[1], np.int64)
     lit, crosses = np.empty(faces.shape[1], np.int64), np.empty(len(points), np.bool_)
     seen = np.empty((faces.shape[1] - begin[0], 3, len(points)))
     for own in range(len(seen)):
         _fill_seen(targets, begin[0] + own, points, seen[own])
     for b in range(len(beams)):
-        for i in range(_lit_spheres(beams, b, bodies, 0, many, slack, near, lit_body)):
+        for i in range(_lit_boxes(beams, b, bodies, slack, near, lit_body)):
             v = lit_body[i]
-            for k in range(_lit_spheres(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
+            for k in range(_lit_faces(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
                 f = lit[k]
                 own = f - begin[0]
-                height = _height(beams, b, faces, f)
-                if f == beams[b, LAST] or not _crossing(beams, b, targets, f, height, seen[own], crosses):
+                if f == beams[b, LAST] or not _crossing(beams, b, frames, f, slack, seen, own, crosses):
                     continue
                 for r in range(len(points)):
                     twice = 2 * seen[own, 2, r]
@@ -449,7 +459,7 @@ def ends_by_scenery(
         targets: All targets.
         points: Receiver of each view, Shape ``[W, 3]``.
     """
-    faces, _, _, bodies, begin, _, _, slack = targets
+    faces, _, frames, bodies, begin, _, _, slack = targets
     found, count = np.empty((256, 2), np.int64), 0
     # A group for each body, then one for each face of scenery.
     many = bodies.shape[1]
@@ -476,7 +486,7 @@ def ends_by_scenery(
         _fill_seen(targets, int(views[w, LAST]), points[w : w + 1], seen[w])
         if seen[w, 2, 0] == 0:
             continue
-        for i in range(_lit_spheres(views, w, bodies, 0, many, slack, near, lit_body)):
+        for i in range(_lit_boxes(views, w, bodies, slack, near, lit_body)):
             shows[lit_body[i], w] = True
         for i in range(_shown_sights(views, w, targets, shown)):
             shows[many + shown[i], w] = True
@@ -493,7 +503,7 @@ def ends_by_scenery(
                 b = order[k]
                 if not near[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
                     continue
-                if _crossing(beams, b, targets, f, _height(beams, b, faces, f), seen[w], crosses):
+                if _crossing(beams, b, frames, f, slack, seen, w, crosses):
                     found, count = _added(found, count, b, w), count + 1
     return found[:count].copy()
 
@@ -509,15 +519,15 @@ def _near_edges(
     piece: Int64Array,
     lit: Int64Array,
 ) -> int:
-    """Write the edges whose spheres reach into the cone of beam b, whose image is in front of a face of them,
+    """Write the edges whose boxes reach into the cone of beam b, whose image is in front of a face of them,
     and return how many they are; but for edges of the surface ``own``, which reflected the beam last: they
     lie in the mirror's plane, and no wave goes from there to them."""
-    pieces, begin, spheres, ends, normals, surfaces, _ = edges
+    pieces, begin, boxes, ends, normals, surfaces, _ = edges
     x, y, z = beams[b, 0], beams[b, 1], beams[b, 2]
     count = 0
-    for i in range(_lit_spheres(beams, b, pieces, 0, pieces.shape[1], slack, near, piece)):
+    for i in range(_lit_boxes(beams, b, pieces, slack, near, piece)):
         low, high = begin[piece[i]], begin[piece[i] + 1]
-        _near_cone(beams, b, spheres, low, high, 2 * slack, near)
+        _near_cone(beams, b, boxes, low, high, 2 * slack, near)
         for e in range(low, high):
             if not near[e - low] or surfaces[e, 0] == own or surfaces[e, 1] == own:
                 continue

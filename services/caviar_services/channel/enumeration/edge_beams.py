@@ -24,12 +24,12 @@ from caviar_services.channel.enumeration.image_beams import (
     ImageBeams,
     SceneryViews,
     Targets,
+    boxes,
     first_beams,
     kernels,
     next_beams,
     reflected_beams,
     source_beams,
-    spheres,
 )
 from caviar_services.channel.sionna.diffracting_edges import SceneEdges
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -81,7 +81,7 @@ class EdgeTargets:
         """These edges, in ascending order, as `beam_kernels` takes them."""
         ends, piece = self.ends[wanted], self.piece[wanted]
         begin = np.append(np.flatnonzero(np.diff(piece, prepend=-2)), len(wanted))
-        around = spheres(ends, begin), begin, spheres(ends, np.arange(len(wanted) + 1))
+        around = boxes(ends, begin), begin, boxes(ends, np.arange(len(wanted) + 1))
         return *around, ends, self.normals[wanted], self.surfaces[wanted], piece >= 0
 
     def outside(self, points: Float64Array, edges: Int64Array) -> BoolArray:

@@ -64,13 +64,14 @@ class Targets:
         u, v = (faces.axes[:, i] * faces.half[:, i, None] for i in (0, 1))
         corners = np.stack([-u - v, u - v, u + v, v - u], axis=1) + faces.centre[:, None]
         rows = [faces.centre.T, faces.radius, faces.normal.T, faces.offset, faces.two_sided]
-        frames = np.zeros((len(faces), 3, 3))
+        frames = np.zeros((len(faces), 5, 3))
         frames[:, :2], frames[:, 2, :2] = faces.axes, faces.half
+        frames[:, 3], frames[:, 4] = faces.centre, faces.normal
         self.arrays = (
             np.ascontiguousarray(np.vstack(rows)),
             np.ascontiguousarray(corners),
             frames,
-            spheres(corners, self.begin),
+            boxes(corners, self.begin),
             self.begin,
             np.searchsorted(sights[:, 0], np.arange(self.first_body + 1)),
             np.ascontiguousarray(sights[:, 1]),
@@ -89,16 +90,16 @@ class Targets:
         return found
 
 
-def spheres(corners: Float64Array, begin: Int64Array) -> Float64Array:
-    """Centre and radius of a sphere around the corners, Shape ``[F, N, 3]``, of each of V runs of rows that
-    begin at ``begin[:-1]`` [m], Shape ``[4, V]``."""
+def boxes(corners: Float64Array, begin: Int64Array) -> Float64Array:
+    """Boxes along the axes around the corners, Shape ``[F, N, 3]``, of each of V runs of rows that begin at
+    ``begin[:-1]``: centre, radius of a sphere around it, and half the sides [m], Shape ``[7, V]``."""
     if len(begin) < 2:
-        return np.zeros((4, 0))
+        return np.zeros((7, 0))
     corners, first = corners[begin[0] :], begin[:-1] - begin[0]
     low, high = np.minimum.reduceat(corners.min(1), first), np.maximum.reduceat(corners.max(1), first)
     centre = (low + high) / 2
     away = np.sqrt(((corners - np.repeat(centre, np.diff(begin), axis=0)[:, None]) ** 2).sum(-1)).max(1)
-    return np.ascontiguousarray(np.vstack([centre.T, np.maximum.reduceat(away, first)]))
+    return np.ascontiguousarray(np.vstack([centre.T, np.maximum.reduceat(away, first), (high - low).T / 2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,7 @@ def chain_pairs(
         return ChainPairs.joined(found, depth)
     length = (scenery >= 0).sum(1)
 
-    points = np.ascontiguousarray(np.vstack([receivers.T, np.zeros(len(receivers))]))
+    points = np.ascontiguousarray(np.vstack([receivers.T, np.zeros((4, len(receivers)))]))
     receivers = np.ascontiguousarray(receivers)
 
     def add(beams: ImageBeams) -> None:

@@ -28,8 +28,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
-from caviar_protocol.space.scene import object_pose
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import Media
@@ -68,10 +67,11 @@ from caviar_space.materials import (
     OutsideUse,
     SurfaceMaterial,
     UsedSurfaces,
+    body_kind,
     itu_material,
 )
 from caviar_space.mesh_detail import DetailSettings
-from caviar_space.meshes import Body, Mesh, coarse_centre, placed, unit_box
+from caviar_space.meshes import Body, Mesh, coarse_centre, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
@@ -165,6 +165,7 @@ class SionnaScene(NumberedTriangles):
         self.notes += self._pool.notes
         self._at_rest = shapes
         self._standing: frozenset[Body] = frozenset()
+        self._known_bodies: tuple[object, Mapping[int, tuple[str, str]]] = (), {}
         # Vertices of bodies that the ray tracer has, and the version of the scene that they are of.
         self._shown, self._shown_version = np.zeros((0, 3)), -1
         self.turning: Turning | None = None
@@ -382,6 +383,7 @@ class SionnaScene(NumberedTriangles):
             AssetError: A file is no mesh.
         """
         self._pool.use_meshes(meshes)
+        self._known_bodies = (), {}
 
     def make_room(self, scene: Scene, without_body: frozenset[str]) -> None:
         """Make bodies where there are too few for the objects of a scene.
@@ -394,7 +396,7 @@ class SionnaScene(NumberedTriangles):
         """
         if self._pool.awaits_meshes:  # before bodies are: where a material is refused, nothing has changed
             self._made = self._with_materials_of_meshes(self._made, self._pool.named_materials())
-        if not self._pool.make_room(scene, self._solid(scene, without_body)):
+        if not self._pool.make_room(scene, self._body_of(scene, without_body)):
             return
         self._skins = self._skins or self._skin_materials({"": 1}, self._settings, {})
         self._moving = self._body_shapes()
@@ -438,21 +440,26 @@ class SionnaScene(NumberedTriangles):
             PayloadError: The pool is too small, or an object has the name of a piece of scenery.
             ScenarioError: An object is of `body_material`, which is not defined at a carrier.
         """
-        solid = self._solid(scene, without_body)
-        kinds = {i: self._pool.kind(scene, i) for i in solid}
+        kinds = {i: body_kind(*body) for i, body in self._body_of(scene, without_body).items()}
         if self._skin_error is not None:
             of_skin = {kind for kind, _ in self._pool.of_material[""]}
             if of_skin.intersection(kinds.values()):
                 raise self._skin_error
         return self.place_bodies(scene, kinds)
 
-    def _solid(self, scene: Scene, without_body: frozenset[str]) -> list[int]:
-        """Objects of a scene that waves meet, by their index."""
-        return [
-            i
-            for i, cls in enumerate(scene.classes)
-            if cls not in without_body and not self._foliage.material_for(scene.names[i], cls)
-        ]
+    def _body_of(self, scene: Scene, without_body: frozenset[str]) -> Mapping[int, tuple[str, str]]:
+        """Mesh and material of the body of each object that waves meet, by the object's index."""
+        of = scene.names, scene.classes, scene.assets, without_body
+        if of != self._known_bodies[0]:  # mostly the same objects as in the frame before
+            self._known_bodies = (
+                of,
+                {
+                    i: self._pool.body_of(scene, i)
+                    for i, cls in enumerate(scene.classes)
+                    if cls not in without_body and not self._foliage.material_for(scene.names[i], cls)
+                },
+            )
+        return self._known_bodies[1]
 
     def place_bodies(self, scene: Scene, kinds: Mapping[int, str]) -> tuple[tuple[str, ...], Float64Array]:
         """Move bodies of given kinds to some objects; else as `place`.
@@ -483,13 +490,14 @@ class SionnaScene(NumberedTriangles):
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
         vertices, meshes = self._vertices.copy(), self._pool.meshes
         begin = len(vertices) - sum(len(meshes[asset].vertices) for asset, _ in self._bodies)
+        turns = np.ascontiguousarray(rotation_matrix(scene.orientation.T).transpose(2, 0, 1))
         for number, body in enumerate(self._bodies, start=self.first_body_piece):
-            mesh = meshes[body[0]]
-            rows = slice(begin, begin + len(mesh.vertices))
+            mesh = meshes[body[0]].vertices
+            rows = slice(begin, begin + len(mesh))
             begin = rows.stop
             i = standing.get(body)
             if i is not None:
-                vertices[rows] = placed(mesh, scene.dimensions[i], object_pose(scene, i))
+                vertices[rows] = (mesh * scene.dimensions[i]) @ turns[i].T + scene.position[i]
                 names[number], velocity[number] = scene.names[i], scene.velocity[i]
                 if turning is not None and scene.angular_velocity is not None:
                     turning.centre[number] = scene.position[i]

@@ -603,23 +603,23 @@ class BodyPool:
                 self.notes += (f"mesh {name!r}: {faces}, within {off:.2%} of its sides (object_faces)",)
         return meshes
 
-    def make_room(self, scene: Scene, solid: Sequence[int]) -> bool:
+    def make_room(self, scene: Scene, body_of: Mapping[int, tuple[str, str]]) -> bool:
         """Make bodies where a frame has more objects of a kind than there are bodies.
 
         A mesh of the beginning whose pool is 0 gets none: `assign` refuses its objects.
 
         Args:
             scene: The scene of a frame.
-            solid: Its objects that waves meet, by their index.
+            body_of: Body of each of its objects that waves meet (`body_of`), by the object's index.
 
         Returns:
             Whether there are other bodies than before.
         """
-        later, asset_of = self._later, scene.assets
-        body_of = {i: self._body_of(scene, i) for i in solid}
+        later = self._later
         needed = Counter(body_of.values())
         # Bodies that a mesh came for are made whatever the pools are; boxes stand in where it is not there.
-        came = {body for i, body in body_of.items() if is_mesh_name(asset_of[i])}
+        of_assets = {(scene.assets[i], body) for i, body in body_of.items()}
+        came = {body for asset, body in of_assets if is_mesh_name(asset)}
         for key in [k for k in needed if k not in came and not self._first.counts.get(body_kind(*k))]:
             del needed[key]
         short = any(n > self._now.counts.get(body_kind(*key), 0) for key, n in needed.items())
@@ -652,17 +652,13 @@ class BodyPool:
         """True if meshes came for which bodies are not made yet."""
         return self._later.changed
 
-    def kind(self, scene: Scene, i: int) -> str:
-        """Kind of the bodies that may stand for an object.
+    def body_of(self, scene: Scene, i: int) -> tuple[str, str]:
+        """Mesh and material of the body of an object; the box for a mesh that is not there.
 
         Args:
             scene: The scene of a frame.
             i: Index of the object.
         """
-        return body_kind(*self._body_of(scene, i))
-
-    def _body_of(self, scene: Scene, i: int) -> tuple[str, str]:
-        """Mesh and material of the body of an object of a scene; the box for a mesh that is not there."""
         asset = scene.assets[i]
         if asset not in self._later.meshes:
             asset = shown_asset(asset, self._first.meshes)

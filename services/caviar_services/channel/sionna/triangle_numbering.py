@@ -210,10 +210,12 @@ class NumberedTriangles:
         """
         numbers = self._face_of[triangles].astype(np.int32)
         of, known = self.plane_of[triangles], []
+        surface = np.where(of >= self.first_moving_plane, self.joined.label[of], -1)
+        met = set(np.unique(surface).tolist()) if self.joined.groups else ()
         for group in self.joined.groups:
-            its = np.isin(of, group[group >= self.first_moving_plane])
-            if not its.any():
+            if int(group[0]) not in met:
                 continue
+            its = surface == group[0]
             # Named by scenery, a surface has the same name whichever bodies stand at it.
             touched = self.joined.scenery.get(int(group[0]))
             members = self.plane_table.triangle[group] if touched is None else np.array([touched])
