@@ -21,6 +21,7 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array
 from caviar_protocol.space.coordinates import Vector, rotation_matrix
 from caviar_protocol.topics import Scene
+from caviar_space.vectors import cross
 
 # Side of a grid cell [m].
 _CELL = 10.0
@@ -447,8 +448,9 @@ class Surfaces:
 
 def _boxes(triangles: Float64Array) -> Float64Array:
     """Lowest and highest corners, Shape ``[3, F, 2]``."""
-    boxes: Float64Array = np.stack([triangles.min(1).T, triangles.max(1).T], axis=-1)
-    return boxes
+    a, b, c = triangles[:, 0].T, triangles[:, 1].T, triangles[:, 2].T
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    return np.stack([low, high], axis=-1)
 
 
 def _met(triangles: Float64Array, origin: Float64Array, direction: Float64Array) -> Int64Array:
@@ -456,12 +458,12 @@ def _met(triangles: Float64Array, origin: Float64Array, direction: Float64Array)
     "Fast, minimum storage ray/triangle intersection", 1997)."""
     first = triangles[:, 1] - triangles[:, 0]
     second = triangles[:, 2] - triangles[:, 0]
-    across = np.cross(direction, second)
+    across = cross(np.broadcast_to(direction, second.shape), second)
     volume = (first * across).sum(1)
     inverse = np.divide(1.0, volume, out=np.zeros_like(volume), where=volume != 0)
     offset = origin - triangles[:, 0]
     u = (offset * across).sum(1) * inverse
-    turned = np.cross(offset, first)
+    turned = cross(offset, first)
     v = (turned @ direction) * inverse
     along = (second * turned).sum(1) * inverse
     met = np.flatnonzero((volume != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (along > 0))

@@ -94,7 +94,7 @@ def euler_from_quaternion(q: Sequence[float]) -> Vector:
     )
 
 
-def rotation_matrix(q: Sequence[float]) -> Float64Array:
+def rotation_matrix(q: Sequence[float] | Float64Array) -> Float64Array:
     """Rotation matrix R of a unit quaternion, Shape ``[3, 3]``: world = R · body.
 
     Args:

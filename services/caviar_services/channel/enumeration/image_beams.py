@@ -95,11 +95,13 @@ def boxes(corners: Float64Array, begin: Int64Array) -> Float64Array:
     ``begin[:-1]``: centre, radius of a sphere around it, and half the sides [m], Shape ``[7, V]``."""
     if len(begin) < 2:
         return np.zeros((7, 0))
-    corners, first = corners[begin[0] :], begin[:-1] - begin[0]
-    low, high = np.minimum.reduceat(corners.min(1), first), np.maximum.reduceat(corners.max(1), first)
+    each = corners.shape[1]
+    rows, first = corners[begin[0] :].reshape(-1, 3).T, each * (begin[:-1] - begin[0])
+    low, high = np.minimum.reduceat(rows, first, axis=1), np.maximum.reduceat(rows, first, axis=1)
     centre = (low + high) / 2
-    away = np.sqrt(((corners - np.repeat(centre, np.diff(begin), axis=0)[:, None]) ** 2).sum(-1)).max(1)
-    return np.ascontiguousarray(np.vstack([centre.T, np.maximum.reduceat(away, first), (high - low).T / 2]))
+    away = rows - np.repeat(centre, each * np.diff(begin), axis=1)
+    radius = np.sqrt(np.maximum.reduceat((away**2).sum(0), first))
+    return np.vstack([centre, radius, (high - low) / 2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -367,7 +367,7 @@ class SionnaScene(NumberedTriangles):
     @property
     def standing_bodies(self) -> tuple[int, ...]:
         """Numbers of the bodies that stand for an object, in ascending order."""
-        return tuple(number for number, body in enumerate(self._bodies) if body in self._standing)
+        return tuple(sorted(self._piece_of[body] - self.first_body_piece for body in self._standing))
 
     # --- meshes that come while the run goes on ------------------------------------------------------
 
@@ -485,25 +485,24 @@ class SionnaScene(NumberedTriangles):
         taken = self._pool.assign(objects)
         standing = {body: index[name] for name, body in taken.items()}
         names, velocity = list(self.names), np.zeros((len(self.names), 3))
+        pieces, rows = [self._piece_of[body] for body in standing], list(standing.values())
+        velocity[pieces] = scene.velocity[rows]
         turning = None
         if scene.angular_velocity is not None and scene.angular_velocity.any():
             turning = Turning(np.zeros_like(velocity), np.zeros_like(velocity))
+            turning.centre[pieces] = scene.position[rows]
+            turning.angular_velocity[pieces] = scene.angular_velocity[rows]
         vertices, meshes = self._vertices.copy(), self._pool.meshes
-        begin = len(vertices) - sum(len(meshes[asset].vertices) for asset, _ in self._bodies)
+        first = self._first_vertices - (len(self.vertices) - len(vertices))
+        for body in self._standing.difference(standing):
+            begin = first[self._piece_of[body]]
+            vertices[begin : begin + len(meshes[body[0]].vertices)] = self._middle
         turns = np.ascontiguousarray(rotation_matrix(scene.orientation.T).transpose(2, 0, 1))
-        for number, body in enumerate(self._bodies, start=self.first_body_piece):
+        for piece, (body, i) in zip(pieces, standing.items(), strict=True):
             mesh = meshes[body[0]].vertices
-            rows = slice(begin, begin + len(mesh))
-            begin = rows.stop
-            i = standing.get(body)
-            if i is not None:
-                vertices[rows] = (mesh * scene.dimensions[i]) @ turns[i].T + scene.position[i]
-                names[number], velocity[number] = scene.names[i], scene.velocity[i]
-                if turning is not None and scene.angular_velocity is not None:
-                    turning.centre[number] = scene.position[i]
-                    turning.angular_velocity[number] = scene.angular_velocity[i]
-            elif body in self._standing:
-                vertices[rows] = self._middle
+            placed = (mesh * scene.dimensions[i]) @ turns[i].T + scene.position[i]
+            vertices[first[piece] : first[piece] + len(mesh)] = placed
+            names[piece] = scene.names[i]
         self.move(vertices)
         self._standing, self.turning = frozenset(standing), turning
         return tuple(names), velocity

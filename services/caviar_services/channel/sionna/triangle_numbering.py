@@ -140,6 +140,7 @@ class NumberedTriangles:
         """Vertices of each triangle, Shape ``[F, 3]``."""
         self.names = tuple(name for shape in shapes for name in shape.names)
         """What the indices of `object_index` stand for while no body stands for an object."""
+        self._piece_of = {body: piece for piece, body in enumerate(self._bodies, self.first_body_piece)}
         # Planes are found in the ray tracer's coordinates, where float64 loses nothing to a far origin.
         self.relative = self.vertices - centre
         """All vertices as they stand, in the ray tracer's coordinates [m], Shape ``[V, 3]``."""
@@ -173,7 +174,7 @@ class NumberedTriangles:
         Returns:
             Whether any has moved.
         """
-        changed = (vertices != self._vertices).any(1)
+        changed = _any(vertices != self._vertices)
         if not changed.any():
             return False
         self._vertices[:] = vertices
@@ -181,11 +182,13 @@ class NumberedTriangles:
         first = len(self.vertices) - len(vertices)
         self.relative[first:][changed] = vertices[changed] - self.centre
         # Most bodies of the pool stand for nothing: only what has moved is looked at.
-        moved = changed[self.triangle_vertices[self._first_moving :] - first].any(1)
+        moved = _any(changed[self.triangle_vertices[self._first_moving :] - first])
         triangles = self._first_moving + np.flatnonzero(moved)
+        planes = np.zeros(len(self.plane_table.triangle), np.bool_)
+        planes[self.plane_of[triangles]] = True
         # Boxes of joined surfaces are around all of their planes: they are made anew.
-        joined = np.array([group[0] for group in self.joined.groups], np.int64)
-        self.plane_table.update(self.relative, np.union1d(self.plane_of[triangles], joined))
+        planes[[group[0] for group in self.joined.groups]] = True
+        self.plane_table.update(self.relative, np.flatnonzero(planes))
         # Find the faces that are one surface now.
         before, self.joined = self.joined, self._coplanar.find()
         self.plane_table.join(self.joined.groups)
@@ -467,3 +470,8 @@ class NumberedTriangles:
 
     def _where(self, shapes: Int64Array) -> Int64Array:
         return np.minimum(np.searchsorted(self._ids, shapes), len(self._ids) - 1)
+
+
+def _any(mask: BoolArray) -> BoolArray:
+    """``mask.any(1)`` of a mask of three columns, in a fifth of its time."""
+    return mask[:, 0] | mask[:, 1] | mask[:, 2]
