@@ -26,6 +26,7 @@ from caviar_protocol.assets import check_unit_box, is_mesh_name
 from caviar_protocol.errors import PayloadError
 from caviar_protocol.space.coordinates import Pose, rotation_matrix
 from caviar_protocol.space.ply import read_ply
+from caviar_protocol.topics import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,24 @@ def placed(mesh: Mesh, dimensions: Float64Array, pose: Pose) -> Float64Array:
         pose.position
     )
     return world
+
+
+def placed_objects(units: Sequence[Mesh], scene: Scene, rows: Sequence[int]) -> list[Float64Array]:
+    """`placed` for many objects of a scene.
+
+    Args:
+        units: Unit mesh of each.
+        scene: The scene of a frame.
+        rows: Their indices in it.
+
+    Returns:
+        World vertices of each [m], Shape ``[V, 3]``.
+    """
+    turns = np.ascontiguousarray(rotation_matrix(scene.orientation.T).transpose(2, 0, 1))
+    return [
+        (unit.vertices * scene.dimensions[i]) @ turns[i].T + scene.position[i]
+        for unit, i in zip(units, rows, strict=True)
+    ]
 
 
 _BOX_FACES = np.array(

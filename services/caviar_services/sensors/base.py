@@ -25,7 +25,7 @@ from caviar_protocol.errors import PayloadError, ScenarioError, SetupError
 from caviar_protocol.host import install_command
 from caviar_protocol.messages import Input, Role
 from caviar_protocol.space.coordinates import Pose, Vector
-from caviar_protocol.space.scene import device_pose, object_pose
+from caviar_protocol.space.scene import device_pose
 from caviar_protocol.topics import Scene
 from caviar_protocol.topics.scene import Device
 from caviar_services.drjit_setup import (
@@ -44,7 +44,7 @@ from caviar_space.meshes import (
     contains,
     joined,
     object_meshes,
-    placed,
+    placed_objects,
     shown_asset,
 )
 from caviar_space.mitsuba_xml import SceneryShape, find_scenery, read_scenery, world_mesh
@@ -407,10 +407,9 @@ class TracedScene:
         assign_bodies(known, self._capacity)
         # Embree rebuilds all that is in the mesh, whether a ray can hit it or not: no body is parked there.
         # A pool of 4 × 64 bodies had 13,800 triangles rebuilt in each frame of `street-canyon`.
-        meshes = [
-            Mesh(placed(unit, scene.dimensions[index], object_pose(scene, index)), unit.faces)
-            for index, unit in enumerate(self._body(asset) for asset in scene.assets)
-        ]
+        units = [self._body(asset) for asset in scene.assets]
+        vertices = placed_objects(units, scene, range(len(units)))
+        meshes = [Mesh(corners, unit.faces) for corners, unit in zip(vertices, units, strict=True)]
         self._set_bodies(scene.names, meshes)
         if self._scenery is None:
             self.centre = _far_centre(np.median(scene.position, axis=0)) if meshes else np.zeros(3)

@@ -16,7 +16,6 @@ from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from caviar_protocol.arrays import Float32Array, Float64Array, Int32Array, Int64Array, Payload, quantity
 from caviar_protocol.errors import ScenarioError
@@ -70,7 +69,7 @@ class _Returns:
     """Number among all rays, Shape ``[H]``."""
     distance: Float32Array
     """[m], Shape ``[H]``."""
-    face: NDArray[np.uint32]
+    face: Int64Array
     """The triangle that each hit, for `TracedScene.face_owner`, Shape ``[H]``."""
     points: Float32Array
     """In the sensors' axes [m], Shape ``[H, 3]``."""
@@ -201,7 +200,7 @@ class LidarSensors(Sensors[LidarSettings]):
             points=returns.points[own],
             points_world=None if world is None else world[own].astype(np.float32),
             range=returns.distance[own],
-            object=object_of_face[returns.face[own]],
+            object=object_of_face.take(returns.face[own]),
             grid=grid,
         )
 
@@ -317,7 +316,7 @@ def _trace(
     return _Returns(
         ray=number.numpy().view(np.int32),
         distance=distance.numpy(),
-        face=face.numpy(),
+        face=face.numpy().astype(np.intp),
         points=points.numpy().reshape(-1, 3),
         world=None if world is None else world.numpy().reshape(-1, 3),
     )
@@ -344,7 +343,7 @@ def _nothing(with_world: bool) -> _Returns:
     return _Returns(
         ray=np.zeros(0, dtype=np.int32),
         distance=np.zeros(0, dtype=np.float32),
-        face=np.zeros(0, dtype=np.uint32),
+        face=np.zeros(0, dtype=np.intp),
         points=points,
         world=points if with_world else None,
     )

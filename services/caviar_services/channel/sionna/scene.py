@@ -28,7 +28,7 @@ import numpy as np
 
 from caviar_protocol.arrays import Float64Array, Int64Array
 from caviar_protocol.errors import PayloadError, ScenarioError
-from caviar_protocol.space.coordinates import SPEED_OF_LIGHT, rotation_matrix
+from caviar_protocol.space.coordinates import SPEED_OF_LIGHT
 from caviar_protocol.topics import Scene
 from caviar_services.channel.paths import Turning
 from caviar_services.channel.propagation.utd import Media
@@ -71,7 +71,7 @@ from caviar_space.materials import (
     itu_material,
 )
 from caviar_space.mesh_detail import DetailSettings
-from caviar_space.meshes import Body, Mesh, coarse_centre, unit_box
+from caviar_space.meshes import Body, Mesh, coarse_centre, placed_objects, unit_box
 from caviar_space.mitsuba_xml import find_scenery
 
 # Frequency [Hz] of a carrier, and what is to be set at materials.
@@ -497,11 +497,9 @@ class SionnaScene(NumberedTriangles):
         for body in self._standing.difference(standing):
             begin = first[self._piece_of[body]]
             vertices[begin : begin + len(meshes[body[0]].vertices)] = self._middle
-        turns = np.ascontiguousarray(rotation_matrix(scene.orientation.T).transpose(2, 0, 1))
-        for piece, (body, i) in zip(pieces, standing.items(), strict=True):
-            mesh = meshes[body[0]].vertices
-            placed = (mesh * scene.dimensions[i]) @ turns[i].T + scene.position[i]
-            vertices[first[piece] : first[piece] + len(mesh)] = placed
+        placed = placed_objects([meshes[kind] for kind, _ in standing], scene, rows)
+        for piece, i, corners in zip(pieces, rows, placed, strict=True):
+            vertices[first[piece] : first[piece] + len(corners)] = corners
             names[piece] = scene.names[i]
         self.move(vertices)
         self._standing, self.turning = frozenset(standing), turning
