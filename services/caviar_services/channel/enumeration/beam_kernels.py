@@ -50,6 +50,9 @@ _EDGES = "Tuple((f8[:,::1], i8[::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[:,:
 AXIS, COSINE, SINE, LIT, LIT_FROM, SIDES, LAST, WIDTH = 3, 6, 7, 8, 11, 12, 36, 37
 """Columns of beams, and how many there are."""
 
+# Other beams at an edge that are few.
+_FEW = 2
+
 # Cosine of the half angle of the widest cone that is tested; wider ones light everything.
 _WIDE = 0.01
 
@@ -109,6 +112,18 @@ def _in_pyramid(beams: Float64Array, b: int, x: float, y: float, z: float, reach
     return True
 
 
+@compiled
+def _box_in_pyramid(beams: Float64Array, b: int, boxes: Float64Array, j: int, slack: float) -> bool:
+    """Test whether box j reaches into all pyramids of beam b."""
+    x, y, z = boxes[0, j] - beams[b, 0], boxes[1, j] - beams[b, 1], boxes[2, j] - beams[b, 2]
+    for k in range(SIDES, LAST, 3):
+        nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
+        reach = abs(nx) * boxes[4, j] + abs(ny) * boxes[5, j] + abs(nz) * boxes[6, j] + slack
+        if nx * x + ny * y + nz * z <= -reach:
+            return False
+    return True
+
+
 @vectorized
 def _facing(
     beams: Float64Array, b: int, faces: Float64Array, low: int, high: int, slack: float, near: BoolArray
@@ -130,15 +145,7 @@ def _lit_boxes(
     _near_cone(beams, b, boxes, 0, many, 2 * slack, near)
     count = 0
     for j in range(many):
-        inside = near[j]
-        x, y, z = boxes[0, j] - beams[b, 0], boxes[1, j] - beams[b, 1], boxes[2, j] - beams[b, 2]
-        k = SIDES
-        while inside and k < LAST:
-            nx, ny, nz = beams[b, k], beams[b, k + 1], beams[b, k + 2]
-            reach = abs(nx) * boxes[4, j] + abs(ny) * boxes[5, j] + abs(nz) * boxes[6, j] + slack
-            inside = nx * x + ny * y + nz * z > -reach
-            k += 3
-        if inside:
+        if near[j] and _box_in_pyramid(beams, b, boxes, j, slack):
             lit[count] = j
             count += 1
     return count
@@ -549,7 +556,8 @@ def lit_edges(beams: Float64Array, own: Int64Array, edges: Edges, slack: float) 
     lit = np.empty(len(edges[3]), np.int64)
     for b in range(len(beams)):
         for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, lit)):
-            found, count = _added(found, count, b, lit[i]), count + 1
+            if _box_in_pyramid(beams, b, edges[2], lit[i], slack):
+                found, count = _added(found, count, b, lit[i]), count + 1
     return found[:count].copy()
 
 
@@ -608,6 +616,9 @@ def meetings(
     for b in range(len(beams)):
         for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, reached)):
             e = reached[i]
+            # Where few others meet the beam, the test of each costs less than that of the edge.
+            if begin[e + 1] - begin[e] > _FEW and not _box_in_pyramid(beams, b, edges[2], e, slack):
+                continue
             ux, uy, uz, length = units[e, 0], units[e, 1], units[e, 2], units[e, 3]
             s, away = _unfolded(beams, b, ends[e], ux, uy, uz)
             for k in range(begin[e], begin[e + 1]):
