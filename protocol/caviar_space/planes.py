@@ -364,9 +364,10 @@ class PlaneTable:
             groups: Planes of each surface, in ascending order.
         """
         self._joined = {plane: group for group in groups for plane in group[1:].tolist()}
-        for group in groups:
-            self.low[group[0]] = self.low[group].min(0)
-            self.high[group[0]] = self.high[group].max(0)
+        if groups:
+            planes, begin = np.concatenate(groups), np.cumsum([0, *map(len, groups[:-1])])
+            self.low[planes[begin]] = np.minimum.reduceat(self.low[planes], begin)
+            self.high[planes[begin]] = np.maximum.reduceat(self.high[planes], begin)
 
     def corners_of(self, triangles: Int64Array) -> Float64Array:
         """Corners of triangles [m], Shape ``[N, 3, 3]``.

@@ -432,7 +432,7 @@ def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) 
 def _cones_near(
     columns: Float64Array, low: int, high: int, x: float, y: float, z: float, reach: float, lit: BoolArray
 ) -> None:
-    """`_near_cone` of one sphere with several beams, whose columns are rows here."""
+    """Test whether a sphere reaches into the cones of several beams, whose columns are rows here."""
     xs, ys, zs = columns[0, low:high], columns[1, low:high], columns[2, low:high]
     ax, ay, az = columns[AXIS, low:high], columns[AXIS + 1, low:high], columns[AXIS + 2, low:high]
     cosine, sine = columns[COSINE, low:high], columns[SINE, low:high]
@@ -442,11 +442,6 @@ def _cones_near(
         within = reach + along * sine[b]
         across = (tx * tx + ty * ty + tz * tz - along * along) * (cosine[b] * cosine[b])
         lit[b] = (within >= 0) & (across <= within * within)
-    # Of more arrays in one loop, a compiler does not look whether they overlap.
-    lx, ly, lz = columns[LIT, low:high], columns[LIT + 1, low:high], columns[LIT + 2, low:high]
-    lit_from = columns[LIT_FROM, low:high]
-    for b in range(len(lx)):
-        lit[b] &= lx[b] * x + ly[b] * y + lz[b] * z - lit_from[b] > -reach
 
 
 @loop(f"i8[:,::1](f8[:,::1], i8, f8[:,::1], {_TARGETS}, f8[:,::1])")
@@ -479,11 +474,11 @@ def ends_by_scenery(
     group_begin = np.cumsum(group_begin)
     order, filled = np.empty(len(beams) - first, np.int64), group_begin.copy()
     # Beams as columns: a view's image is held against several at once.
-    columns, near = np.empty((SIDES, len(order))), np.empty(len(order) + many, np.bool_)
+    columns, near = np.empty((LIT, len(order))), np.empty(len(order) + many, np.bool_)
     for b in range(first, len(beams)):
         group = group_of[int(beams[b, LAST])]
         order[filled[group]] = b
-        columns[:, filled[group]] = beams[b, :SIDES]
+        columns[:, filled[group]] = beams[b, :LIT]
         columns[COSINE, filled[group]] = max(beams[b, COSINE], 0.0)
         filled[group] += 1
     shows = np.zeros((len(group_begin) - 1, len(views)), np.bool_)
@@ -508,7 +503,9 @@ def ends_by_scenery(
             _cones_near(columns, low, high, ix, iy, iz, 2 * slack, near)
             for k in range(low, high):
                 b = order[k]
-                if not near[k - low] or beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
+                if not near[k - low] or not _on_lit_side(beams, b, ix, iy, iz, slack):
+                    continue
+                if beams[b, LAST] == f or not _in_pyramid(beams, b, ix, iy, iz, slack):
                     continue
                 if _crossing(beams, b, frames, f, slack, seen, w, crosses):
                     found, count = _added(found, count, b, w), count + 1
