@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from caviar_services.channel.enumeration import scenery_chains
-from caviar_services.channel.enumeration.scenery_chains import ChainTree
+from caviar_services.channel.enumeration.scenery_chains import chain_targets, lit_chains
 from caviar_space.rectangles import RIM, FaceRectangles, narrowest_sides
 
 SIGHTS = np.array([[2, 5], [2, 7], [5, 2], [7, 2]])
@@ -33,9 +33,9 @@ AWAY = [(-9.0, -5.0, 0.0), (9.0, -5.0, 0.0), (9.0, -5.0, 8.0), (-9.0, -5.0, 8.0)
 
 
 def chains(faces: FaceRectangles, sights: np.ndarray, depth: int, source: tuple[float, ...]) -> list[tuple]:
-    tree = ChainTree.of(faces, sights, depth)
-    assert tree is not None
-    rows = tree.chains(np.array(source), np.ones(len(faces), np.bool_)).tolist()
+    targets = chain_targets(faces, sights, depth)
+    assert targets is not None
+    rows = lit_chains(targets, np.array(source), np.ones(len(faces), np.bool_), depth).tolist()
     return [tuple(plane for plane in row if plane >= 0) for row in rows]
 
 
@@ -51,9 +51,9 @@ def test_a_wall_behind_another_is_not_lit_by_way_of_it() -> None:
 
 
 def test_a_chain_begins_at_a_face_that_the_source_sees() -> None:
-    tree = ChainTree.of(walls(SOUTH, NORTH), np.array([[2, 5], [5, 2]]), 3)
-    assert tree is not None
-    found = tree.chains(np.array([0.5, 2.0, 3.0]), np.array([False, True]))
+    targets = chain_targets(walls(SOUTH, NORTH), np.array([[2, 5], [5, 2]]), 3)
+    assert targets is not None
+    found = lit_chains(targets, np.array([0.5, 2.0, 3.0]), np.array([False, True]), 3)
     assert found.tolist() == [[5, -1, -1], [5, 2, -1], [5, 2, 5]]
 
 
@@ -87,11 +87,11 @@ def test_nothing_that_is_reflected_is_left_out() -> None:
     assert len(reflected) > 5
 
 
-def test_of_too_many_sequences_there_is_no_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_sequences_are_not_enumerated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scenery_chains, "MOST_CHAINS", 12)
     faces = walls(SOUTH, NORTH, AWAY)
-    assert ChainTree.of(faces, SIGHTS, 3) is None
-    assert ChainTree.of(faces, SIGHTS, 2) is not None
+    assert chain_targets(faces, SIGHTS, 3) is None
+    assert chain_targets(faces, SIGHTS, 2) is not None
 
 
 def test_faces_that_see_nothing_reflect_alone() -> None:

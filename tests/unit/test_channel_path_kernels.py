@@ -30,7 +30,7 @@ def first_of_all(corners: Float64Array, start: Float64Array, end: Float64Array) 
 
 def trees_of(vertices: Float64Array, faces: Any, split: int) -> tuple[Any, Any]:
     """Two trees, of the triangles before ``split`` and of the others, fitted to the vertices."""
-    one, two = (path_kernels.build(vertices[part]) for part in (faces[:split], faces[split:]))
+    one, two = (path_kernels.build(vertices[part].sum(1)) for part in (faces[:split], faces[split:]))
     nodes, order = np.concatenate([one[0], two[0]]), np.concatenate([one[1], two[1] + split])
     own = nodes[len(one[0]) :]
     own[own[:, 0] >= 0, 0] += len(one[0])

@@ -85,12 +85,8 @@ def _near_cone(
     cosine, sine = max(beams[b, COSINE], 0.0), beams[b, SINE]
     square = cosine * cosine
     # From 0 on: an index that may be negative keeps the compiler from taking several at once.
-    xs, ys, zs, radius = (
-        spheres[0, low:high],
-        spheres[1, low:high],
-        spheres[2, low:high],
-        spheres[3, low:high],
-    )
+    xs, ys, zs = spheres[0, low:high], spheres[1, low:high], spheres[2, low:high]
+    radius = spheres[3, low:high]
     for j in range(len(xs)):
         x, y, z = xs[j], ys[j], zs[j]
         reach = radius[j] + extra
@@ -214,9 +210,8 @@ def reflected(targets: Targets, before: Float64Array, parent: Int64Array, last: 
         n0, n1, n2, offset = faces[4, f], faces[5, f], faces[6, f], faces[7, f]
         height = source[0] * n0 + source[1] * n1 + source[2] * n2 - offset
         image = beams[b]
-        image[0] = source[0] - 2 * height * n0
-        image[1] = source[1] - 2 * height * n1
-        image[2] = source[2] - 2 * height * n2
+        for c in range(3):
+            image[c] = source[c] - 2 * height * faces[4 + c, f]
         # The image is behind the mirror, so the lit side is the other one.
         away = -1.0 if image[0] * n0 + image[1] * n1 + image[2] * n2 > offset else 1.0
         beams[b, LIT], beams[b, LIT + 1], beams[b, LIT + 2] = n0 * away, n1 * away, n2 * away
@@ -268,17 +263,11 @@ def lit_points(beams: Float64Array, points: Float64Array, slack: float) -> Int64
 
 @compiled
 def _lit_faces(
-    beams: Float64Array,
-    b: int,
-    faces: Float64Array,
-    low: int,
-    high: int,
-    slack: float,
-    near: BoolArray,
-    lit: Int64Array,
+    beams: Float64Array, b: int, targets: Targets, low: int, high: int, near: BoolArray, lit: Int64Array
 ) -> int:
     """Write the numbers of the faces whose spheres reach into the cone of beam b and which reflect on its
     image's side, and return how many they are."""
+    faces, slack = targets[0], targets[7]
     _near_cone(beams, b, faces, low, high, 2 * slack, near)
     _facing(beams, b, faces, low, high, slack, near)
     count = 0
@@ -298,25 +287,16 @@ def lit_faces(beams: Float64Array, first: int, targets: Targets) -> Int64Array:
     near, lit_body = np.empty(faces.shape[1], np.bool_), np.empty(bodies.shape[1], np.int64)
     lit = np.empty(faces.shape[1], np.int64)
     for b in range(len(beams)):
-        some = _lit_faces(beams, b, faces, 0, begin[0], slack, near, lit) if b >= first else 0
+        some = _lit_faces(beams, b, targets, 0, begin[0], near, lit) if b >= first else 0
         for i in range(_lit_boxes(beams, b, bodies, slack, near, lit_body)):
             v = lit_body[i]
-            some += _lit_faces(beams, b, faces, begin[v], begin[v + 1], slack, near, lit[some:])
+            some += _lit_faces(beams, b, targets, begin[v], begin[v + 1], near, lit[some:])
         for i in range(some):
             f = lit[i]
             # A plane does not reflect twice in a row.
             if f != beams[b, LAST] and _lights_corner(beams, b, corners, f, slack):
                 found, count = _added(found, count, b, f), count + 1
     return found[:count].copy()
-
-
-@loop(f"b1[::1](f8[:,::1], i8[::1], i8[::1], {_TARGETS})")
-def lights(beams: Float64Array, beam: Int64Array, face: Int64Array, targets: Targets) -> BoolArray:
-    """Mask of pairs of a beam and a face that it may light."""
-    lit = np.empty(len(beam), np.bool_)
-    for k in range(len(beam)):
-        lit[k] = _lights_corner(beams, beam[k], targets[1], face[k], targets[7])
-    return lit
 
 
 @compiled
@@ -415,7 +395,7 @@ def ends_by_bodies(beams: Float64Array, targets: Targets, points: Float64Array) 
     for b in range(len(beams)):
         for i in range(_lit_boxes(beams, b, bodies, slack, near, lit_body)):
             v = lit_body[i]
-            for k in range(_lit_faces(beams, b, faces, begin[v], begin[v + 1], slack, near, lit)):
+            for k in range(_lit_faces(beams, b, targets, begin[v], begin[v + 1], near, lit)):
                 f = lit[k]
                 own = f - begin[0]
                 if f == beams[b, LAST] or not _crossing(beams, b, frames, f, slack, seen, own, crosses):
@@ -601,15 +581,12 @@ def meetings(
     # Unit vectors along edges and their lengths; where the others are along them, and how far from them.
     units, along, aways = np.empty((len(ends), 4)), np.empty(len(lit)), np.empty(len(lit))
     for e in range(len(ends)):
-        ux, uy, uz = (
-            ends[e, 1, 0] - ends[e, 0, 0],
-            ends[e, 1, 1] - ends[e, 0, 1],
-            ends[e, 1, 2] - ends[e, 0, 2],
-        )
+        ux, uy, uz = ends[e, 1] - ends[e, 0]
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
-        units[e, 0], units[e, 1], units[e, 2], units[e, 3] = ux / length, uy / length, uz / length, length
+        ux, uy, uz = ux / length, uy / length, uz / length
+        units[e] = ux, uy, uz, length
         for k in range(begin[e], begin[e + 1]):
-            along[k], aways[k] = _unfolded(others, lit[k, 1], ends[e], units[e, 0], units[e, 1], units[e, 2])
+            along[k], aways[k] = _unfolded(others, lit[k, 1], ends[e], ux, uy, uz)
     for b in range(len(beams)):
         for i in range(_near_edges(beams, b, own[b], edges, slack, near, piece, reached)):
             e = reached[i]

@@ -115,8 +115,7 @@ class EnumeratedTracer:
         free = unhidden(scene, self._obstacles, faces, paths, start, ends)
         seen = paths.take(free)
         mirrors = self._mirrors(faces, seen.chain, seen.points)
-        types = np.where(seen.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
-        found = [self._traced(seen.receiver, types, *mirrors, seen.points, start, ends)]
+        found = [self._traced(seen.receiver, *mirrors, seen.points, start, ends)]
         if self._options.refraction:
             found.append(self._transmitted(faces, paths.take(~free), start, ends))
         if self._edges is not None and over_edges:
@@ -125,8 +124,7 @@ class EnumeratedTracer:
             bent = edge_paths(targets, edges, candidates, start, ends, self._depth)
             bent = bent.take(~near[bent.receiver])
             bent = bent.take(unhidden(scene, self._obstacles, faces, bent, start, ends, edges))
-            types = np.where(bent.chain >= 0, Interaction.REFLECTION, 0).astype(np.uint8)
-            triangles, _ = self._mirrors(faces, bent.chain, bent.points)
+            types, triangles, _ = self._mirrors(faces, bent.chain, bent.points)
             rows, edge = np.arange(len(bent.edge)), edges.number[bent.edge]
             types[rows, bent.bend] = Interaction.DIFFRACTION
             triangles[rows, bent.bend] = self._edges.triangles[edge, 0]
@@ -193,7 +191,7 @@ class EnumeratedTracer:
         shape = len(count), self._depth
         types, triangles = np.zeros(shape, np.uint8), np.full(shape, -1)
         normals, points = np.zeros((*shape, 3)), np.repeat(end[:, None], self._depth, axis=1)
-        of_faces, their_normals = self._mirrors(faces, paths.chain, paths.points)
+        _, of_faces, their_normals = self._mirrors(faces, paths.chain, paths.points)
         types[mirrors], types[at] = Interaction.REFLECTION, Interaction.TRANSMISSION
         triangles[mirrors], triangles[at] = of_faces[path, d], found.triangle
         points[mirrors], points[at] = paths.points[path, d], found.points
@@ -203,15 +201,16 @@ class EnumeratedTracer:
 
     def _mirrors(
         self, faces: FaceRectangles, chain: Int64Array, points: Float64Array
-    ) -> tuple[Int64Array, Float64Array]:
-        """Triangles that reflect at points of chains, −1 past the last, and unit normals there."""
+    ) -> tuple[UInt8Array, Int64Array, Float64Array]:
+        """Interactions at points of chains, triangles that reflect there, −1 past the last, and unit
+        normals."""
         used, table = chain >= 0, self._scene.plane_table
         triangles, normals = np.full(chain.shape, -1), np.zeros((*chain.shape, 3))
         if used.any():
             plane = faces.plane[chain[used]]
             triangles[used] = table.first_holding(table.triangle[plane], points[used])
             normals[used] = faces.normal[chain[used]]
-        return triangles, normals
+        return np.where(used, Interaction.REFLECTION, 0).astype(np.uint8), triangles, normals
 
     def _traced(
         self,

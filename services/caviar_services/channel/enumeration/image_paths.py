@@ -96,18 +96,26 @@ def unhidden(
         receivers: Positions [m], Shape ``[R, 3]``.
         edges: Edges of the paths; None: they have none.
     """
-    start = np.broadcast_to(transmitter, (len(paths.chain), 1, 3))
-    corners = np.concatenate([start, paths.points, receivers[paths.receiver][:, None]], axis=1)
-    planes, normals = np.full(corners.shape[:2], -1), np.zeros(corners.shape)
-    surfaces = np.full((*planes.shape, 2), -1)
-    path, d = np.nonzero(paths.chain >= 0)
-    face, corner = paths.chain[path, d], (path, d + 1)
-    planes[corner], normals[corner] = faces.plane[face], faces.normal[face]
-    surfaces[corner] = scene.joined.label[faces.plane[face]][:, None]
+    corners, planes, normals = _corners(faces, paths, transmitter, receivers)
+    surfaces = np.where(planes >= 0, scene.joined.label[planes], -1)[..., None].repeat(2, axis=-1)
     if edges is not None:
         corner = np.arange(len(paths.bend)), paths.bend + 1
         normals[corner], surfaces[corner] = edges.outward[paths.edge], edges.surfaces[paths.edge]
     return obstacles.unhidden(corners, paths.count, paths.bend, normals, surfaces, planes)
+
+
+def _corners(
+    faces: FaceRectangles, paths: ImagePaths, transmitter: Float64Array, receivers: Float64Array
+) -> tuple[Float64Array, Int64Array, Float64Array]:
+    """Corners of paths, from the transmitter to the receiver [m], with the planes and the unit normals of the
+    faces there, −1 and 0 for none; Shape ``[P, D + 2, …]`` each."""
+    start = np.broadcast_to(transmitter, (len(paths.chain), 1, 3))
+    corners = np.concatenate([start, paths.points, receivers[paths.receiver][:, None]], axis=1)
+    planes, normals = np.full(corners.shape[:2], -1), np.zeros(corners.shape)
+    path, d = np.nonzero(paths.chain >= 0)
+    face = paths.chain[path, d]
+    planes[path, d + 1], normals[path, d + 1] = faces.plane[face], faces.normal[face]
+    return corners, planes, normals
 
 
 # Surfaces at both ends of a segment, each of which a ray may meet once more by rounding.
@@ -217,15 +225,9 @@ class _Segments:
         transmitter: Float64Array,
         receivers: Float64Array,
     ) -> _Segments:
-        count, rows = (paths.chain >= 0).sum(1), np.arange(len(paths.chain))
-        start = np.broadcast_to(transmitter, (len(rows), 1, 3))
-        corners = np.concatenate([start, paths.points, receivers[paths.receiver][:, None]], axis=1)
-        mirror = np.pad(paths.chain, ((0, 0), (1, 1)), constant_values=-1)
-        normal, surface = np.zeros(corners.shape), np.full(mirror.shape, -1)
-        used = mirror >= 0
-        normal[used] = faces.normal[mirror[used]]
-        surface[used] = scene.joined.label[faces.plane[mirror[used]]]
-        path, number = np.nonzero(np.arange(corners.shape[1] - 1) <= count[:, None])
+        corners, planes, normal = _corners(faces, paths, transmitter, receivers)
+        surface = np.where(planes >= 0, scene.joined.label[planes], -1)
+        path, number = np.nonzero(np.arange(corners.shape[1] - 1) <= paths.count[:, None])
         first, last = corners[path, number], corners[path, number + 1]
         direction = last - first
         direction = direction / np.sqrt((direction**2).sum(1, keepdims=True))
@@ -336,10 +338,4 @@ def _with_points(
     chain[:, :i], chain[:, i + 1 : i + 1 + j] = chains.before[rows], chains.behind[rows, ::-1]
     points = np.repeat(ends[rows][:, None], depth, axis=1)
     points[:, :i], points[:, i], points[:, i + 1 : i + 1 + j] = before, place[rows], behind[:, ::-1]
-    return ImagePaths(
-        chain,
-        np.full(len(rows), i),
-        chains.edge[rows],
-        chains.receiver[rows],
-        points,
-    )
+    return ImagePaths(chain, np.full(len(rows), i), chains.edge[rows], chains.receiver[rows], points)

@@ -38,9 +38,10 @@ class ObstacleTrees:
         begin = [0, *(scene.begin_of(scene.first_body_piece + body)[1] for body in sorted(kinds))]
         still = scene.relative[self._corners[: begin[1] if kinds else None]]
         of_kind = {
-            kind: path_kernels.build(mesh.vertices[mesh.faces]) for kind, mesh in scene.unit_meshes.items()
+            kind: path_kernels.build(mesh.vertices[mesh.faces].sum(1))
+            for kind, mesh in scene.unit_meshes.items()
         }
-        made = [path_kernels.build(still), *(of_kind[kinds[body]] for body in sorted(kinds))]
+        made = [path_kernels.build(still.sum(1)), *(of_kind[kinds[body]] for body in sorted(kinds))]
         ends = np.cumsum([len(nodes) for nodes, _ in made])
         nodes = np.concatenate([nodes for nodes, _ in made])
         order = np.concatenate([order for _, order in made])

@@ -107,16 +107,14 @@ def reflections(
                 break
             share = near / (near - far)
             x, y, z = x + share * (tx - x), y + share * (ty - y), z + share * (tz - z)
+            points[n, d, 0], points[n, d, 1], points[n, d, 2] = x, y, z
             for a in range(2):
-                flat[d, a] = (
-                    (x - faces[0, f]) * frames[f, a, 0]
-                    + (y - faces[1, f]) * frames[f, a, 1]
-                    + (z - faces[2, f]) * frames[f, a, 2]
-                )
+                flat[d, a] = 0.0
+                for c in range(3):
+                    flat[d, a] += (points[n, d, c] - faces[c, f]) * frames[f, a, c]
                 good[n] &= abs(flat[d, a]) <= frames[f, 2, a] + _SLACK
             if not good[n]:
                 break
-            points[n, d, 0], points[n, d, 1], points[n, d, 2] = x, y, z
         # Triangles cost most: they are tested where all rectangles are met.
         for d in range(count):
             f = chain[n, d]
@@ -128,16 +126,12 @@ def reflections(
 _LEAF = 4
 
 
-@loop("Tuple((i8[:,::1], i8[::1]))(f8[:,:,::1])")
-def build(corners: Float64Array) -> tuple[Int64Array, Int64Array]:
-    """Nodes and order of a tree of triangles, Shape ``[T, 3, 3]``: each node is split at the median of its
-    triangles' middles along the axis on which these are farthest apart."""
-    count = len(corners)
+@loop("Tuple((i8[:,::1], i8[::1]))(f8[:,::1])")
+def build(middle: Float64Array) -> tuple[Int64Array, Int64Array]:
+    """Nodes and order of a tree of triangles: each node is split at the median of its triangles' middles,
+    Shape ``[T, 3]`` of any scale, along the axis on which these are farthest apart."""
+    count = len(middle)
     order, nodes = np.arange(count), np.full((max(2 * count, 1), 3), -1, np.int64)
-    middle = np.zeros((count, 3))
-    for t in range(count):
-        for c in range(3):
-            middle[t, c] = corners[t, 0, c] + corners[t, 1, c] + corners[t, 2, c]
     nodes[0, 1], nodes[0, 2] = 0, count
     made, i = 1, 0
     while i < made:

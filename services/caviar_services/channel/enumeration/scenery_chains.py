@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import astuple, dataclass, replace
 from functools import lru_cache, reduce
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -41,7 +40,13 @@ import numpy as np
 from caviar_protocol.arrays import BoolArray, Float64Array, Int32Array, Int64Array
 from caviar_protocol.files import read_regular, replace_file
 from caviar_protocol.messages import WARNING
-from caviar_services.channel.enumeration.image_beams import Targets, first_beams, kernels, reflected_beams
+from caviar_services.channel.enumeration.image_beams import (
+    ChainPairs,
+    Targets,
+    first_beams,
+    kernels,
+    reflected_beams,
+)
 from caviar_services.channel.sionna.candidates import Faces, chains_of
 from caviar_services.channel.sionna.ray_launcher import Launch, Launcher, LaunchOptions, PartedLauncher
 from caviar_services.channel.sionna.scene import SionnaScene
@@ -230,86 +235,45 @@ MOST_CHAINS = 20_000
 """Largest number of sequences that are enumerated."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Level:
-    """Sequences of one length."""
-
-    parent: Int64Array
-    """Index of the sequence one face shorter that each continues, Shape ``[K]``."""
-    face: Int64Array
-    """Its last face, Shape ``[K]``."""
-    planes: Int32Array
-    """Its planes, −1 past the last, Shape ``[K, D]``."""
-
-
-class ChainTree:
-    """Sequences of faces, each of which sees the next one.
+def chain_targets(faces: FaceRectangles, sights: Int64Array, depth: int) -> Targets | None:
+    """Targets of beams along sequences of faces, of which each sees the next one.
 
     Args:
         faces: Of scenery, in ascending order of their planes.
-        levels: Sequences of one face, of two faces, and so on.
+        sights: Pairs of planes that see one another, in both orders, sorted, Shape ``[M, 2]``.
+        depth: Faces of a sequence at most.
+
+    Returns:
+        The targets; None where there are more sequences than `MOST_CHAINS`.
     """
+    seen = np.searchsorted(faces.plane, sights)
+    # Sequences that end at each face; their number grows with a power of the faces that each one sees.
+    ends, count = np.ones(len(faces)), 0.0
+    for _ in range(depth):
+        count += ends.sum()
+        ends = np.bincount(seen[:, 1], ends[seen[:, 0]], len(faces)).astype(np.float64)
+    return Targets(faces, np.zeros(0, np.int64), seen) if count <= MOST_CHAINS else None
 
-    def __init__(self, faces: FaceRectangles, levels: list[_Level]) -> None:
-        self._faces, self._levels = faces, levels
-        self._targets = Targets(faces, np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
 
-    @property
-    def planes(self) -> Int64Array:
-        """Planes of the faces, ascending, Shape ``[U]``."""
-        return self._faces.plane
+def lit_chains(targets: Targets, source: Float64Array, seen: BoolArray, depth: int) -> Int32Array:
+    """Sequences of faces that a source can light.
 
-    @classmethod
-    def of(cls, faces: FaceRectangles, sights: Int64Array, depth: int) -> ChainTree | None:
-        """All sequences of faces up to a length.
+    Args:
+        targets: From `chain_targets`.
+        source: Position [m], Shape ``[3]``.
+        seen: Faces that the source may see, Shape ``[U]``.
+        depth: Faces of a sequence at most.
 
-        Args:
-            faces: Of scenery, in ascending order of their planes.
-            sights: Pairs of planes that see one another, in both orders, sorted, Shape ``[M, 2]``.
-            depth: Faces of a sequence at most.
-
-        Returns:
-            The tree; None where there are more sequences than `MOST_CHAINS`.
-        """
-        seen = np.searchsorted(faces.plane, sights)
-        parent, face = np.zeros(len(faces), np.int64), np.arange(len(faces))
-        planes = np.full((len(faces), depth), -1, np.int32)
-        levels: list[_Level] = []
-        for length in range(depth):
-            planes[:, length] = faces.plane[face]
-            levels.append(_Level(parent, face, planes))
-            # The number grows with a power of the faces that each one sees: give up before memory does.
-            if sum(len(level.face) for level in levels) > MOST_CHAINS:
-                return None
-            begin, end = (np.searchsorted(seen[:, 0], face, side) for side in ("left", "right"))
-            parent, behind = ranges(begin, end - begin)
-            face, planes = seen[behind, 1], planes[parent]
-        return cls(faces, levels)
-
-    def chains(self, source: Float64Array, seen: BoolArray) -> Int32Array:
-        """Sequences that a source can light.
-
-        Args:
-            source: Position [m], Shape ``[3]``.
-            seen: Faces that the source may see, Shape ``[U]``.
-
-        Returns:
-            Planes of each, −1 past the last, Shape ``[K, D]``: shorter sequences first, with the beginnings
-            of each one among them.
-        """
-        rows = np.flatnonzero(seen)
-        beams = first_beams(self._targets, source, rows)
-        found = [self._levels[0].planes[rows]]
-        for shorter, level in pairwise(self._levels):
-            place = np.full(len(shorter.face), -1)
-            place[rows] = np.arange(len(rows))
-            rows = np.flatnonzero(place[level.parent] >= 0)
-            parent, face = place[level.parent[rows]], level.face[rows]
-            lit = kernels.lights(beams.rows, parent, face, self._targets.arrays)
-            rows = rows[lit]
-            beams = reflected_beams(self._targets, beams, parent[lit], face[lit])
-            found.append(level.planes[rows])
-        return np.concatenate(found)
+    Returns:
+        Planes of each, −1 past the last, Shape ``[K, D]``: shorter sequences first, with the beginnings of
+        each one among them.
+    """
+    beams = [first_beams(targets, source, np.flatnonzero(seen))]
+    for _ in range(1, depth):
+        shown = kernels.shown_scenery(beams[-1].rows, targets.arrays)
+        beams.append(reflected_beams(targets, beams[-1], *shown.T))
+    chains = ChainPairs.joined([(of.chain, np.zeros(len(of), np.int64)) for of in beams], depth).chain
+    return np.where(chains >= 0, targets.faces.plane[chains], -1).astype(np.int32)
 
 
 # From each plane, to find which others it sees: before the first frame, and in each.
@@ -381,7 +345,7 @@ class SceneryChains:
         if before is not None:
             self._known.update(before._known)
         # All chains, and which planes see one another; None: too many, or no transmitter moves.
-        self._every: tuple[ChainTree, Int32Array] | None = (
+        self._every: tuple[Targets, Int32Array] | None = (
             before._every if before is not None else self._every_chain() if moving else None
         )
         self._last: tuple[bytes, int, KnownScenery] | None = None
@@ -440,23 +404,21 @@ class SceneryChains:
     def _now(self, place: Float64Array) -> KnownScenery:
         """Scenery as the frame shows it from a place in the ray tracer's coordinates [m], Shape ``[3]``."""
         if not self._scene.has_scenery:
-            depth = self._options.max_depth
-            return KnownScenery(np.zeros((0, depth), np.int32), np.zeros((0, 2), np.int32))
+            return KnownScenery(np.zeros((0, self._options.max_depth), np.int32), np.zeros((0, 2), np.int32))
         if self._every is None:
             chains = self._launched(place)
             return KnownScenery(chains, self._sights(chains, _SIGHT_RAYS_PER_FRAME))
-        tree, sights = self._every
-        return KnownScenery(
-            tree.chains(place, seen_planes(self._look, place[None], tree.planes, _SEEN_RAYS)[0]), sights
-        )
+        targets, sights = self._every
+        seen = seen_planes(self._look, place[None], targets.faces.plane, _SEEN_RAYS)[0]
+        return KnownScenery(lit_chains(targets, place, seen, self._options.max_depth), sights)
 
-    def _every_chain(self) -> tuple[ChainTree, Int32Array] | None:
+    def _every_chain(self) -> tuple[Targets, Int32Array] | None:
         faces = self._faces.scenery(np.arange(self._scene.first_moving_plane))
         if not 0 < len(faces) <= _FEW:
             return None
         sights = visible_pairs(self._look, faces, _SIGHT_RAYS, self._options.seed)
-        tree = ChainTree.of(faces, sights, self._options.max_depth)
-        return None if tree is None else (tree, sights.astype(np.int32))
+        targets = chain_targets(faces, sights, self._options.max_depth)
+        return None if targets is None else (targets, sights.astype(np.int32))
 
     def _launched(self, place: Float64Array) -> Int32Array:
         """Chains that one launch finds from a place in the ray tracer's coordinates [m], Shape ``[3]``."""
