@@ -179,6 +179,12 @@ MEASUREMENTS: Mapping[str, Measurement] = {
         "quadrotor.md",
         {"quadrotor-frames": ""},
     ),
+    "shared-memory": Measurement(
+        "python tests/bench/bench_shared_memory.py --repeat 1 --markdown {out}/shared-memory.md",
+        "python tests/bench/bench_shared_memory.py --markdown {out}/shared-memory.md",
+        "shared-memory.md",
+        {"shared-memory": ""},
+    ),
     "simplify": Measurement(
         "python tests/bench/bench_simplify.py --positions 40 --markdown {out}/simplify.md",
         "python tests/bench/bench_simplify.py --markdown {out}/simplify.md",

@@ -2,16 +2,18 @@
 
     python tests/bench/bench_processes.py street-canyon [--frames N] [--markdown FILE]
 
-Starts `caviar run` and reads what the kernel counted for each thread (``/proc/PID/task/TID/schedstat``), from
-the 30th frame on, when kernels are compiled and caches are warm. The broker notes when each frame was
-finished (``latency.npz``), which says how many frames lie between two samples. On two cores no run is faster
-than half of the sum allows, nor than its busiest thread.
+Starts `caviar run` and reads what the kernel counted for each thread (``schedstat`` and ``stat`` in
+``/proc/PID/task/TID``), from the 30th frame on, when kernels are compiled and caches are warm. The broker
+notes when each frame was finished (``latency.npz``), which says how many frames lie between two samples. On
+two cores no run is faster than half of the sum allows, nor than its busiest thread. Time in the kernel is
+mostly that of sockets and files: what another way of the bytes between processes could save at most.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,6 +30,7 @@ WARM_UP = 30
 LAST = 3
 """Frames at the end that do not count: processes end in them."""
 PERIOD_S = 0.05
+TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 FEWEST_SAMPLES = 10
 """Samples that a measurement needs: a process ends, or is counted, up to a period beside a frame."""
 
@@ -43,6 +46,8 @@ class Sample(NamedTuple):
     """Of the monotonic clock, as the broker's."""
     used_ns: Counter[tuple[str, int]]
     """Processor time by process and thread."""
+    kernel_ns: Counter[tuple[str, int]]
+    """What of it was spent in the kernel."""
 
 
 def descendants(pid: int) -> Iterator[int]:
@@ -68,19 +73,37 @@ def name_of(pid: int) -> str:
 def sampled(pid: int) -> Sample:
     """Threads that end in the meantime are left out."""
     used: Counter[tuple[str, int]] = Counter()
+    kernel: Counter[tuple[str, int]] = Counter()
     instant_ns = time.monotonic_ns()
     for process in list(descendants(pid)):
         try:
             name = name_of(process)
             for task in Path(f"/proc/{process}/task").iterdir():
                 used[name, int(task.name)] = int((task / "schedstat").read_text().split()[0])
+                # Numbers begin after the name of the program, which is in brackets: the 15th is stime.
+                ticks = int((task / "stat").read_text().rpartition(")")[2].split()[12])
+                kernel[name, int(task.name)] = ticks * TICK_NS
         except OSError:
             continue
-    return Sample(instant_ns, used)
+    return Sample(instant_ns, used, kernel)
 
 
-def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float], float, float, int, str]:
-    """By process, ms a frame; ms of the busiest thread; frames/s; frames that count; and the digest."""
+class Measured(NamedTuple):
+    """Times of a frame [ms]."""
+
+    by_process: dict[str, float]
+    kernel: dict[str, float]
+    """What of it was spent in the kernel, by process."""
+    busiest: float
+    """Of the busiest thread."""
+    rate: float
+    """[frames/s]"""
+    frames: int
+    digest: str
+
+
+def measured(scenario: str, frames: int, folder: Path) -> Measured:
+    """Measure a run of a scenario, whose files go below a folder."""
     command = [str(Path(sys.executable).with_name("caviar")), "run", scenario, "--frames", str(frames)]
     command += ["--out", str(folder), "--json", str(folder / "summary.json")]
     run = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -102,11 +125,13 @@ def measured(scenario: str, frames: int, folder: Path) -> tuple[dict[str, float]
     count = float(done[1] - done[0])
     by_thread = {key: (ns - first.used_ns[key]) / 1e6 / count for key, ns in last.used_ns.items()}
     by_process: defaultdict[str, float] = defaultdict(float)
-    for (name, _), ms in by_thread.items():
+    kernel: defaultdict[str, float] = defaultdict(float)
+    for (name, thread), ms in by_thread.items():
         by_process[name] += ms
+        kernel[name] += (last.kernel_ns[name, thread] - first.kernel_ns[name, thread]) / 1e6 / count
     digest = json.loads((folder / "summary.json").read_text())["digest"]
     rate = count / (last.instant_ns - first.instant_ns) * 1e9
-    return dict(by_process), max(by_thread.values()), rate, round(count), digest
+    return Measured(by_process, kernel, max(by_thread.values()), rate, round(count), digest)
 
 
 def main() -> None:
@@ -128,13 +153,16 @@ def main() -> None:
                 if arguments.frames is not None:
                     parser.error(f"{error}; give more --frames")
                 frames *= 10
-    by_process, busiest, rate, count, digest = found
-    rows = [(name, f"{ms:.1f}") for name, ms in sorted(by_process.items(), key=lambda item: -item[1])]
-    rows += [("all", f"{sum(by_process.values()):.1f}"), ("busiest thread", f"{busiest:.1f}")]
-    title = f"`{arguments.scenario}`, {count} frames"
-    table = [f"| {title} | processor time of a frame, ms |", "| --- | ---: |"]
-    table += [f"| {name} | {value} |" for name, value in rows]
-    sys.stdout.write("\n".join(table) + f"\n{rate:.1f} frames/s; digest {digest}\n")
+    table = [
+        f"| `{arguments.scenario}`, {found.frames} frames | processor time of a frame, ms | in the kernel |",
+        "| --- | ---: | ---: |",
+    ]
+    for name, ms in sorted(found.by_process.items(), key=lambda item: -item[1]):
+        table.append(f"| {name} | {ms:.1f} | {found.kernel[name]:.1f} |")
+    totals = (sum(times.values()) for times in (found.by_process, found.kernel))
+    table.append(f"| all | {' | '.join(f'{total:.1f}' for total in totals)} |")
+    table.append(f"| busiest thread | {found.busiest:.1f} | |")
+    sys.stdout.write("\n".join(table) + f"\n{found.rate:.1f} frames/s; digest {found.digest}\n")
     if arguments.markdown:
         arguments.markdown.write_text("## Processes\n\n" + "\n".join(table) + "\n")
 
