@@ -89,6 +89,8 @@ def rate(size: int, window: int, with_memory: bool, folder: str) -> float:
             while waiting >= window:
                 socket.recv()
                 waiting -= 1
+        for _ in range(waiting):
+            socket.recv()
         taken = time.perf_counter() - began
         socket.send(END)
         for other in others:
