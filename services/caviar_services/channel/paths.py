@@ -30,7 +30,7 @@ from caviar_protocol.space.scene import device_pose, device_velocity
 from caviar_protocol.topics import AntennaArray, AntennaDevice, Scene
 from caviar_services.channel.propagation.patterns import ElementPattern, Field, Patterns, radiated_field
 from caviar_space.obstacles import Surfaces
-from caviar_space.vectors import Rows, cross
+from caviar_space.vectors import Rows, cross, equal_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,16 +339,16 @@ def _kinds(table: PathTable) -> tuple[UInt64Array, Int64Array]:
     objects = np.where(faces < 0, -1, table.objects)
     # Paths of one kind are equal rows of integers: names are hashed once a kind, not once a path.
     discrete = np.concatenate([table.types.astype(np.int32), objects, faces], axis=1)
-    kinds, kind = np.unique(discrete, axis=0, return_inverse=True)
+    first, kind = equal_rows(discrete)
     named = (
         tuple(
             (t, *(table.joined_faces[-1 - f] if f < 0 else (table.object_names[o], f)))
             for t, o, f in zip(row[:depth], row[depth : 2 * depth], row[2 * depth :], strict=True)
             if t
         )
-        for row in kinds.tolist()
+        for row in discrete[first].tolist()
     )
-    return np.array([_name_hash(names) for names in named], np.uint64), kind.reshape(-1)
+    return np.array([_name_hash(names) for names in named], np.uint64), kind
 
 
 # Kinds of paths recur from frame to frame.

@@ -4,7 +4,7 @@ Chains of scenery are known for the place that a transmitter stands at (`scenery
 bodies are enumerated in each frame (`image_beams`), those over an edge likewise (`edge_beams`). The image
 method decides which are paths (`image_paths`), transmitted ones among them.
 
-In the street canyon this finds the reflections that 3e7 rays find, in about half the time that 1e5 rays take.
+In the street canyon this finds the reflections that 3e7 rays find, in a quarter of the time of 1e5 rays.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from caviar_services.channel.sionna.path_table import Traced, joined, nothing
 from caviar_services.channel.sionna.ray_launcher import LaunchOptions
 from caviar_services.channel.sionna.scene import SionnaScene
 from caviar_space.rectangles import FaceRectangles
+from caviar_space.vectors import equal_rows
 
 _NO_SHAPE = 0xFFFFFFFF
 
@@ -159,7 +160,7 @@ class EnumeratedTracer:
         used = paths.chain >= 0
         surfaces = np.where(used, joined.label[faces.plane[paths.chain]], -1)
         keys = np.column_stack([paths.receiver, surfaces])
-        return paths.take(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
+        return paths.take(equal_rows(keys)[0])
 
     def _views(self, scenery: FaceRectangles, receivers: Float64Array) -> SceneryViews:
         """Faces of scenery that may reflect last before each receiver."""
@@ -278,7 +279,7 @@ class EnumeratedTracer:
             ]
         )
         only = np.concatenate([_only_reflected(part) for part in (enumerated, launched)])
-        _, first = np.unique(np.column_stack([only, keys]), axis=0, return_index=True)
+        first, _ = equal_rows(np.column_stack([only, keys]))
         new = np.zeros(len(keys), np.bool_)
         new[first] = True
         wanted = np.where(_only_reflected(launched), new[len(enumerated.types) :], True)
@@ -326,9 +327,8 @@ class EnumeratedTracer:
         by_body = (chain >= self._scene.first_moving_plane).any(1)
         chain = chain[:, : chains.shape[1]]
         straight = np.full((1, chains.shape[1]), -1)
-        _, of = np.unique(np.concatenate([straight, chains, chain]), axis=0, return_inverse=True)
-        of = of.reshape(-1)
-        known: BoolArray = kind & (by_body | np.isin(of[1 + len(chains) :], of[: 1 + len(chains)]))
+        _, of = equal_rows(np.concatenate([straight, chains, chain]))
+        known: BoolArray = kind & (by_body | (of[1 + len(chains) :] <= of[: 1 + len(chains)].max()))
         return known
 
     def _is_known_bent(

@@ -37,10 +37,7 @@ class ObstacleTrees:
         # Triangles of bodies come last, body after body.
         begin = [0, *(scene.begin_of(scene.first_body_piece + body)[1] for body in sorted(kinds))]
         still = scene.relative[self._corners[: begin[1] if kinds else None]]
-        of_kind = {
-            kind: path_kernels.build(mesh.vertices[mesh.faces].sum(1))
-            for kind, mesh in scene.unit_meshes.items()
-        }
+        of_kind = {k: path_kernels.build(m.vertices[m.faces].sum(1)) for k, m in scene.unit_meshes.items()}
         made = [path_kernels.build(still.sum(1)), *(of_kind[kinds[body]] for body in sorted(kinds))]
         ends = np.cumsum([len(nodes) for nodes, _ in made])
         nodes = np.concatenate([nodes for nodes, _ in made])

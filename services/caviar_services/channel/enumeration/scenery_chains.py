@@ -447,8 +447,7 @@ class _Parts:
         self._what, self._tell, self._began = what, tell, time.monotonic()
 
     def __call__(self, part: int, parts: int) -> None:
-        left_s = (time.monotonic() - self._began) * (parts / part - 1) if part else 0.0
-        left = f", {left_s:.0f} s left" if part else ""
+        left = f", {(time.monotonic() - self._began) * (parts / part - 1):.0f} s left" if part else ""
         self._tell(f"{self._what}, {part + 1} of {parts}{left}")
 
 

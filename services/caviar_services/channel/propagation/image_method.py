@@ -24,7 +24,7 @@ import numpy as np
 
 from caviar_protocol.arrays import BoolArray, Float64Array, Int64Array, UInt8Array
 from caviar_protocol.topics import Interaction
-from caviar_space.vectors import cross
+from caviar_space.vectors import cross, equal_rows
 
 # [m]; a point that moves less is the same.
 _NEAR = 0.05
@@ -293,9 +293,9 @@ def distinct(pair: Int64Array, types: UInt8Array, points: Float64Array) -> BoolA
     used = (types[some] != 0)[..., None]
     # The grid is off the origin by an odd part of a cell: coordinates are often round numbers, and would lie
     # on the border of two cells.
-    cells = np.where(used, np.floor(points[some] / _SAME_PLACE + 0.271828), 0.0)
+    cells = np.where(used, np.floor(points[some] / _SAME_PLACE + 0.271828), 0.0) + 0.0  # no negative zeros
     keys = np.concatenate(
         [pair[some, None], types[some], cells.reshape(len(some), 3 * types.shape[1])], axis=1
     )
-    kept[some[np.unique(keys, axis=0, return_index=True)[1]]] = True
+    kept[some[equal_rows(keys)[0]]] = True
     return kept
