@@ -79,9 +79,9 @@ def sampled(pid: int) -> Sample:
         try:
             name = name_of(process)
             for task in Path(f"/proc/{process}/task").iterdir():
-                used[name, int(task.name)] = int((task / "schedstat").read_text().split()[0])
                 # Numbers begin after the name of the program, which is in brackets: the 15th is stime.
                 ticks = int((task / "stat").read_text().rpartition(")")[2].split()[12])
+                used[name, int(task.name)] = int((task / "schedstat").read_text().split()[0])
                 kernel[name, int(task.name)] = ticks * TICK_NS
         except OSError:
             continue

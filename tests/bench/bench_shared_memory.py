@@ -16,6 +16,7 @@ import argparse
 import multiprocessing
 import tempfile
 import time
+from contextlib import ExitStack
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
@@ -68,14 +69,20 @@ def rate(size: int, window: int, with_memory: bool, folder: str) -> float:
         multiprocessing.Process(target=consume, args=(address, name, size)),
     ]
     content = np.random.default_rng(0).integers(0, 255, size, np.uint8)
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.identity = PRODUCER
+    with ExitStack() as ended:
+        if shared is not None:
+            ended.callback(shared.unlink)
+            ended.callback(shared.close)
+        for other in others:
+            ended.callback(other.kill)
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
+        ended.callback(socket.close, 0)
+        socket.identity, socket.rcvtimeo = PRODUCER, 30_000  # one of the others may have ended
         socket.connect(address)
         for other in others:
             other.start()
             time.sleep(0.3)  # the consumer's first word is lost where the producer is not connected
-        if socket.recv() != b"ready":
-            raise RuntimeError("the consumer did not begin")
+        socket.recv()
         began, sent, waiting = time.perf_counter(), 0, 0
         while time.perf_counter() - began < SECONDS:
             part = content.copy()  # a producer makes its part anew in each frame
@@ -95,9 +102,6 @@ def rate(size: int, window: int, with_memory: bool, folder: str) -> float:
         socket.send(END)
         for other in others:
             other.join(10)
-    if shared is not None:
-        shared.close()
-        shared.unlink()
     return sent * size / taken
 
 

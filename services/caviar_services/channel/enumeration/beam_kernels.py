@@ -76,7 +76,7 @@ def _near_cone(
 ) -> None:
     """Test whether spheres reach into the cone of beam b, on the lit side of its last plane.
 
-    A cheap test before `_in_pyramid`, without a branch, so that a compiler takes several spheres at once.
+    A cheap test before those of pyramids, without a branch, so that a compiler takes several spheres at once.
     """
     ix, iy, iz = beams[b, 0], beams[b, 1], beams[b, 2]
     ax, ay, az = beams[b, AXIS], beams[b, AXIS + 1], beams[b, AXIS + 2]
@@ -336,9 +336,9 @@ def _crossing(
     own: int,
     crosses: BoolArray,
 ) -> bool:
-    """Test which receivers see the image of beam b in a face, within its rectangle.
+    """Test which receivers see the image of beam b in face f, within its rectangle.
 
-    Coordinates are those of the face's ``frame``, also in ``seen``, which has the receivers'.
+    ``seen[own]`` has the receivers in the face's frame (`_fill_seen`).
     """
     dx, dy, dz = beams[b, 0] - frames[f, 3, 0], beams[b, 1] - frames[f, 3, 1], beams[b, 2] - frames[f, 3, 2]
     x = dx * frames[f, 0, 0] + dy * frames[f, 0, 1] + dz * frames[f, 0, 2]
@@ -503,7 +503,7 @@ def _near_edges(
     piece: Int64Array,
     lit: Int64Array,
 ) -> int:
-    """Write the edges whose boxes reach into the cone of beam b, whose image is in front of a face of them,
+    """Write the edges whose spheres reach into the cone of beam b, whose image is in front of a face of them,
     and return how many they are; but for edges of the surface ``own``, which reflected the beam last: they
     lie in the mirror's plane, and no wave goes from there to them."""
     pieces, begin, boxes, ends, normals, surfaces, _ = edges

@@ -44,7 +44,7 @@ _EVERYWHERE = -1e30
 
 
 class Targets:
-    """Targets of a frame's beams, as `beam_kernels` takes them: faces, and bodies by the spheres around them.
+    """Targets of a frame's beams, as `beam_kernels` takes them: faces, and bodies by their boxes.
 
     Args:
         faces: Those of scenery first, then those of bodies, body after body.
