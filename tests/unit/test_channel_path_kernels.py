@@ -74,7 +74,9 @@ def test_each_loop_is_named_while_it_compiles(monkeypatch: pytest.MonkeyPatch) -
             said.append("closed")
 
     assert beam_kernels.WIDTH  # imported, so that its loops are none of these
-    monkeypatch.setattr(compiled_loops, "_loops", [(Loop(), "f8(f8)"), (Loop(), "i8(i8)")])
-    for _ in range(2):  # nothing is left for the second run of a process
-        compiled_loops.compile_loops(lambda number, count: said.append((number, count)))
-    assert said == [(0, 2), "f8(f8)", "closed", (1, 2), "i8(i8)", "closed"]
+    loops = [(Loop(), "f8(f8)", False), (Loop(), "b1(b1)", True), (Loop(), "i8(i8)", False)]
+    monkeypatch.setattr(compiled_loops, "_loops", loops)
+    for edges in (False, True, True):  # nothing is left for the last run of a process
+        compiled_loops.compile_loops(lambda number, count: said.append((number, count)), edges)
+    assert said[:6] == [(0, 2), "f8(f8)", "closed", (1, 2), "i8(i8)", "closed"]
+    assert said[6:] == [(0, 1), "b1(b1)", "closed"]

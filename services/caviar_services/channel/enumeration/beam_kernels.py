@@ -62,7 +62,10 @@ def _added(found: Int64Array, count: int, one: int, two: int, three: int = 0) ->
     """Rows with one more after so many; where there is no room for it, they are copied."""
     if count == len(found):
         larger = np.empty((2 * count, found.shape[1]), np.int64)
-        larger[:count] = found
+        # Item by item: what assigns a slice takes seconds to compile, for the text of its error.
+        for i in range(count):
+            for k in range(found.shape[1]):
+                larger[i, k] = found[i, k]
         found = larger
     found[count, 0], found[count, 1] = one, two
     if found.shape[1] > 2:
@@ -203,13 +206,13 @@ def reflected(targets: Targets, before: Float64Array, parent: Int64Array, last: 
     faces that reflected them before bound the beams, too."""
     faces, corners = targets[:2]
     beams = np.zeros((len(last), WIDTH))
-    beams[:, LAST] = last
     edge, axis = np.empty((4, 3)), np.empty(3)
     for b in range(len(last)):
         f, source, g = last[b], before[parent[b]], int(before[parent[b], LAST])
         n0, n1, n2, offset = faces[4, f], faces[5, f], faces[6, f], faces[7, f]
         height = source[0] * n0 + source[1] * n1 + source[2] * n2 - offset
         image = beams[b]
+        image[LAST] = f
         for c in range(3):
             image[c] = source[c] - 2 * height * faces[4 + c, f]
         # The image is behind the mirror, so the lit side is the other one.
@@ -458,7 +461,8 @@ def ends_by_scenery(
     for b in range(first, len(beams)):
         group = group_of[int(beams[b, LAST])]
         order[filled[group]] = b
-        columns[:, filled[group]] = beams[b, :LIT]
+        for c in range(LIT):
+            columns[c, filled[group]] = beams[b, c]
         columns[COSINE, filled[group]] = max(beams[b, COSINE], 0.0)
         filled[group] += 1
     shows = np.zeros((len(group_begin) - 1, len(views)), np.bool_)
@@ -524,7 +528,7 @@ def _near_edges(
     return count
 
 
-@loop(f"i8[:,::1](f8[:,::1], i8[::1], {_EDGES}, f8)")
+@loop(f"i8[:,::1](f8[:,::1], i8[::1], {_EDGES}, f8)", edges=True)
 def lit_edges(beams: Float64Array, own: Int64Array, edges: Edges, slack: float) -> Int64Array:
     """Pairs of a beam and an edge that it may light; ``own`` are the surfaces that reflected the beams last,
     −2 for none."""
@@ -549,7 +553,7 @@ def _unfolded(
     return s, math.sqrt(x * x + y * y + z * z)
 
 
-@loop(f"i8[:,::1](f8[:,::1], i8[::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], {_EDGES}, f8)")
+@loop(f"i8[:,::1](f8[:,::1], i8[::1], b1[::1], f8[:,::1], i8[:,::1], b1[::1], {_EDGES}, f8)", edges=True)
 def meetings(
     beams: Float64Array,
     own: Int64Array,
@@ -581,10 +585,11 @@ def meetings(
     # Unit vectors along edges and their lengths; where the others are along them, and how far from them.
     units, along, aways = np.empty((len(ends), 4)), np.empty(len(lit)), np.empty(len(lit))
     for e in range(len(ends)):
-        ux, uy, uz = ends[e, 1] - ends[e, 0]
+        ux, uy = ends[e, 1, 0] - ends[e, 0, 0], ends[e, 1, 1] - ends[e, 0, 1]
+        uz = ends[e, 1, 2] - ends[e, 0, 2]
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
         ux, uy, uz = ux / length, uy / length, uz / length
-        units[e] = ux, uy, uz, length
+        units[e, 0], units[e, 1], units[e, 2], units[e, 3] = ux, uy, uz, length
         for k in range(begin[e], begin[e + 1]):
             along[k], aways[k] = _unfolded(others, lit[k, 1], ends[e], ux, uy, uz)
     for b in range(len(beams)):

@@ -27,7 +27,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _OPTIONS = {"nogil": True, "error_model": "numpy"}
 _MODULES = ("beam_kernels", "path_kernels")
-_loops: list[tuple[Any, str]] = []
+_loops: list[tuple[Any, str, bool]] = []
 _lock = Lock()
 
 
@@ -44,8 +44,9 @@ def vectorized(function: F) -> F:
     return made
 
 
-def loop(signature: str) -> Callable[[F], F]:
-    """Have a function compiled by `compile_loops` for these types of arguments."""
+def loop(signature: str, edges: bool = False) -> Callable[[F], F]:
+    """Have a function compiled by `compile_loops` for these types of arguments; ``edges``: only where waves
+    are diffracted."""
 
     def decorate(function: F) -> F:
         if numba is None:
@@ -54,18 +55,19 @@ def loop(signature: str) -> Callable[[F], F]:
             made = numba.njit(cache=True, **_OPTIONS)(function)
         except RuntimeError:  # Numba has no folder that it may write to
             made = numba.njit(**_OPTIONS)(function)
-        _loops.append((made, signature))
+        _loops.append((made, signature, edges))
         kept: F = made
         return kept
 
     return decorate
 
 
-def compile_loops(progress: Callable[[int, int], None]) -> None:
-    """Compile all loops, half a minute, or read from disk what was compiled before.
+def compile_loops(progress: Callable[[int, int], None], edges: bool = True) -> None:
+    """Compile loops, a quarter of a minute for all, or read from disk what was compiled before.
 
     Args:
         progress: Called before each loop with its number, from 0, and the count of loops.
+        edges: Whether those of edges are wanted, too.
 
     Raises:
         SetupError: Numba is not installed.
@@ -78,10 +80,9 @@ def compile_loops(progress: Callable[[int, int], None]) -> None:
     for name in _MODULES:
         import_module(f"{__package__}.{name}")
     with _lock:  # services of an embedded run are prepared at once
-        count = len(_loops)
-        while _loops:
-            made, signature = _loops[0]
-            progress(count - len(_loops), count)
+        wanted = [entry for entry in _loops if edges or not entry[2]]
+        for number, (made, signature, of_edges) in enumerate(wanted):
+            progress(number, len(wanted))
             made.compile(signature)
             made.disable_compile()
-            del _loops[0]
+            _loops.remove((made, signature, of_edges))

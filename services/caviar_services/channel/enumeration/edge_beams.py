@@ -181,16 +181,10 @@ class _Side:
         # Chains of scenery alone over an edge of scenery are left to rays.
         lit = other._lit
         wanted, edge = np.unique(lit[:, 0], return_inverse=True)
-        beam, met, beam_of_other = kernels.meetings(
-            self.beams.rows,
-            self._own,
-            self.beams.by_body,
-            other.beams.rows,
-            np.column_stack([edge, lit[:, 1]]),
-            other.beams.by_body,
-            self.edges.arrays(wanted),
-            self.targets.slack,
-        ).T
+        mine = self.beams.rows, self._own, self.beams.by_body
+        theirs = other.beams.rows, np.column_stack([edge, lit[:, 1]]), other.beams.by_body
+        met_at = self.edges.arrays(wanted), self.targets.slack
+        beam, met, beam_of_other = kernels.meetings(*mine, *theirs, *met_at).T
         return beam, wanted[met], beam_of_other
 
 

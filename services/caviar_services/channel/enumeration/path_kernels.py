@@ -83,7 +83,11 @@ def reflections(
     points, good = np.empty((len(chain), depth, 3)), np.ones(len(chain), np.bool_)
     images, flat = np.empty((depth + 1, 3)), np.empty((depth, 2))
     for n in range(len(chain)):
-        count, images[0] = 0, start[n]
+        count = 0
+        for c in range(3):
+            images[0, c] = start[n, c]
+            for d in range(depth):
+                points[n, d, c] = end[n, c]  # past the last reflection it stays
         while count < depth and chain[n, count] >= 0:
             f = chain[n, count]
             image = images[count]
@@ -93,7 +97,6 @@ def reflections(
             for c in range(3):
                 images[count + 1, c] = image[c] - twice * faces[4 + c, f]
             count += 1
-        points[n, count:] = end[n]
         # Back from the end: the line to the last image meets the last face at the last point, and so on.
         x, y, z = end[n, 0], end[n, 1], end[n, 2]
         for d in range(count - 1, -1, -1):
@@ -140,10 +143,13 @@ def build(middle: Float64Array) -> tuple[Int64Array, Int64Array]:
             some = order[begin:end].copy()
             axis, widest = 0, -1.0
             for c in range(3):
-                along = middle[some, c]
-                if along.max() - along.min() > widest:
-                    axis, widest = c, along.max() - along.min()
-            order[begin:end] = some[np.argsort(middle[some, axis], kind="mergesort")]
+                low, high = np.inf, -np.inf
+                for t in some:
+                    low, high = min(low, middle[t, c]), max(high, middle[t, c])
+                if high - low > widest:
+                    axis, widest = c, high - low
+            for k, t in enumerate(some[np.argsort(middle[some, axis], kind="mergesort")]):
+                order[begin + k] = t
             half = (begin + end) // 2
             nodes[i, 0] = made
             nodes[made, 1], nodes[made, 2] = begin, half

@@ -197,7 +197,7 @@ class PathFinder:
                 tracer.trace(above, receivers, corners=corners)
         if self._enumerated is not None:
             loops = importlib.import_module("caviar_services.channel.enumeration.compiled_loops")
-            loops.compile_loops(self._compiling)
+            loops.compile_loops(self._compiling, options.diffraction)
             self._enumerated.compile_kernels()
             self._enumerate_above(self._enumerated, above)
         if s.rung == "spherical":
