@@ -323,7 +323,7 @@ class PlaneTable:
         self.high = np.zeros((count, 3))
         # Of triangles, over the axes: planes of thousands are searched, the ground with all floors on it.
         self._lows, self._highs = np.zeros((2, 3, len(numbers)))
-        # By each plane of a surface but the first, whose triangles come before those of the others.
+        # All planes of a surface, by each of them but the first.
         self._joined: Mapping[int, Int64Array] = {}
 
     def update(self, corners: Float64Array, planes: Int64Array | None = None) -> None:

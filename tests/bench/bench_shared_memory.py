@@ -32,6 +32,10 @@ def route(address: str) -> None:
     """Pass on what the producer and the consumer send each other, until the producer's last word."""
     with zmq.Context() as context, context.socket(zmq.ROUTER) as socket:
         socket.bind(address)
+        known: set[bytes] = set()
+        while len(known) < 2:  # a word to one that is not there yet would be lost
+            known.add(socket.recv_multipart()[0])
+        socket.send_multipart([PRODUCER, b"both are there"])
         while True:
             sender, *parts = socket.recv_multipart(copy=False)
             receiver = CONSUMER if sender.bytes == PRODUCER else PRODUCER
@@ -46,7 +50,7 @@ def consume(address: str, name: str, size: int) -> None:
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.identity = CONSUMER
         socket.connect(address)
-        socket.send(b"ready")
+        socket.send(b"here")
         while (parts := socket.recv_multipart(copy=False))[0].bytes != END:
             if shared is None:
                 words = np.frombuffer(parts[1].buffer, np.uint64)
@@ -81,7 +85,7 @@ def rate(size: int, window: int, with_memory: bool, folder: str) -> float:
         socket.connect(address)
         for other in others:
             other.start()
-            time.sleep(0.3)  # the consumer's first word is lost where the producer is not connected
+        socket.send(b"here")
         socket.recv()
         began, sent, waiting = time.perf_counter(), 0, 0
         while time.perf_counter() - began < SECONDS:

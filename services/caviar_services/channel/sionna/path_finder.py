@@ -208,7 +208,7 @@ class PathFinder:
 
     def _compiling(self, number: int, count: int) -> None:
         phase = f"compiling kernels of enumeration {number + 1}/{count}"
-        # Up to ten seconds of a processor that other processes may share.
+        # Some seconds of a processor that other processes may share.
         self._run.progress(phase, 3 * COMPILE_GRACE_S)
 
     def _enumerate_above(self, tracer: EnumeratedTracer, above: Float64Array) -> None:
